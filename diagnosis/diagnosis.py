@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,6 @@ from bodyschema.diagnosis.assess.explanation import (
     Explanation,
     changed_by_the_way,
     explain,
-    needs_no_more_names,
     useful,
     without_one,
 )
@@ -23,11 +22,9 @@ from bodyschema.diagnosis.assess.shares import Shares, shares
 from bodyschema.diagnosis.assess.stored import is_better_with, stored
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.background import Scales
-from bodyschema.diagnosis.fit.contact import doubtful
 from bodyschema.diagnosis.fit.fit import Fit, fitted
 from bodyschema.diagnosis.fit.instrument import instrument_factor, reshaped
 from bodyschema.diagnosis.fit.observations import IntArray, Observations
-from bodyschema.diagnosis.search.alike import Alike, alike
 from bodyschema.diagnosis.search.drives import with_small_ripples
 from bodyschema.diagnosis.search.held_out import Added, Blocks, added, gain_percent, held_out_errors, is_marker
 from bodyschema.diagnosis.search.hypotheses import Hypotheses
@@ -157,7 +154,7 @@ class Diagnosis:
 
     @property
     def _off(self) -> np.ndarray:
-        return ~self.markers & self.extended.observations.trusted & ~doubtful(self.extended)
+        return ~self.markers & self.extended.observations.trusted & ~self.extended.doubtful()
 
     @property
     def outliers_are_found(self) -> bool:
@@ -247,15 +244,6 @@ class Diagnosis:
     def sought(self) -> Fit:
         """The complete fit over the rows in which causes were sought."""
         return self.extended if self.part is None else self.extended.over(self.part)
-
-    @cached_property
-    def alike(self) -> tuple[Alike, ...]:
-        """Confounded effects beside the best geometry."""
-        named = {cause.key for cause in self.causes}
-        joints = {cause.where for cause in self.causes}
-        geometry = self.geometry if self.part is None else self.geometry.over(self.part)
-        pairs = alike(geometry, (effect for effect in self.hypotheses.effects if effect.where in joints))
-        return tuple(pair for pair in pairs if named & {pair.one.key, pair.other.key})
 
     @cached_property
     def rejected(self) -> list[tuple[Candidate, Added]]:
@@ -398,7 +386,7 @@ def _moment_anew(fit: Fit, cause: Effect, searched: FloatArray) -> Candidate | N
 
 def _left_out(fit: Fit) -> NDArray[np.bool_]:
     """Return the rows (n,) to leave out because their history is not known well enough, if they are not too many."""
-    rows = doubtful(fit)
+    rows = fit.doubtful()
     return rows if rows.mean() <= MOST_DOUBTFUL else np.zeros_like(rows)
 
 
@@ -418,8 +406,7 @@ def _found(
     # The set of causes compared best tells the noise, and the rows that they leave out, before the long search.
     begun, start = _counted(begun, start, simulation)
     unknowns = Unknowns(start)
-    enough = partial(needs_no_more_names, unknowns=unknowns, search=search)
-    extended = search.run(begun, enough) if start.is_exact else _searched(begun, search, enough)
+    extended = search.run(begun) if start.is_exact else _searched(begun, search)
     other_shape = None if start.is_exact else reshaped(extended)
     if other_shape is not None and (rattle(extended) or explain(extended, search.path, unknowns, search, told).unknown):
         # What is left is not noise alone.
@@ -427,8 +414,7 @@ def _found(
     again, start = (extended, start) if search.ended_early else _counted(extended, start, simulation, other_shape)
     if again is not extended:
         unknowns = Unknowns(start)
-        enough = partial(needs_no_more_names, unknowns=unknowns, search=search)
-        extended = _searched(again, search, enough)
+        extended = _searched(again, search)
     loose = None if start.is_exact else rattle(extended)
     if loose is not None and explain(extended, search.path, unknowns, search, told).unknown:
         # An error of the last joint moves the marker along one line as well.
@@ -442,8 +428,7 @@ def _found(
         search = Search(fixed, told)
         start = aligned(start.observations.with_rattle(loose.ratio, loose.ways), simulation)
         unknowns = Unknowns(start)
-        enough = partial(needs_no_more_names, unknowns=unknowns, search=search)
-        extended = _searched(together(start, fixed, told), search, enough)
+        extended = _searched(together(start, fixed, told), search)
         loose = rattle(extended) or loose
     told.begin(NAMELESS, SEARCH)
     explanation = useful(explain(extended, search.path, unknowns, search, told), search, blocks, told)
@@ -497,12 +482,12 @@ def _stored(start: Fit, alone: Fit, complete: Fit, left: Leftover, blocks: Block
     return best
 
 
-def _searched(begun: Fit, search: Search, enough: Callable[[Sequence[Fit], float], bool]) -> Fit:
+def _searched(begun: Fit, search: Search) -> Fit:
     """Run the search for causes from a fit, and refit with tolerances updated to what it finds."""
     extended = begun
     for _ in range(_RESCALED):
         begun = _with_small_ones_tolerated(begun)
-        extended = search.run(begun, enough)
+        extended = search.run(begun)
         before = extended.background.scales or Scales()
         # Unnamed causes may be all there is, and inflate the apparent tolerances.
         bare = extended.with_causes([])

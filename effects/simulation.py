@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -38,6 +38,13 @@ _CORRECTIONS: WeakKeyDictionary[Motion, WeakKeyDictionary[Effect, FloatArray]] =
 # Predictions (n, 3) of residuals, which no effect changes, as long as both live.
 _RESIDUALS: WeakKeyDictionary[Motion, WeakKeyDictionary[Residual, FloatArray]] = WeakKeyDictionary()
 Staged = TypeVar("Staged", bound=EffectType)
+
+
+class _Beneath(NamedTuple):
+    """Links (d + 1, 4, 4) of a chain, and joint angles (n, d) by the readings, as a background alone makes them."""
+
+    fixed: FloatArray
+    angles: WeakKeyDictionary[Motion, FloatArray]
 
 
 class Residual(Protocol):
@@ -78,7 +85,7 @@ class Simulation:
     def with_effects(self, effects: Sequence[Effect]) -> Simulation:
         """Return the same robot and residual with other effects."""
         changed = replace(self, effects=tuple(effects))
-        changed.__dict__["gravity"] = self.gravity
+        changed.__dict__.update(gravity=self.gravity, _beneath=self._beneath)
         return changed
 
     def with_background(self, background: Sequence[Effect]) -> Simulation:
@@ -170,14 +177,26 @@ class Simulation:
 
     def unloaded(self, readings: Motion) -> FloatArray:
         """Return true joint angles (n, d) [rad, m] without deflection under weight."""
-        q = readings.q.copy()
-        for effect in self.all_effects:
+        beneath = self._beneath.angles
+        if readings not in beneath:
+            beneath[readings] = self._corrected(readings, readings.q, self.background)
+        return self._corrected(readings, beneath[readings], self.effects)
+
+    def _corrected(self, readings: Motion, angles: FloatArray, effects: Sequence[Effect]) -> FloatArray:
+        """Return joint angles (n, d) [rad, m] with the corrections of some effects added."""
+        q = angles.copy()
+        for effect in effects:
             if effect.kind.encoder is not None:
                 place, known = self.place(effect), _CORRECTIONS.setdefault(readings, WeakKeyDictionary())
                 if effect not in known:
                     known[effect] = effect.kind.encoder.correction(readings, place, effect.values)
                 q[:, place.joint] += known[effect]
         return q
+
+    @cached_property
+    def _beneath(self) -> _Beneath:
+        """What the background alone does, which is the same with other effects."""
+        return _Beneath(self._moved(self.robot.chain.fixed, self.background), WeakKeyDictionary())
 
     def place(self, effect: Effect) -> Place:
         """Return the place of an effect of the first stage."""
@@ -303,19 +322,25 @@ class Simulation:
     def _chain(self) -> RigidChain:
         """Return the chain with corrected links."""
         chain = self.robot.chain
-        fixed = chain.fixed.copy()
-        for k, moved in self.link_moves:
+        return RigidChain(self._moved(self._beneath.fixed, self.effects), chain.axes, chain.prismatic)
+
+    def _moved(self, links: FloatArray, effects: Sequence[Effect]) -> FloatArray:
+        """Return links (d + 1, 4, 4) with the corrections of some effects."""
+        fixed = links.copy()
+        for k, moved in self._link_moves(effects):
             if self.upward[k]:
                 fixed[k + 1] = inverse(moved) @ fixed[k + 1]
             else:
                 fixed[k] = fixed[k] @ moved
-        return RigidChain(fixed, chain.axes, chain.prismatic)
+        return fixed
 
-    @cached_property
+    @property
     def link_moves(self) -> list[tuple[int, FloatArray]]:
         """Corrections of joint frames: the index in q, and the pose (4, 4) in the nominal frame."""
-        structure = [effect for effect, _ in self._of(StructureEffect)]
-        return [(self.place(effect).joint, effect.frame) for effect in structure if effect.frame is not None]
+        return self._link_moves(self.all_effects)
+
+    def _link_moves(self, effects: Sequence[Effect]) -> list[tuple[int, FloatArray]]:
+        return [(self.place(effect).joint, effect.frame) for effect in effects if effect.frame is not None]
 
     @cached_property
     def upward(self) -> list[bool]:

@@ -16,12 +16,12 @@ from bodyschema.diagnosis.report.numbers import (
     numbers_of,
     percent,
     place,
-    rival_named,
     share,
     telling,
 )
-from bodyschema.diagnosis.report.result import SMALL, Cause, DiagnosisFile, Errors, Indistinguishable, Verdict
-from bodyschema.diagnosis.report.text import beside_geometry, in_order, made_to, modelled, other_shares, to_do
+from bodyschema.diagnosis.report.presenters.registry import named, rival_named
+from bodyschema.diagnosis.report.result import SMALL, DiagnosisFile, Errors, Indistinguishable, Verdict
+from bodyschema.diagnosis.report.text import in_order, made_to, modelled, other_shares, to_do
 
 # Number of rejected hypotheses shown.
 NEAREST = 6
@@ -68,12 +68,10 @@ def view(diagnosis: DiagnosisFile, remedies: Sequence[str], *, timed: bool) -> G
         parts.append(_causes(diagnosis, timed))
     if diagnosis.tolerances is not None:
         parts.append(Text(made_to(diagnosis.tolerances)))
-    if rivals := [line for cause in diagnosis.causes if not cause.is_correction for line in rival_lines(cause)]:
+    if rivals := _rivals(diagnosis):
         parts.append(_list("Not distinguished", rivals))
     if diagnosis.rejected:
         parts.append(_rejected(diagnosis))
-    if alike := beside_geometry(diagnosis.rms_mm, diagnosis.alike):
-        parts.append(_list("Beside the best geometry", alike))
     first, small = to_do(diagnosis, remedies)
     if first:
         parts.append(_list("What to do", first, numbered=True))
@@ -96,13 +94,15 @@ def unexplained(diagnosis: DiagnosisFile) -> str:
     )
 
 
-def rival_lines(cause: Cause) -> list[str]:
+def _rivals(diagnosis: DiagnosisFile) -> list[str]:
     """Return one sentence for each alternative explanation of a cause."""
-    return [_rival(cause, rival) for rival in cause.rivals]
+    told, by = [cause for cause in diagnosis.causes if not cause.is_correction], diagnosis.seen_by
+    names = [named(cause.effect, cause.where, cause.source, by) for cause in told]
+    return [_rival(name, rival, by) for name, cause in zip(names, told, strict=True) for rival in cause.rivals]
 
 
-def _rival(cause: Cause, rival: Indistinguishable) -> str:
-    instead = f"{place(cause)} may be {rival_named(rival)} ({percent(rival.probability)})"
+def _rival(itself: str, rival: Indistinguishable, seen_by: str) -> str:
+    instead = f"{itself} may be {rival_named(rival, seen_by)} ({percent(rival.probability)})"
     if rival.by == "any_motion":
         return f"{instead}; no motion tells them apart."
     return f"{instead}; another motion can tell."

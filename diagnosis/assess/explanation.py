@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,8 +34,6 @@ _AS_GOOD = 8.0
 _NEAR = 30.0
 # A smaller share of the held-out squares is a slight gain; 1 % was, and 40 % was not.
 _SLIGHT = 0.02
-# Assumed maximum of further causes after the next.
-_MANY = 10
 # Of the fits along the search, this many first and last ones are tried beside unnamed causes.
 _FIRST, _LAST = 3, 2
 # Rounded readings of a joint at rest cannot produce more evidence than this [nats].
@@ -177,26 +175,6 @@ def _rescaled(best: Explanation, apart: Apart, unknowns: Unknowns, search: Searc
     before = best.fit.background.scales
     gained = again.worth - best.worth - scales.doubt + (0.0 if before is None else before.doubt)
     return again if again.unknown and gained > 0.0 else best
-
-
-def needs_no_more_names(path: Sequence[Fit], worth: float, unknowns: Unknowns, search: Search) -> bool:
-    """Return True if an early fit of the search, with unnamed causes, already explains the data.
-
-    It has to be more probable than many further causes, each worth as much as the next.
-
-    Args:
-        path: the fits of the search, the last with all causes named so far.
-        worth: evidence gain of the next cause [nats].
-    """
-    fit = path[-1]
-    if unknowns.nearest(fit)[0][1] < _MANY * worth / _MOST_UNKNOWNS:
-        return False
-    least = fit.log_likelihood - cost_of_names(fit.causes, search) + _MANY * worth
-    for first in path[:_FIRST]:
-        other = _with_unknown(first, unknowns, search, least)
-        if other.apart is not None and other.worth > least and search.is_complete(other.beside):
-            return True
-    return False
 
 
 def _is_as_good(fewer: Explanation, explanation: Explanation) -> bool:

@@ -2,36 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bodyschema.diagnosis.fit.fit import Fit, amount_columns
 from bodyschema.diagnosis.fit.scatter import beyond_single_rows, limited_rows, remembers
 from bodyschema.diagnosis.fit.worth import nats
 from bodyschema.diagnosis.search.held_out import Blocks
 from bodyschema.diagnosis.search.scan import Candidate
-from bodyschema.diagnosis.search.search import Search, describe
+from bodyschema.diagnosis.search.search import Search
 from bodyschema.diagnosis.unnamed.unknown import Unknowns
 from bodyschema.effects import Effect, Motion
 from bodyschema.interfaces.records import FloatArray
 
 from .nameless import Nameless
-from .stability import Instead, bagged, named_again
 
 # Signals that differ by less than this, twice the log-likelihood that the right one is expected to gain, are one.
 SAME = 6.0
 # Predictions are the same if their expected Δχ² is smaller.
 _SAME_SHARE = 1e-3
+# Number of resamplings for probabilities; 0.3 to 3 times this changes them by less than 0.03.
+_BAGGED = 400
 # A less probable rival is not listed.
 PROBABLE = 0.02
 # Smallest share of a cause's gain that a rival must explain.
 _COMES_NEAR = 0.7
 # A rival less probable by this is not fitted to convergence [nats].
 _HOPELESS = 40.0
-_Other = tuple[Fit | Nameless, Effect | None, str]
 # Number of poses over the whole range of the joints, which stand for any motion, and the scatter of the logarithms of
 # the times between them.
 _POSES, _UNEVEN = 400, 1.0
@@ -45,8 +44,7 @@ class Rival:
 
     Attributes:
         instead: the fit with it in the place of the cause.
-        effect: with its best-fitting numbers; None where it has no name.
-        described: short description.
+        itself: the effect with its best-fitting numbers, or what has no name.
         probability: given that the cause or one of its rivals is present.
         difference: Δχ² by which this motion is expected to separate them.
         anywhere: the same for as many poses over the whole range of the joints.
@@ -55,8 +53,7 @@ class Rival:
     """
 
     instead: Fit | Nameless
-    effect: Effect | None
-    described: str
+    itself: Effect | Nameless
     probability: float
     difference: float
     anywhere: float
@@ -81,20 +78,16 @@ class Standing:
     Attributes:
         itself: the cause with its best first-order fit.
         probability: probability of the cause or its equivalents.
-        worth: evidence gain of the cause over leaving it out [nats].
         dof: number of its amounts that the data determine.
         gain: its Δχ².
         rivals: the probable ones, the most probable first.
-        again: True for block resamplings in which it would be named again.
     """
 
     itself: Candidate
     probability: float
-    worth: float
     dof: int
     gain: float
     rivals: tuple[Rival, ...]
-    again: NDArray[np.bool_]
 
 
 def standings(fit: Fit, search: Search, blocks: Blocks, seed: int, unknowns: Unknowns | None = None) -> list[Standing]:
@@ -112,56 +105,61 @@ def _standing(
     beside = search.beside(fit, cause)
     without = beside.without
     gain = 2.0 * (fit.log_likelihood - without.log_likelihood)
-    itself = beside.itself
-    worth = search.worth(fit, cause)
-    nothing = Instead(without, -itself.dof, -search.doubt(itself))
-    tried = []
+    itself, worth = beside.itself, search.worth(fit, cause)
+    tried: list[tuple[Fit, Effect]] = []
+    behind = list[float]()
     for candidate in beside.candidates:
         if candidate.gain < _COMES_NEAR * itself.gain:
             continue
         rival = beside.exchanged(candidate, fit.log_likelihood - _HOPELESS)
         doubt = float(np.log(max(candidate.trials / max(itself.trials, 1), 1e-3)))
-        tried.append((Instead(rival, candidate.dof - itself.dof, doubt), candidate.effect))
-    behind = [nats(2.0 * (one.fit.log_likelihood - fit.log_likelihood), one.dof) - one.doubt for one, _ in tried]
-    behind = [
-        worth + (beyond_single_rows(fit, one.fit) if remembers(cause) and remembers(effect) else 0.0)
-        for worth, (one, effect) in zip(behind, tried, strict=True)
-    ]
-    others: list[_Other] = [_as_fitted(one.fit, effect) for one, effect in tried]
+        more = nats(2.0 * (rival.log_likelihood - fit.log_likelihood), candidate.dof - itself.dof) - doubt
+        alike = remembers(cause) and remembers(candidate.effect)
+        tried.append((rival, candidate.effect))
+        behind.append(more + (beyond_single_rows(fit, rival) if alike else 0.0))
+    others: list[tuple[Fit | Nameless, Effect | Nameless]] = [_as_fitted(*one) for one in tried]
     if unknowns is not None:
         near = unknowns.specific(without, _COMES_NEAR * itself.gain)
         aparts = [unknowns.apart(without, (way,)) for way in near]
         if (nameless := Nameless.in_place_of(cause, fit, aparts, unknowns, search)) is not None:
-            others.append((nameless, None, nameless.what))
+            others.append((nameless, nameless))
             behind.append(nameless.behind)
     # What a cause is worth allows for blocks already.
-    rows = [np.zeros(len(fit.left)), *(_at_rows(fit, other, cause, effect) for other, effect, _ in others)]
+    rows = [np.zeros(len(fit.left)), *(_at_rows(fit, other, cause, itself) for other, itself in others)]
     probable = bagged([-worth, *behind], rows, blocks, seed)
     wide = widened(fit, range(fit.observations.motion.q.shape[1]), uneven=_UNEVEN)
     signal = apart_on(fit, without, wide)
     rivals = []
-    for (other, effect, told), share in zip(others, probable[2:], strict=True):
+    for (other, alternative), share in zip(others, probable[2:], strict=True):
         if share >= PROBABLE:
             anywhere = apart_on(fit, other, wide)
             one = anywhere < _SAME_SHARE * signal and _is_no_more(other, fit, without, wide)
-            rivals.append(Rival(other, effect, told, float(share), _difference(fit, other), anywhere, signal, one))
+            rivals.append(Rival(other, alternative, float(share), _difference(fit, other), anywhere, signal, one))
     same = sum(rival.probability for rival in rivals if rival.is_one)
     ordered = tuple(sorted(rivals, key=lambda rival: rival.probability, reverse=True))
-    return Standing(
-        itself,
-        float(probable[0]) + same,
-        worth,
-        itself.dof,
-        gain,
-        ordered,
-        named_again(fit, nothing, [one for one, _ in tried], blocks, seed),
-    )
+    return Standing(itself, float(probable[0]) + same, itself.dof, gain, ordered)
 
 
-def _at_rows(fit: Fit, other: Fit | Nameless, cause: Effect, effect: Effect | None) -> FloatArray:
+def bagged(behind: Sequence[float], rows: Sequence[FloatArray], blocks: Blocks, seed: int) -> FloatArray:
+    """Return the probability of a cause and of each alternative to it (1 + m,), as the mean over block resamplings.
+
+    No model is exact, so evidence that a few blocks decide is not sure (Huggins and Miller 2023, bagged posteriors).
+
+    Args:
+        behind: log-evidence of each alternative over the cause [nats].
+        rows: the part of it that each row holds (n,).
+    """
+    even = np.full(blocks.count, 1.0 / blocks.count)
+    drawn = np.random.default_rng(seed).multinomial(blocks.count, even, _BAGGED) - 1
+    nats = np.array([np.zeros(_BAGGED), *(b + drawn @ blocks.sums(own) for b, own in zip(behind, rows, strict=True))])
+    odds = np.exp(nats - nats.max(axis=0))
+    return np.asarray((odds / odds.sum(axis=0)).mean(axis=1), dtype=np.float64)
+
+
+def _at_rows(fit: Fit, other: Fit | Nameless, cause: Effect, itself: Effect | Nameless) -> FloatArray:
     """Return the log-likelihood of an alternative over a fit at each row (n,) [nats]."""
     there = other if isinstance(other, Fit) else other.apart.fit
-    if effect is not None and remembers(cause) and remembers(effect):
+    if isinstance(itself, Effect) and remembers(cause) and remembers(itself):
         return limited_rows(fit, there)
     return there.row_log_likelihoods - fit.row_log_likelihoods
 
@@ -173,9 +171,8 @@ def _is_no_more(other: Fit | Nameless, fit: Fit, without: Fit, wide: Motion) -> 
     return apart_on(other, fit, wide) < _SAME_SHARE * apart_on(other, without, wide)
 
 
-def _as_fitted(fit: Fit, effect: Effect) -> _Other:
-    cause = next(cause for cause in fit.causes if cause.identity == effect.identity)
-    return fit, cause, describe(cause)
+def _as_fitted(fit: Fit, effect: Effect) -> tuple[Fit, Effect]:
+    return fit, next(cause for cause in fit.causes if cause.identity == effect.identity)
 
 
 def _difference(one: Fit, other: Fit | Nameless) -> float:

@@ -1,7 +1,7 @@
 """Model the manufacturing tolerances: small errors of every link, axis and drive.
 
 The position and axis of each link, its joint offset included, deviate by N(0, (s τ)²). So do the small periodic errors
-of each drive. The data determine three scales s: for lengths, for angles and for drives. This background is part of
+of each drive. The data determine the scales s: for lengths, angles, drives and slides. This background is part of
 every fit and never a finding; a cause is larger.
 """
 
@@ -33,11 +33,12 @@ MOST = 10.0
 
 
 class Scales(NamedTuple):
-    """Sizes of the tolerances as multiples of `LENGTH_M`, `ANGLE_RAD` and `DRIVE_RAD`."""
+    """Sizes of the tolerances as multiples of `LENGTH_M`, `ANGLE_RAD`, `DRIVE_RAD`, and `_DRIVE_M` for slides."""
 
     lengths: float = 1.0
     angles: float = 1.0
     drives: float = 1.0
+    slides: float = 1.0
 
     @property
     def no_larger(self) -> Scales:
@@ -108,7 +109,7 @@ class Background:
         """Return True if an effect is a periodic drive error no larger than those of other drives."""
         if self.scales is None or not effect.kind.of_drive:
             return False
-        usual = self.scales.lengths * _DRIVE_M if effect.prismatic else self.scales.drives * DRIVE_RAD
+        usual = self.scales.slides * _DRIVE_M if effect.prismatic else self.scales.drives * DRIVE_RAD
         return float(np.linalg.norm(effect.values[effect.amounts])) < _LIKE_OTHERS * usual
 
     @cached_property
@@ -174,8 +175,8 @@ def _with(effect: Effect, amounts: FloatArray) -> Effect:
 
 def _groups(effect: Effect) -> np.ndarray:
     if effect.kind.of_drive:
-        # A ball screw's ripple is a length; the drive scale of gears does not apply.
-        return np.full(len(effect.amounts), 0 if effect.prismatic else 2)
+        # How true a ball screw runs has nothing to do with gears, nor with links.
+        return np.full(len(effect.amounts), 3 if effect.prismatic else 2)
     return np.array([0, 0, 0, 1, 1, 1])
 
 

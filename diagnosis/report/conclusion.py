@@ -8,7 +8,6 @@ import numpy as np
 from bodyschema.diagnosis.assess.rivals import Rival, Standing
 from bodyschema.diagnosis.diagnosis import MOST_DOUBTFUL, Diagnosis
 from bodyschema.diagnosis.fit.background import ANGLE_RAD, DRIVE_RAD, LENGTH_M
-from bodyschema.diagnosis.fit.contact import doubtful
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.worth import NAMED, nats
 from bodyschema.diagnosis.search.aliases import alias_sentences
@@ -19,7 +18,7 @@ from bodyschema.effects.effect_type import EffectType
 from bodyschema.interfaces.records import FloatArray
 
 from .result import (
-    Alike,
+    OUTLIERS,
     Cause,
     DiagnosisFile,
     Errors,
@@ -28,7 +27,6 @@ from .result import (
     Interval,
     Pairs,
     Rejected,
-    Stability,
     Tolerances,
     Unexplained,
     Verdict,
@@ -47,15 +45,15 @@ _HARDLY_CHANCE = 1e-3
 def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
     """Return the machine-readable form of a diagnosis."""
     percent, interval = diagnosis.gain()
-    causes = _causes(diagnosis)
+    # A tracker or a scanner has no intrinsics in robot.toml.
+    seen_by = "instrument" if diagnosis.aligned.simulation.robot.calibration is None else "camera"
+    causes = _causes(diagnosis, seen_by)
     rms = _rms_mm(diagnosis)
     verdict = _verdict(diagnosis, causes, percent)
     counted = diagnosis.gain_with_outliers() if diagnosis.outliers else (None, None)
     gain = Gain(percent, interval, with_outliers_percent=counted[0], with_outliers_ci95=counted[1])
     tolerances = _tolerances(diagnosis)
     timed = diagnosis.aligned.observations.motion.t is not None
-    # A tracker or a scanner has no intrinsics in robot.toml.
-    seen_by = "instrument" if diagnosis.aligned.simulation.robot.calibration is None else "camera"
     weighed = diagnosis.aligned.simulation.gravity.known
     named_mm, tolerated_mm = _named_mm(diagnosis), _tolerated_mm(diagnosis)
     return DiagnosisFile(
@@ -70,10 +68,8 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
         causes=causes,
         rejected=_rejected(diagnosis),
         unexplained=_unexplained(diagnosis),
-        stability=_stability(diagnosis, causes),
-        advice=advice(diagnosis, causes),
+        advice=advice(diagnosis, causes, seen_by),
         limitations=_limitations(diagnosis),
-        alike=_alike(diagnosis),
         tolerances=tolerances,
         seen_by=seen_by,
         weighed=weighed,
@@ -83,10 +79,10 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
 def _tolerances(diagnosis: Diagnosis) -> Tolerances:
     found = diagnosis.tolerated
     units = np.array([1e3 * LENGTH_M, np.degrees(ANGLE_RAD), np.degrees(DRIVE_RAD)])
-    sizes = units * np.asarray(found.scales)
-    wide = np.exp(_HALF_WIDTH_95 * found.unsure)
-    lowest = np.where(found.seen, sizes / wide, 0.0)
-    highest = np.where(found.seen, sizes * wide, units * found.most)
+    sizes, seen = units * np.asarray(found.scales)[:3], found.seen[:3]
+    wide = np.exp(_HALF_WIDTH_95 * found.unsure[:3])
+    lowest = np.where(seen, sizes / wide, 0.0)
+    highest = np.where(seen, sizes * wide, units * found.most[:3])
     ends = zip(sizes.tolist(), lowest.tolist(), highest.tolist(), strict=True)
     intervals = [Interval(size, (low, high)) for size, low, high in ends]
     shares = diagnosis.shares
@@ -134,7 +130,7 @@ def _mean_mm(diagnosis: Diagnosis) -> Errors:
     return Errors(**figures, noise_floor=min(1e3 * float(lengths.mean()), figures["extended"]))
 
 
-def _causes(diagnosis: Diagnosis) -> tuple[Cause, ...]:
+def _causes(diagnosis: Diagnosis, seen_by: str) -> tuple[Cause, ...]:
     fit, worse = diagnosis.extended, [max(diagnosis.worse_without[c.identity], 1.0) for c in diagnosis.causes]
     sure, causes = _OF_A_DESCRIPTION if diagnosis.ended_early else 1.0, []
     parts = zip(fit.causes, diagnosis.standings, diagnosis.shares.causes, worse, strict=True)
@@ -148,10 +144,9 @@ def _causes(diagnosis: Diagnosis) -> tuple[Cause, ...]:
                 probability=sure * standing.probability,
                 share_of_gain_percent=100.0 * share,
                 held_out_gain_percent=100.0 * (1.0 - squares**-0.5),
-                stability_percent=100.0 * float(standing.again.mean()),
                 indistinguishable_from=tuple(_named(r) for r in standing.rivals if r.is_same_here),
                 rivals=tuple(_named(r) for r in standing.rivals),
-                evidence=evidence(standing),
+                evidence=evidence(standing, seen_by),
             )
         )
     if not diagnosis.aligned.simulation.gravity.known:
@@ -177,11 +172,10 @@ def _or_sag(cause: Cause) -> Cause:
 
 
 def _named(rival: Rival) -> Indistinguishable:
-    effect = rival.effect
     by = "any_motion" if rival.is_same_anywhere else "this_motion"
-    if effect is None:
-        return Indistinguishable("unexplained", None, None, by, rival.probability, rival.described)
-    return Indistinguishable(effect.name, effect.where, effect.source, by, rival.probability)
+    if isinstance(rival.itself, Effect):
+        return Indistinguishable(*rival.itself.key, by, rival.probability)
+    return Indistinguishable("unexplained", None, None, by, rival.probability, rival.itself.what)
 
 
 def _outliers(diagnosis: Diagnosis) -> Cause:
@@ -189,14 +183,13 @@ def _outliers(diagnosis: Diagnosis) -> Cause:
     share = found / n
     half = _HALF_WIDTH_95 * float(np.sqrt(share * (1.0 - share) / n))
     return Cause(
-        effect="outliers",
+        effect=OUTLIERS,
         where=None,
         source=None,
         parameters={"share": Interval(share, (max(share - half, 0.0), share + half))},
         probability=1.0,
         share_of_gain_percent=0.0,
         held_out_gain_percent=0.0,
-        stability_percent=None,
         indistinguishable_from=(),
         rivals=(),
         evidence=f"{found} of {n} fixes are farther from all others than the noise can put them.",
@@ -274,7 +267,7 @@ def _why_not(diagnosis: Diagnosis, candidate: Candidate, tried: int) -> str:
 def _limitations(diagnosis: Diagnosis) -> tuple[str, ...]:
     told = list(diagnosis.hypotheses.limitations)
     sided = [cause for cause in diagnosis.causes if cause.kind.by_direction]
-    unknown_side = doubtful(diagnosis.extended, sided).mean()
+    unknown_side = diagnosis.extended.doubtful(sided).mean()
     if unknown_side > MOST_DOUBTFUL:
         joints = ", ".join(str(cause.where) for cause in sided)
         told.append(
@@ -304,27 +297,6 @@ def _left_out(stored: Fit) -> str:
         f"extended.toml holds {held}: with all that was found here it would not surely be better on another recording. "
         "Record poses over the whole range of all joints."
     )
-
-
-def _alike(diagnosis: Diagnosis) -> tuple[Alike, ...]:
-    return tuple(
-        Alike(
-            where=str(pair.one.where),
-            effect=pair.one.name,
-            other=pair.other.name,
-            explains_percent=100.0 * pair.one_explains,
-            other_explains_percent=100.0 * pair.other_explains,
-            shared_percent=100.0 * pair.shared,
-            delta_chi2=pair.preferred,
-        )
-        for pair in diagnosis.alike
-    )
-
-
-def _stability(diagnosis: Diagnosis, causes: tuple[Cause, ...]) -> Stability | None:
-    # Outliers come last and have no standing.
-    again = [standing.again for cause, standing in zip(causes, diagnosis.standings, strict=False) if not cause.is_small]
-    return Stability(len(again[0]), int(np.all(again, axis=0).sum())) if again else None
 
 
 def _unexplained(diagnosis: Diagnosis) -> Unexplained:

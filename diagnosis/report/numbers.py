@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from .result import Cause, Indistinguishable, Interval, Rejected
+from .result import Cause, Interval, Rejected
 
 _DEG = math.degrees(1.0)
 # Factor and unit by the suffix of a number's name; the first match applies.
@@ -129,19 +129,9 @@ def _label(name: str) -> str:
 
 
 def place(what: Cause | Rejected) -> str:
-    """Return effect and joint, as in `joint_coupling of elbow with shoulder`."""
-    return named(what.effect, what.where, what.source)
-
-
-def named(effect: str, where: str | None, source: str | None) -> str:
-    """Return effect and joint in the form of `place`."""
-    at = "" if where is None else f" at {where}"
-    return f"{effect}{at}{'' if source is None else f' from {source}'}"
-
-
-def rival_named(rival: Indistinguishable) -> str:
-    """Return the name and place of a rival, or its description if it has no name."""
-    return rival.what or named(rival.effect, rival.where, rival.source)
+    """Return effect and joint by their names in files, as in `joint_coupling at elbow from shoulder`."""
+    at = "" if what.where is None else f" at {what.where}"
+    return f"{what.effect}{at}{'' if what.source is None else f' from {what.source}'}"
 
 
 def chance(p: float) -> str:

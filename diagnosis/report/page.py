@@ -15,7 +15,7 @@ from bodyschema.diagnosis.report.numbers import chance, mm, share, told_values
 from bodyschema.diagnosis.report.presenters.outliers import outlier_panel
 from bodyschema.diagnosis.report.presenters.registry import presenter_of
 from bodyschema.diagnosis.report.result import Cause, DiagnosisFile, Gain, Verdict
-from bodyschema.diagnosis.report.text import beside_geometry, corrections, finding, in_order, made_to, modelled, to_do
+from bodyschema.diagnosis.report.text import corrections, finding, in_order, made_to, modelled, to_do
 from bodyschema.effects import Effect
 
 from . import tables
@@ -65,7 +65,6 @@ def page(diagnosis: Diagnosis, file: DiagnosisFile, remedies: Sequence[str], abo
         _glance(residuals, file),
         _causes(residuals, file, remedies),
         _tolerances(file),
-        _alike(file),
         _advice(file),
         _where(residuals),
         _against(residuals),
@@ -123,9 +122,6 @@ def _glance(residuals: Residuals, file: DiagnosisFile) -> str:
         (f"{mm(rms.noise_floor)} mm", "noise alone (RMS)"),
         (f"{file.pairs.outliers:,} of {file.pairs.total:,}", f"fixes that are not the marker{_counted(gain)}"),
     ]
-    if file.stability is not None:
-        same = f"{file.stability.same_causes} of {file.stability.resampled}"
-        tiles.append((same, "resampled recordings with the same large causes"))
     items = "".join(f"<div><b>{value}</b><span>{escape(label)}</span></div>" for value, label in tiles)
     return (
         f'<section><div class="tiles">{items}</div><div class="beside"><div>{_panels([histogram(residuals)])}</div>'
@@ -163,7 +159,7 @@ def _cause(
     return (
         f'<details class="cause"{state}><summary>{escape(said[0].upper() + said[1:])}</summary><div class="beside">'
         f"{_panels([plot])}<div><p>{tables.numbers(cause, timed=residuals.timed)}</p><p>{escape(cause.evidence)}</p>"
-        f"{tables.rivals(cause)}<p><b>What to do.</b> {escape(remedy)}</p></div></div></details>"
+        f"{tables.rivals(cause, file.seen_by)}<p><b>What to do.</b> {escape(remedy)}</p></div></div></details>"
     )
 
 
@@ -173,14 +169,6 @@ def _tolerances(file: DiagnosisFile) -> str:
     use = to_do(file, [])[0]
     told = " ".join([made_to(file.tolerances), *use])
     return f'<section id="tolerances"><p>{escape(told)}</p></section>'
-
-
-def _alike(file: DiagnosisFile) -> str:
-    told = beside_geometry(file.rms_mm, file.alike)
-    if not told:
-        return ""
-    pairs = _items(told[1:])
-    return f'<section id="alike"><h2>Beside the best geometry</h2><p>{escape(told[0])}</p><ul>{pairs}</ul></section>'
 
 
 def _advice(file: DiagnosisFile) -> str:

@@ -10,6 +10,8 @@ import msgspec
 SMALL = 5.0
 # A less probable cause leaves the verdict open, and is to be confirmed first.
 SURE = 0.9
+# Fixes that are not the marker, as a cause.
+OUTLIERS = "outliers"
 # Probability of what is no more probable than not.
 _EVEN = 0.5
 Verdict = Literal["explained", "nothing_found", "undecided", "unexplained"]
@@ -62,7 +64,6 @@ class Cause(msgspec.Struct, frozen=True):
     Attributes:
         share_of_gain_percent: share of the explained squared error, tolerances included.
         held_out_gain_percent: rise of the held-out RMS without it, all else refitted.
-        stability_percent: share of block resamplings in which it is named again.
     """
 
     effect: str
@@ -72,7 +73,6 @@ class Cause(msgspec.Struct, frozen=True):
     probability: float
     share_of_gain_percent: float
     held_out_gain_percent: float
-    stability_percent: float | None
     indistinguishable_from: tuple[Indistinguishable, ...]
     rivals: tuple[Indistinguishable, ...]
     evidence: str
@@ -85,7 +85,7 @@ class Cause(msgspec.Struct, frozen=True):
     @property
     def is_small(self) -> bool:
         """True for an effect of little weight; fixes that are not the marker have none."""
-        return self.stability_percent is not None and self.weight_percent < SMALL
+        return self.effect != OUTLIERS and self.weight_percent < SMALL
 
     @property
     def leaves_open(self) -> bool:
@@ -118,26 +118,6 @@ class Rejected(msgspec.Struct, frozen=True):
     held_out_gain_percent: float
     p_value: float
     why: str = ""
-
-
-class Alike(msgspec.Struct, frozen=True):
-    """Two confounded effects at one joint, each fitted alone beside the best geometry.
-
-    Attributes:
-        effect: the one that explains most there.
-        other: the effect confounded with it.
-        explains_percent, other_explains_percent: explained shares of the squared error that the best geometry leaves.
-        shared_percent: share of what `other` explains that `effect` explains too.
-        delta_chi2: Δχ² of `effect` less that of `other`.
-    """
-
-    where: str
-    effect: str
-    other: str
-    explains_percent: float
-    other_explains_percent: float
-    shared_percent: float
-    delta_chi2: float
 
 
 class Unexplained(msgspec.Struct, frozen=True):
@@ -201,13 +181,6 @@ class Errors(msgspec.Struct, frozen=True):
     noise_floor: float | None
 
 
-class Stability(msgspec.Struct, frozen=True):
-    """Number of block resamplings that give the same causes, small ones aside; None where all are small."""
-
-    resampled: int
-    same_causes: int
-
-
 class DiagnosisFile(msgspec.Struct, frozen=True):
     """The contents of `diagnosis.json`.
 
@@ -225,10 +198,8 @@ class DiagnosisFile(msgspec.Struct, frozen=True):
     causes: tuple[Cause, ...]
     rejected: tuple[Rejected, ...]
     unexplained: Unexplained
-    stability: Stability | None
     advice: tuple[str, ...]
     limitations: tuple[str, ...]
-    alike: tuple[Alike, ...] = ()
     tolerances: Tolerances | None = None
     seen_by: Literal["camera", "instrument"] = "camera"
     weighed: bool = True

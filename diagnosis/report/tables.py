@@ -12,10 +12,10 @@ from bodyschema.diagnosis.report.numbers import (
     numbers_of,
     percent,
     place,
-    rival_named,
     share,
     telling,
 )
+from bodyschema.diagnosis.report.presenters.registry import rival_named
 from bodyschema.diagnosis.report.result import Cause, DiagnosisFile, Indistinguishable, Rejected
 from bodyschema.diagnosis.report.text import in_order, other_shares
 
@@ -75,17 +75,17 @@ def _lines(shown: Iterable[Number]) -> str:
     return "<br>".join(f"{escape(n.label)} <b>{escape(n.value)}</b> <small>{escape(n.interval)}</small>" for n in shown)
 
 
-def rivals(cause: Cause) -> str:
+def rivals(cause: Cause, seen_by: str) -> str:
     """Return a list of a cause's rivals; empty if there are none."""
     if not cause.rivals:
         return ""
-    items = "".join(f"<li>{_rival(rival)}" for rival in cause.rivals)
+    items = "".join(f"<li>{_rival(rival, seen_by)}" for rival in cause.rivals)
     return f"<p>It could also be:<ul>{items}</ul>"
 
 
-def _rival(rival: Indistinguishable) -> str:
+def _rival(rival: Indistinguishable, seen_by: str) -> str:
     tell = "no motion tells them apart" if rival.by == "any_motion" else "another motion can tell"
-    what = escape(rival_named(rival))
+    what = escape(rival_named(rival, seen_by))
     return f"<b>{what}</b>, with a probability of {percent(rival.probability)}; {tell}"
 
 

@@ -11,14 +11,14 @@ from bodyschema.diagnosis.assess.nameless import Nameless
 from bodyschema.diagnosis.assess.rivals import Rival, Standing, apart_on, whole_range, widened
 from bodyschema.diagnosis.diagnosis import Diagnosis
 from bodyschema.diagnosis.report.presenters.presenter import Found, Workshop
-from bodyschema.diagnosis.report.presenters.registry import presenter_of
-from bodyschema.diagnosis.search.search import describe
+from bodyschema.diagnosis.report.presenters.registry import named, presenter_of, rival_named
+from bodyschema.effects import Effect
 from bodyschema.effects.unexplained import PLACE
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
 
-from .numbers import named, rival_named, told_values
-from .result import SMALL, SURE, Alike, Cause, DiagnosisFile, Errors, Gain, Interval, Tolerances, Unexplained, Verdict
+from .numbers import told_values
+from .result import SMALL, SURE, Cause, DiagnosisFile, Errors, Gain, Interval, Tolerances, Unexplained, Verdict
 
 # Tolerances that leave at most this share of the error are mentioned.
 _BY_TOLERANCES = 0.95
@@ -89,18 +89,17 @@ def remedies(diagnosis: DiagnosisFile, robot: RobotDescription, steps: FloatArra
     causes = in_order(diagnosis.causes)
     found = [replace(Found.of(cause), weighed=diagnosis.weighed) for cause in causes]
     told = [presenter_of(each.effect).remedy(workshop, what) for each, what in zip(causes, found, strict=True)]
-    return [_if_sure(cause, remedy) for cause, remedy in zip(causes, told, strict=True)]
+    return [_if_sure(cause, remedy, diagnosis.seen_by) for cause, remedy in zip(causes, told, strict=True)]
 
 
-def _if_sure(cause: Cause, remedy: str) -> str:
+def _if_sure(cause: Cause, remedy: str, seen_by: str) -> str:
     """Return the remedy, preceded by what to confirm before any change."""
     open_ones = [rival for rival in cause.rivals if rival.by == "this_motion"]
     if cause.probability >= SURE or not open_ones:
         return remedy
-    rivals = " or ".join(rival_named(rival) for rival in open_ones[:2])
-    return (
-        f"If it is {named(cause.effect, cause.where, cause.source)} and not {rivals}: {remedy[0].lower()}{remedy[1:]}"
-    )
+    rivals = " or ".join(rival_named(rival, seen_by) for rival in open_ones[:2])
+    itself = named(cause.effect, cause.where, cause.source, seen_by)
+    return f"If it is {itself} and not {rivals}: {remedy[0].lower()}{remedy[1:]}"
 
 
 def sentence(
@@ -141,17 +140,16 @@ def sentence(
         figures += f", {named_mm:.3g} mm without the smooth model of the rest"
     elif tolerated_mm is not None and tolerated_mm < _BY_TOLERANCES * rms.aligned:
         figures += f", {tolerated_mm:.3g} mm with tolerances alone"
-    return f"{head}. RMS error {figures}{_open(verdict, causes)}"
+    return f"{head}. RMS error {figures}{_open(verdict, causes, seen_by)}"
 
 
 def _head(causes: Sequence[Cause], tolerances: Tolerances | None, seen_by: str, *, timed: bool, weighed: bool) -> str:
     """Return the largest causes as a sentence without its full stop."""
     ordered = in_order(causes)
     everywhere = ["small errors everywhere"] if tolerances is not None and tolerances.share_percent >= SMALL else []
-    named = [cause for cause in ordered if not (cause.is_correction or (everywhere and cause.is_small))]
-    first = named[:_TOLD]
+    first = [cause for cause in ordered if not (cause.is_correction or (everywhere and cause.is_small))][:_TOLD]
     said = [finding(c.effect, c.where, c.source, told_values(c), seen_by, timed=timed, weighed=weighed) for c in first]
-    told = [clause + _or(cause) for clause, cause in zip(said, first, strict=True)]
+    told = [clause + _or(cause, seen_by) for clause, cause in zip(said, first, strict=True)]
     others = [cause.is_outvoted or cause.is_correction for cause in ordered if cause not in first]
     if more := others.count(False):
         everywhere.append(f"{more} {'smaller' if first else 'small'} cause{'s' * (more > 1)}")
@@ -162,22 +160,22 @@ def _head(causes: Sequence[Cause], tolerances: Tolerances | None, seen_by: str, 
     return head[0].upper() + head[1:]
 
 
-def _or(cause: Cause) -> str:
+def _or(cause: Cause, seen_by: str) -> str:
     """Return the most probable alternative of a cause that is not sure, in parentheses."""
     if not cause.leaves_open:
         return ""
-    return f" ({'more probably' if cause.is_outvoted else 'or'} {rival_named(cause.rivals[0])})"
+    return f" ({'more probably' if cause.is_outvoted else 'or'} {rival_named(cause.rivals[0], seen_by)})"
 
 
-def _open(verdict: Verdict, causes: Sequence[Cause]) -> str:
+def _open(verdict: Verdict, causes: Sequence[Cause], seen_by: str) -> str:
     """Return the part of a verdict's sentence on what remains open."""
     if verdict == "unexplained":
         return ". Part of the error remains unexplained"
     unsure = [cause for cause in causes if cause.leaves_open]
     if verdict != "undecided" or not unsure:
         return ""
-    named = [f"{c.effect}{'' if c.where is None else f' at {c.where}'}" for c in unsure]
-    return f". Not sure: {', '.join(named)}; other causes explain as much"
+    told = [named(c.effect, c.where, c.source, seen_by) for c in unsure]
+    return f". Not sure: {', '.join(told)}; other causes explain as much"
 
 
 def _share(gain: Gain) -> str:
@@ -219,23 +217,6 @@ def to_do(diagnosis: DiagnosisFile, remedies: Sequence[str]) -> tuple[list[str],
     return told, small
 
 
-def beside_geometry(rms: Errors, alike: Sequence[Alike]) -> list[str]:
-    """Return sentences on what the best geometry explains and which effects are confounded; empty if there are none."""
-    if rms.geometry is None or not alike:
-        return []
-    told = [
-        f"The best geometry, with every link, zero, the tool and the camera free, brings {rms.aligned:.3g} mm to "
-        f"{rms.geometry:.3g} mm. What is left can be described in more than one way:"
-    ]
-    for pair in alike:
-        told.append(
-            f"{pair.effect} and {pair.other} at {pair.where} share a direction: alone they explain "
-            f"{pair.explains_percent:.0f} % and {pair.other_explains_percent:.0f} % of what is left, and "
-            f"{pair.shared_percent:.0f} % of the smaller part is the same (Δχ² = {pair.delta_chi2:.0f} for the first)."
-        )
-    return told
-
-
 def modelled(left: Unexplained) -> str:
     """Return one or two sentences on the smooth model in extended.toml; empty if no structure is left."""
     told = []
@@ -253,7 +234,7 @@ def modelled(left: Unexplained) -> str:
     return " ".join(told)
 
 
-def evidence(standing: Standing) -> str:
+def evidence(standing: Standing, seen_by: str) -> str:
     """Return the evidence for a cause in one sentence."""
     text = (
         f"Without it the fit is worse by Δχ² = {standing.gain:.0f} for {standing.dof} number{'s' * (standing.dof > 1)}"
@@ -261,31 +242,37 @@ def evidence(standing: Standing) -> str:
     if not standing.rivals:
         return f"{text}; nothing else comes near."
     rival = standing.rivals[0]
-    return f"{text}; the nearest rival: {rival.described} ({100 * rival.probability:.0f} %)."
+    return f"{text}; the nearest rival: {called(rival.itself, seen_by)} ({100 * rival.probability:.0f} %)."
 
 
-def advice(diagnosis: Diagnosis, causes: Sequence[Cause]) -> tuple[str, ...]:
+def called(cause: Effect | Nameless, seen_by: str) -> str:
+    """Return a cause or an alternative without a name in a few words."""
+    return named(*cause.key, seen_by) if isinstance(cause, Effect) else cause.what
+
+
+def advice(diagnosis: Diagnosis, causes: Sequence[Cause], seen_by: str) -> tuple[str, ...]:
     """Return sentences of advice: motions that would separate confounded causes, and steps against unnamed causes.
 
     Args:
         causes: those of the diagnosis, and perhaps outliers after them.
+        seen_by: the kind of measuring device, as in `DiagnosisFile`.
     """
     told: list[str] = []
     pairs: dict[str, list[str]] = {}
     for cause, standing, found in zip(diagnosis.causes, diagnosis.standings, causes, strict=False):
         for rival in () if found.is_correction else standing.rivals:
+            one, other = called(cause, seen_by), called(rival.itself, seen_by)
             if not rival.is_same_anywhere:
-                pair = f"{describe(cause)} from {rival.described}"
-                pairs.setdefault(_motion(diagnosis, rival), []).append(pair)
+                pairs.setdefault(_motion(diagnosis, rival), []).append(f"{one} from {other}")
             elif not rival.is_one:
                 told.append(
-                    f"No motion tells {describe(cause)} from {rival.described}, which can do more besides: "
+                    f"No motion tells {one} from {other}, which can do more besides: "
                     "a longer recording of the same kind would show whether it does that."
                 )
-            elif rival.effect is not None:
-                told.append(f"No motion tells {describe(cause)} from {rival.described}: fix whichever is easier.")
-            if isinstance(rival.instead, Nameless):
-                told.append(f"Watch whether {rival.described}: {_WATCH[rival.instead.kind]}.")
+            elif isinstance(rival.itself, Effect):
+                told.append(f"No motion tells {one} from {other}: fix whichever is easier.")
+            if isinstance(rival.itself, Nameless):
+                told.append(f"Watch whether {other}: {_WATCH[rival.itself.kind]}.")
     told = [f"To tell {_some(told_apart)}, {motion}." for motion, told_apart in pairs.items()] + told
     if diagnosis.left.rattle is not None:
         told.append(f"Fasten the marker: {diagnosis.left.rattle.what}.")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bodyschema.diagnosis.fit.fit import Fit
-from bodyschema.diagnosis.fit.worth import NAMED, nats
+from bodyschema.diagnosis.fit.worth import NAMED, nats, rise_for
 from bodyschema.effects import Effect
 
 from .scan import Scan
@@ -25,8 +25,9 @@ def with_small_ripples(fit: Fit) -> Fit:
         robot, scan = fit.simulation.robot, Scan(fit)
         moving = np.flatnonzero(np.ptp(fit.observations.motion.q, axis=0) > 0.0)
         found: list[Effect] = []
+        least = 2.0 * rise_for(NAMED + np.log(len(moving)), 2)
         for k in moving:
-            candidate = scan.candidate(Effect.at(robot, "joint_ripple", robot.joints[k]))
+            candidate = scan.candidate(Effect.at(robot, "joint_ripple", robot.joints[k]), least)
             if candidate is None or not fit.background.tolerates(candidate.effect) or _is_there(fit, candidate.effect):
                 continue
             if nats(candidate.gain, candidate.dof) - np.log(len(moving) * candidate.trials) > NAMED:

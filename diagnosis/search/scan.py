@@ -180,47 +180,6 @@ class Scan:
     def _left_out(self) -> Identity | None:
         return self._besides[self._state - 1] if self._state else None
 
-    def best_pair(self, hypotheses: Iterable[Effect]) -> tuple[Candidate, Candidate] | None:
-        """Return the two effects of one amount each that explain most together; None where there are not two.
-
-        The moment of an effect is the one at which it explains most alone.
-        """
-        alone = [self._alone(effect) for effect in hypotheses if len(effect.amounts) == 1 and not effect.shapes]
-        singles = [one for one in alone if one is not None]
-        if len(singles) < 2:
-            return None
-        run = self._fit.run
-        columns = np.concatenate([run.columns(one.effect)[:, :, one.effect.amounts] for one in singles], axis=2)
-        inner, toward, raw = (part[0] for part in self._products.of(self._fit.weighted(columns)).at(self._state))
-        # Normalise by each column's length beside the fit; collinear pairs are left out.
-        lengths = np.sqrt(np.maximum(np.diag(inner), 0.0))
-        told = lengths > np.sqrt(_TOLD_APART * raw)
-        lengths = np.where(told, lengths, np.inf)
-        shared = inner / np.outer(lengths, lengths)
-        alone = toward / lengths
-        apart = 1.0 - np.square(shared)
-        squares = np.square(alone)[:, None] + np.square(alone) - 2.0 * shared * np.outer(alone, alone)
-        usable = np.outer(told, told) & (apart > _TOLD_APART)
-        explained = np.where(usable, squares / np.maximum(apart, _TOLD_APART), 0.0)
-        one, other = np.unravel_index(int(np.argmax(explained)), explained.shape)
-        if explained[one, other] <= 0.0:
-            return None
-        amounts = (alone[[one, other]] - shared[one, other] * alone[[other, one]]) / apart[one, other]
-        rss = self._products.squares[self._state]
-        gain = -3.0 * self._products.rows * np.log1p(-min(explained[one, other] / rss, 0.999999))
-        values = amounts / lengths[[one, other]]
-        pair = [
-            replace(singles[k], effect=_with_amounts(singles[k].effect, values[[place]]), gain=float(gain), dof=1)
-            for place, k in enumerate((int(one), int(other)))
-        ]
-        return pair[0], pair[1]
-
-    def _alone(self, effect: Effect) -> Candidate | None:
-        """Return an effect of one amount as one of a pair, with its moment if any; None if not identifiable."""
-        if effect.kind.begins:
-            return self._moment(effect)
-        return Candidate(effect, 0.0, 1) if effect.kind.is_linear else None
-
     def _finely(self, effect: Effect, shapes: FloatArray, least: float) -> Candidate | None:
         """Return the best of an effect with one shape parameter, over increasing shapes (m,), then between them."""
         # Each place without a cause uses the same coarse shapes.

@@ -13,7 +13,7 @@ from scipy.special import chdtri
 from bodyschema.diagnosis.fit.fit import Fit, improved
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.fit.scatter import beyond_single_rows, instruments, remembers
-from bodyschema.diagnosis.fit.worth import ANOTHER, NAMED, choices, nats, rise_for
+from bodyschema.diagnosis.fit.worth import NAMED, choices, nats, rise_for
 from bodyschema.effects import Effect, Identity
 
 from .held_out import Blocks, block_p_value
@@ -27,8 +27,6 @@ _WORTH_IN_FULL = 0.2
 _MOST_CAUSES, _MOST_STEPS = 12, 20
 # More jumps, slips and bumps than this in one recording describe something that comes and goes.
 _MOST_MOMENTS = 3
-# Check for completeness each time after this many further causes.
-_ASKED_EACH = 3
 # Maximum of sets of causes to examine; none is examined twice.
 _MOST_SETS = 60
 # Multiple of a limit, and the margin to it [nats], beyond which the first order decides.
@@ -44,12 +42,10 @@ _OF_SINGLE_ROWS = 10.0
 _ELSEWHERE = 1.0
 # A period that explains less than before by this has diverged [nats].
 _ASTRAY = 5.0
-# An exchange with a smaller loss may pay off with one further cause [nats].
-_WITH_ONE_MORE = 100.0
 # With fewer blocks of time, p-values are too coarse; a gain above this needs no p-value [nats].
 _FEW_BLOCKS, _BEYOND_DOUBT = 20, 30.0
-# The camera's pose and the marker's position are simpler than the adjacent link, and so are two effects of one amount.
-_OF_A_LINK, _OF_A_PAIR = 1, 2
+# The camera's pose and the marker's position are simpler than the adjacent link.
+_OF_A_LINK = 1
 
 
 class Beside:
@@ -95,9 +91,9 @@ class Beside:
         least = self._fit.log_likelihood - rise
         return improved(self._fit.starting(self._others), least).log_likelihood > least
 
-    def with_instead(self, *effects: Effect, least: float = -np.inf) -> Fit:
-        """Refit with others in the place of the cause; give up where `least` is out of reach [nats]."""
-        return improved(self._fit.starting([*self._others, *effects]), least)
+    def elsewhere(self, least: float) -> Fit:
+        """Refit with the best moment or period of the cause; give up where `least` is out of reach [nats]."""
+        return improved(self._fit.starting([*self._others, self.itself.effect]), least)
 
     def exchanged(self, candidate: Candidate, least: float) -> Fit:
         """Refit with a candidate in the place of the cause; the best such fit is kept."""
@@ -131,36 +127,24 @@ class Search:
         self.path: list[Fit] = []
         self.ended_early = False
 
-    def run(self, start: Fit, enough: Callable[[Sequence[Fit], float], bool] = lambda *_: False) -> Fit:
+    def run(self, start: Fit) -> Fit:
         """Find the causes on top of the parameters that `start` has fitted.
 
         Afterwards `ended_early` is True if the number of steps ended the search before it converged.
-
-        Args:
-            enough: called with the fits so far and the worth of one more cause [nats]; True ends the search.
         """
-        fit, self.ended_early, asked = start, False, 0
+        fit, self.ended_early = start, False
         self._seen: set[Named] = set()
         self.path = [start]
         if start.causes:
             fit = self._reviewed(start)
             self._went_to(fit)
         while len(self.path) <= _MOST_STEPS and len(fit.causes) <= _MOST_CAUSES and len(self._seen) < _MOST_SETS:
-            added, worth = self._added(fit)
-            if added is not None and len(fit.causes) >= asked + _ASKED_EACH:
-                asked = len(fit.causes)
-                if enough(self.path, worth):
-                    break
-            better = added or self._two_in_place_of_one(fit) or self._simpler_and_one_more(fit)
-            if better is None:
+            added = self._added(fit)
+            if added is None or (causes := named(added.causes)) in self._seen:
                 break
-            causes = named(better.causes)
-            if causes in self._seen:
-                break
-            if added is not None:
-                self._tell(f"found {describe(added.causes[-1])}")
+            self._tell(f"found {describe(added.causes[-1])}")
             self._seen.add(causes)
-            fit = self._reviewed(better)
+            fit = self._reviewed(added)
             self._went_to(fit)
         is_long = len(self.path) > _MOST_STEPS or len(self._seen) >= _MOST_SETS
         self.ended_early = is_long or len(fit.causes) > _MOST_CAUSES
@@ -171,8 +155,8 @@ class Search:
         self.path[-1] = replace(self.path[-1])
         self.path.append(fit)
 
-    def _added(self, fit: Fit) -> tuple[Fit | None, float]:
-        """Add one more cause and return its worth [nats]; None if no candidate is probable enough."""
+    def _added(self, fit: Fit) -> Fit | None:
+        """Add one more cause; None if no candidate is probable enough."""
         best, most = None, NAMED
         known = self._known[1] if self._known[0] is fit else None
         for candidate in self.shortlist(known or Scan(fit), self._open(fit)):
@@ -186,67 +170,7 @@ class Search:
             worth = nats(gain, candidate.dof) - doubt
             if worth > most and tried.causes[-1].is_possible:
                 best, most = tried, worth
-        return best, most
-
-    def is_complete(self, fit: Fit) -> bool:
-        """Return True if no further cause is worth naming."""
-        return self._added(fit)[0] is None
-
-    def _two_in_place_of_one(self, fit: Fit) -> Fit | None:
-        """Replace a cause of many parameters by two causes of one parameter each; None if it does not pay."""
-        for cause in fit.causes:
-            beside = self.beside(fit, cause)
-            if simplicity(cause) <= _OF_A_PAIR:
-                continue
-            open_ones = [effect for effect in self._open(fit) if effect.key != cause.key]
-            pair = self._scan(fit).without(cause).best_pair(open_ones)
-            if pair is None or pair[0].gain < _COMES_NEAR * beside.itself.gain:
-                continue
-            pair = self._with_moments(beside.without, pair)
-            doubts = self.doubt(beside.itself) - self._doubt_of_pair(*pair)
-            dof = len(pair) - beside.itself.dof
-            least = fit.log_likelihood + rise_for(-doubts, dof)
-            tried = beside.with_instead(*(one.effect for one in pair), least=least)
-            worth = nats(2.0 * (tried.log_likelihood - fit.log_likelihood), dof) + doubts
-            if worth > 0.0 and named(tried.causes) not in self._seen and all(c.is_possible for c in tried.causes):
-                self._tell(f"exchanged {describe(cause)} for {' and '.join(describe(one.effect) for one in pair)}")
-                return tried
-        return None
-
-    def _doubt_of_pair(self, one: Candidate, other: Candidate) -> float:
-        """Return the multiplicity penalty of two causes named together [nats]."""
-        alike = one.effect.kind is other.effect.kind
-        further = min(self.doubt(other), ANOTHER + float(np.log(other.trials))) if alike else self.doubt(other)
-        return self.doubt(one) + further
-
-    def _with_moments(self, fit: Fit, pair: tuple[Candidate, Candidate]) -> tuple[Candidate, Candidate]:
-        """Return two candidates; the moment of each is the best one beside the other."""
-        one, other = pair
-        if one.effect.kind.begins:
-            one = Scan(fit.with_causes([*fit.causes, other.effect])).candidate(one.effect) or one
-        if other.effect.kind.begins:
-            other = Scan(fit.with_causes([*fit.causes, one.effect])).candidate(other.effect) or other
-        return one, other
-
-    def _simpler_and_one_more(self, fit: Fit) -> Fit | None:
-        """Replace a cause by a simpler rival and add another cause; None if it does not pay.
-
-        A cause of many parameters may stand for a simpler one and a small one together.
-        """
-        for cause in fit.causes:
-            beside = self.beside(fit, cause)
-            for candidate in beside.candidates:
-                if candidate.dof >= beside.itself.dof or candidate.gain < _COMES_NEAR * beside.itself.gain:
-                    continue
-                tried, worth = self._exchanged(fit, beside, candidate, -_WITH_ONE_MORE)
-                if worth < -_WITH_ONE_MORE or named(tried.causes) in self._seen or not tried.causes[-1].is_possible:
-                    continue
-                better, more = self._added(tried)
-                if better is not None and worth + more > 1.0:
-                    found = f"{describe(candidate.effect)} and {describe(better.causes[-1])}"
-                    self._tell(f"exchanged {describe(cause)} for {found}")
-                    return better
-        return None
+        return best
 
     def _exchanged(self, fit: Fit, beside: Beside, candidate: Candidate, least: float) -> tuple[Fit, float]:
         """Exchange a cause for a candidate, and return the evidence gain [nats]; approximate if below `least`."""
@@ -369,7 +293,7 @@ class Search:
         """Return the fit with a cause refined, dropped or exchanged; None if it stays as it is."""
         beside = self.beside(fit, cause)
         if beside.itself.gain > beside.gain + _ELSEWHERE:
-            tried = beside.with_instead(beside.itself.effect, least=fit.log_likelihood + _ELSEWHERE)
+            tried = beside.elsewhere(fit.log_likelihood + _ELSEWHERE)
             if tried.log_likelihood > fit.log_likelihood + _ELSEWHERE:
                 return tried
         if beside.in_parts is not None and beside.in_parts.effect.free != cause.free:

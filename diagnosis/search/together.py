@@ -53,7 +53,7 @@ _MOST_REFITTED, _COMES_NEAR = 8, 15.0
 # Tolerances may stand for a cause of which they leave less than this share of the squares; a third is left of a jump.
 _FOLLOWED = 0.1
 
-_LOG_SMALLEST, _LOG_MOST = math.log(_SMALLEST), math.log(MOST)
+_LOG_SMALLEST, _LOG_MOST, _SCALES = math.log(_SMALLEST), math.log(MOST), len(Scales())
 
 dpotrf, dpotri, dpotrs = get_lapack_funcs(("potrf", "potri", "potrs"), dtype=np.float64)
 
@@ -64,9 +64,9 @@ class Tolerated:
 
     Attributes:
         scales: the most probable ones.
-        unsure: standard deviations of their logarithms (3,).
-        seen: True for scales that show in the data (3,).
-        most: the largest ones (3,) that the data do not rule out with 95 %; of use where they do not show.
+        unsure: standard deviations of their logarithms (4,).
+        seen: True for scales that show in the data (4,).
+        most: the largest ones (4,) that the data do not rule out with 95 %; of use where they do not show.
     """
 
     scales: Scales
@@ -84,7 +84,7 @@ class Together:
         worth: its evidence less the cost of naming its causes [nats]; comparable only with that of other sets.
         scales: scales of the tolerances.
         sigma: size of the noise, in units of the stated one.
-        spent: effective number of data that determine each scale (3,).
+        spent: effective number of data that determine each scale (4,).
         amounts: amounts of all its columns (p,).
         factor: factor of their precision, from `cho_factor`.
         columns: indices of its columns (p,).
@@ -318,7 +318,7 @@ class Sets:
         inner, toward = self._inner[np.ix_(columns, columns)], self._toward[columns]
         logs = np.log(near.scales if near else Scales())
         sigma = near.sigma if near else self._noise
-        members, spent = (group == np.arange(3)[:, None]).astype(np.float64), np.zeros(3)
+        members, spent = (group == np.arange(_SCALES)[:, None]).astype(np.float64), np.zeros(_SCALES)
         for done in range(_ROUNDS if near is None else _ROUNDS_NEAR):
             factor, variances, amounts = self._solved(inner, toward, group, logs, sigma)
             told = 1.0 - dpotri(factor[0], lower=True)[0].diagonal() / variances
@@ -326,41 +326,42 @@ class Sets:
             spent, squares = members @ told, members @ (np.square(amounts) / variances)
             steps = (squares - spent - logs / SPREAD**2) / (2.0 * np.maximum(spent, 0.5) + 1.0 / SPREAD**2)
             steps = np.minimum(np.maximum(steps, -_FARTHEST), _FARTHEST)
+            moved = np.minimum(np.maximum(logs + steps, _LOG_SMALLEST), _LOG_MOST)
             rss = self._square - 2.0 * float(amounts @ toward) + float(amounts @ inner @ amounts)
             free = max(self._rows - float(told.sum()), 1.0)
             quieter = 0.5 * math.log(max(rss, 1e-300) / free) - math.log(sigma)
             quieter = min(max(quieter, -_FARTHEST), _FARTHEST)
-            if done and max(np.abs(steps).max(), abs(quieter)) < _STILL:
+            if done and max(np.abs(moved - logs).max(), abs(quieter)) < _STILL:
                 break
-            logs = np.minimum(np.maximum(logs + steps, _LOG_SMALLEST), _LOG_MOST)
+            logs = moved
             sigma = max(sigma * math.exp(quieter), _QUIETEST * self._noise)
         worth, factor, amounts = self._worth(inner, toward, group, logs, sigma)
         scales = Scales(*np.exp(logs).tolist())
         worth -= scales.doubt + _volume(spent)
-        if max(scales) < _MAY_BE_EXACT:
-            exact = self._worth(inner, toward, group, np.full(3, _LOG_SMALLEST), sigma)
+        if math.exp(logs[members.any(axis=1)].max()) < _MAY_BE_EXACT:
+            exact = self._worth(inner, toward, group, np.full(_SCALES, _LOG_SMALLEST), sigma)
             if exact[0] > worth:
-                (worth, factor, amounts), scales = exact, Scales(*[_SMALLEST] * 3)
+                (worth, factor, amounts), scales = exact, Scales(*[_SMALLEST] * _SCALES)
         worth -= self._cost(chosen)
         return Together(chosen, worth, scales, sigma, spent, amounts, factor, columns)
 
     def shown(self, here: Together) -> NDArray[np.bool_]:
-        """Return True for each scale without whose tolerances the data would be much less probable (3,)."""
+        """Return True for each scale without whose tolerances the data would be much less probable (4,)."""
         inner, toward = self._inner[np.ix_(here.columns, here.columns)], self._toward[here.columns]
         group = self._group(here.columns)
         whole = self._worth(inner, toward, group, np.log(here.scales), here.sigma)[0]
         without = []
-        for g in range(3):
+        for g in range(_SCALES):
             logs = np.log(here.scales)
             logs[g] = _LOG_SMALLEST
             without.append(self._worth(inner, toward, group, logs, here.sigma)[0])
         return whole - np.array(without) > _SHOWN
 
     def largest(self, here: Together) -> FloatArray:
-        """Return the largest scales (3,), each beside the others as they are, that the data do not rule out."""
+        """Return the largest scales (4,), each beside the others as they are, that the data do not rule out."""
         inner, toward = self._inner[np.ix_(here.columns, here.columns)], self._toward[here.columns]
         group, found = self._group(here.columns), np.array(here.scales)
-        for g in range(3):
+        for g in range(_SCALES):
             logs, best = np.log(here.scales), -np.inf
             while logs[g] < _LOG_MOST:
                 worth = self._worth(inner, toward, group, logs, here.sigma)[0]
@@ -434,7 +435,7 @@ def _parts(effect: Effect) -> list[tuple[object, ...]]:
 
 
 def _volume(spent: FloatArray) -> float:
-    """Return what integrating over the scales costs beyond taking the best, from the data spent on each (3,) [nats]."""
+    """Return what integrating over the scales costs beyond taking the best, from the data spent on each (4,) [nats]."""
     return float(0.5 * np.log1p(2.0 * spent * SPREAD**2).sum())
 
 
@@ -487,7 +488,8 @@ def together(start: Fit, hypotheses: Sequence[Effect], tell: Callable[[str], Non
 def tolerated(fit: Fit) -> Tolerated:
     """Return the scales of tolerances with the most evidence beside the causes of a fit."""
     if fit.background.scales is None:
-        return Tolerated(Scales(), np.full(3, SPREAD), np.zeros(3, dtype=np.bool_), np.full(3, MOST))
+        unseen = np.zeros(_SCALES, dtype=np.bool_)
+        return Tolerated(Scales(), np.full(_SCALES, SPREAD), unseen, np.full(_SCALES, MOST))
     causes = [Candidate(cause, 0.0, 1) for cause in fit.causes]
     sets = Sets(fit, causes, 0.0)
     here = sets.of(tuple(range(len(causes))))

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import chdtri
 
 from bodyschema.diagnosis.fit.background import rows_in_part
-from bodyschema.diagnosis.fit.fit import Fit, solved
+from bodyschema.diagnosis.fit.fit import Fit, Noise, solved
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.fit.worth import nats
 from bodyschema.diagnosis.search.held_out import FEWEST_ROWS_A_BLOCK, Blocks, held_out_square, scores_p_value
@@ -155,7 +155,9 @@ class Unknowns:
         self._start, self._run = start, start.run
         self._families = families(start.run)
         self._prepared: dict[int, Way] = {}
-        self._near: WeakKeyDictionary[Fit, dict[tuple[Way, ...], list[tuple[Way, float]]]] = WeakKeyDictionary()
+        # By the noise of a fit, which copies of the fit share.
+        self._near: WeakKeyDictionary[Noise, dict[tuple[Way, ...], list[tuple[Way, float]]]] = WeakKeyDictionary()
+        self._apart: WeakKeyDictionary[Noise, dict[tuple[Way, ...], Apart]] = WeakKeyDictionary()
 
     def _way(self, k: int) -> Way:
         """Return a family, prepared on first use."""
@@ -182,7 +184,7 @@ class Unknowns:
 
     def nearest(self, fit: Fit, others: Sequence[Way] = ()) -> list[tuple[Way, float]]:
         """Return the families that may be best beside a fit and others, with their first-order worth [nats]."""
-        known = self._near.setdefault(fit, {})
+        known = self._near.setdefault(fit.noise, {})
         if tuple(others) not in known:
             known[tuple(others)] = self._ranked(fit, others)
         return known[tuple(others)]
@@ -243,6 +245,12 @@ class Unknowns:
         Args:
             start: a fit with some of the families.
         """
+        done = self._apart.setdefault(fit.noise, {})
+        if tuple(chosen) not in done:
+            done[tuple(chosen)] = self._fitted_apart(fit, chosen, start)
+        return done[tuple(chosen)]
+
+    def _fitted_apart(self, fit: Fit, chosen: Sequence[Way], start: Apart | None) -> Apart:
         known = {} if start is None else dict(zip(start.chosen, start.numbers, strict=True))
         numbers = tuple(known.get(way, np.zeros(len(way.scales))) for way in chosen)
         # No function is expected to exceed twice the whole residual.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -84,20 +83,9 @@ class Play:
 
     def follow(self, reading: float) -> float:
         """Return the output for the next reading."""
-        return self.followed([reading])[0]
-
-    def followed(self, readings: Sequence[float]) -> list[float]:
-        """Return the outputs for the next readings."""
-        half, outputs = self._half, []
-        output = readings[0] if self._output is None else self._output
-        for reading in readings:
-            if output < reading - half:
-                output = reading - half
-            elif output > reading + half:
-                output = reading + half
-            outputs.append(output)
-        self._output = output
-        return outputs
+        output = reading if self._output is None else self._output
+        self._output = min(max(output, reading - self._half), reading + self._half)
+        return self._output
 
 
 def played(q: FloatArray, width: float) -> FloatArray:
@@ -106,11 +94,16 @@ def played(q: FloatArray, width: float) -> FloatArray:
     Between two runs it is driven straight from the last reading of one to the first of the next: the side at the end of
         the run is known, and a long move ends on its own side.
     """
-    moves = np.diff(q)
+    moves, half = np.diff(q), 0.5 * width
     leading = moves[np.flatnonzero(moves)[:1]]
-    play = Play(width)
-    play.begin(float(q[0]), float(leading[0]) if len(leading) else 0.0)
-    return np.array(play.followed(q.tolist())) - q
+    begun = q[0] - half * float(np.sign(leading[0])) if len(leading) else q[0]
+    # Each reading limits the output to its own range; so do several in a row, which are combined by doubling.
+    low, high, back = q - half, q + half, 1
+    while back < len(q):
+        earlier = low[:-back], high[:-back]
+        low[back:], high[back:] = (np.clip(one, low[back:], high[back:]) for one in earlier)
+        back *= 2
+    return np.clip(begun, low, high) - q
 
 
 @lru_cache(maxsize=_PLAYS_KEPT)

@@ -71,7 +71,6 @@ def _cause(name: str, *listed: Indistinguishable, probability: float = 0.99, **n
         probability=probability,
         share_of_gain_percent=100.0,
         held_out_gain_percent=50.0,
-        stability_percent=100.0,
         indistinguishable_from=listed,
         rivals=listed,
         evidence="",
@@ -99,7 +98,6 @@ def _file(*causes: Cause, verdict: str = "explained", depends_on: tuple[str, ...
         causes=causes,
         rejected=(),
         unexplained=Unexplained(0.0, depends_on, 0.5),
-        stability=None,
         advice=(),
         limitations=(),
     )

@@ -193,8 +193,8 @@ def test_rivals_are_told_with_what_would_tell_them_apart(found) -> None:
     )
     cause = msgspec.structs.replace(found.causes[0], rivals=rivals)
     text = " ".join(printed(msgspec.structs.replace(found, causes=(cause,))).split())
-    assert "may be backlash at wrist (30 %); another motion can tell" in text
-    assert "may be camera_pose (20 %); no motion tells them apart" in text
+    assert "may be play of joint wrist (30 %); another motion can tell" in text
+    assert "may be a wrong place of the camera (20 %); no motion tells them apart" in text
 
 
 def test_what_fits_no_effect_is_told_with_its_joints(found) -> None:

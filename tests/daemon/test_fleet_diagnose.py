@@ -135,7 +135,6 @@ def result(name: str, *effects: str) -> Diagnosed:
             probability=0.99,
             share_of_gain_percent=100.0,
             held_out_gain_percent=50.0,
-            stability_percent=None,
             indistinguishable_from=(),
             rivals=(),
             evidence="",
@@ -153,7 +152,6 @@ def result(name: str, *effects: str) -> Diagnosed:
         causes=causes,
         rejected=(),
         unexplained=Unexplained(0.0, (), 1.0),
-        stability=None,
         advice=(),
         limitations=(),
     )

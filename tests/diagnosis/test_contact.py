@@ -9,7 +9,6 @@ import pytest
 from planted_cases import INTERVAL_S, SHOULDER, desk_arm, measured, motion_of, seen, walk
 
 from bodyschema.diagnosis.fit.alignment import aligned
-from bodyschema.diagnosis.fit.contact import doubtful
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.effects import Effect, Motion, Simulation
@@ -37,19 +36,19 @@ def in_runs(robot: RobotDescription, *effects: Effect) -> Fit:
 
 
 def test_a_joint_that_settles_is_at_rest_when_it_has_forgotten_what_was_before_the_run(robot) -> None:
-    lacking = doubtful(in_runs(robot, Effect.at(robot, "settling", SHOULDER, values=[0.3, 0.3])))
+    lacking = in_runs(robot, Effect.at(robot, "settling", SHOULDER, values=[0.3, 0.3])).doubtful()
     rows = np.flatnonzero(lacking[:RUN])
     # 0.3 and 0.09 of it are more than a twentieth, 0.027 is not; the first row is never trusted in a walk.
     np.testing.assert_array_equal(rows, [1, 2])
 
 
 def test_a_joint_that_remembers_nothing_is_at_rest_at_once(robot) -> None:
-    assert not doubtful(in_runs(robot, Effect.at(robot, "settling", SHOULDER, values=[0.3, 0.0]))).any()
+    assert not in_runs(robot, Effect.at(robot, "settling", SHOULDER, values=[0.3, 0.0])).doubtful().any()
 
 
 def test_a_run_that_begins_in_mid_move_makes_no_outliers_beyond_the_rows_before_rest(robot) -> None:
     fit = in_runs(robot, Effect.at(robot, "settling", SHOULDER, values=[0.5, 0.3]))
-    again = aligned(fit.observations.without(doubtful(fit)), Simulation(robot)).with_causes(fit.causes)
+    again = aligned(fit.observations.without(fit.doubtful()), Simulation(robot)).with_causes(fit.causes)
     assert fit.noise.share > 0.02
     assert again.noise.share < 0.005
 

@@ -50,7 +50,6 @@ def cause(effect: Effect, **more) -> Cause:
         told["probability"],
         100.0,
         1.0,
-        100.0,
         (),
         told["rivals"],
         "",
@@ -60,7 +59,7 @@ def cause(effect: Effect, **more) -> Cause:
 def told(robot: RobotDescription, *causes: Cause, step: float = 0.0, torque: float | None = None) -> list[str]:
     file = DiagnosisFile(
         "explained", "", Pairs(1, 1, 0), ERRORS, ERRORS, Gain(0.0, (0.0, 0.0)), causes, (), Unexplained(0.0, (), 1.0),
-        None, (), (),
+        (), (),
     )  # fmt: skip
     d = len(robot.joints)
     return remedies(file, robot, np.full(d, step), None if torque is None else np.full(d, torque))
@@ -155,7 +154,7 @@ def test_of_a_cause_that_may_be_another_one_that_is_said_first(robot) -> None:
     effect = Effect.at(robot, "backlash", "elbow_pitch", values=[0.01])
     rival = Indistinguishable("settling", "elbow_pitch", None, "this_motion", 0.4)
     remedy = told(robot, cause(effect, probability=0.6, rivals=(rival,)))[0]
-    assert remedy.startswith("If it is backlash at elbow_pitch and not settling at elbow_pitch: tighten")
+    assert remedy.startswith("If it is play of joint elbow_pitch and not joint elbow_pitch read before")
 
 
 def test_numbers_have_the_digits_that_their_interval_has() -> None:

@@ -46,7 +46,7 @@ def test_a_cause_that_no_motion_tells_from_its_rival_is_as_sure_as_both_together
 
 def test_of_causes_that_no_motion_tells_apart_the_advice_is_to_mend_either(turned_camera) -> None:
     assert conclusion(turned_camera).advice == (
-        f"No motion tells camera_pose from link_geometry at {BASE}: fix whichever is easier.",
+        f"No motion tells a wrong place of the camera from a wrong link before joint {BASE}: fix whichever is easier.",
     )
 
 
@@ -126,7 +126,7 @@ def test_effects_that_are_only_small_are_not_said_to_be_the_same_in_any_motion()
     rivals = [rival for standing in found.standings for rival in standing.rivals]
     assert rivals
     assert not any(rival.is_same_anywhere for rival in rivals)
-    assert conclusion(found).advice[0].startswith("To tell joint_eccentricity")
+    assert conclusion(found).advice[0].startswith("To tell an eccentric encoder of joint ")
 
 
 def test_a_rival_that_can_do_more_than_a_cause_does_not_make_it_surer() -> None:
@@ -135,11 +135,13 @@ def test_a_rival_that_can_do_more_than_a_cause_does_not_make_it_surer() -> None:
     truth = Effect.at(robot, "encoder_jump", robot.joints[-1], values=[0.02, float(motion.clock[ROWS // 2]) + 0.01])
     found = diagnosed(robot, motion, truth, ("encoder_jump", "tool_slip"))
     (standing,) = found.standings
-    (rival,) = (rival for rival in standing.rivals if rival.effect is not None and rival.effect.name == "tool_slip")
+    (rival,) = (
+        rival for rival in standing.rivals if isinstance(rival.itself, Effect) and rival.itself.name == "tool_slip"
+    )
     assert rival.is_same_anywhere
     assert not rival.is_one
     assert standing.probability < 1.0 - rival.probability + 1e-9
-    assert any("from tool_slip, which can do more besides" in line for line in conclusion(found).advice)
+    assert any("from a marker that slipped, which can do more besides" in line for line in conclusion(found).advice)
 
 
 def test_a_cause_that_nothing_else_comes_near_has_no_rivals() -> None:

@@ -128,44 +128,6 @@ def test_a_play_is_found_with_its_width(robot, width) -> None:
     assert start.with_causes([candidate.effect]).causes[0].value("width_rad") == pytest.approx(width, rel=0.05)
 
 
-def test_the_best_pair_is_what_both_together_would_explain(robot) -> None:
-    planted = (
-        Effect.at(robot, "joint_offset", SHOULDER, values=[0.004]),
-        Effect.at(robot, "joint_scale", ELBOW, values=[-0.003]),
-    )
-    start = start_of(robot, walk(robot, 6), planted, 6)
-    hypotheses = [
-        Effect.at(robot, name, joint) for name in ("joint_offset", "joint_scale") for joint in (BASE, SHOULDER, ELBOW)
-    ]
-    pair = Scan(start).best_pair(hypotheses)
-    assert pair is not None
-    assert {one.effect.key for one in pair} == {effect.key for effect in planted}
-    for one in pair:
-        (true,) = [effect.values[0] for effect in planted if effect.key == one.effect.key]
-        assert one.effect.values[0] == pytest.approx(true, rel=0.2)
-
-
-def test_one_effect_is_no_pair(robot) -> None:
-    start = start_of(robot, walk(robot, 6), (), 6)
-    assert Scan(start).best_pair([Effect.at(robot, "joint_offset", SHOULDER)]) is None
-
-
-def test_one_of_the_best_pair_may_begin_at_the_moment_at_which_it_would_explain_most_alone(robot) -> None:
-    planted = (
-        Effect.at(robot, "encoder_jump", ELBOW, values=[0.01, 35.1]),
-        Effect.at(robot, "joint_scale", SHOULDER, values=[0.02]),
-    )
-    kinds = ("joint_offset", "joint_scale", "encoder_jump")
-    hypotheses = [Effect.at(robot, name, joint) for name in kinds for joint in (BASE, SHOULDER, ELBOW)]
-    scan = Scan(start_of(robot, walk(robot, 3), planted, 3))
-    pair, alone = scan.best_pair(hypotheses), scan.candidate(Effect.at(robot, "encoder_jump", ELBOW))
-    assert pair is not None
-    assert alone is not None
-    assert {one.effect.key for one in pair} == {effect.key for effect in planted}
-    jump = next(one for one in pair if one.effect.name == "encoder_jump")
-    assert jump.effect.values[1] == alone.effect.values[1]
-
-
 def test_a_scan_without_a_cause_sees_what_a_fit_without_it_leaves(robot) -> None:
     truth = [
         Effect.at(robot, "joint_offset", SHOULDER, values=[0.004]),

@@ -11,6 +11,7 @@ from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.worth import NAMED, nats, rise_for
 from bodyschema.diagnosis.search.scan import Scan
 from bodyschema.diagnosis.search.search import Search, simplicity
+from bodyschema.diagnosis.search.together import together
 from bodyschema.effects import Effect
 from bodyschema.robot.description import RobotDescription
 
@@ -222,7 +223,7 @@ def test_two_offsets_are_named_rather_than_the_link_between_them_that_can_do_bot
     )
     start = start_of(robot, walk(robot, 6), offsets, 6)
     hypotheses = [Effect.at(robot, "link_geometry", SHOULDER), *map(at_rest, offsets)]
-    found = Search(hypotheses, lambda _: None).run(start)
+    found = Search(hypotheses, lambda _: None).run(together(start, hypotheses))
     assert names(found) == {("joint_offset", BASE), ("joint_offset", SHOULDER)}
 
 

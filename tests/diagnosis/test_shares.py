@@ -37,7 +37,7 @@ def test_a_zero_has_its_share_though_a_link_could_turn(divided: Shares) -> None:
 
 def _cause(joint: str, probability: float, share: float, gain: float) -> Cause:
     rivals = (Indistinguishable("settling", joint, None, "this_motion", 1.0 - probability),)
-    return Cause("backlash", joint, None, {}, probability, share, gain, 100.0, (), rivals, "")
+    return Cause("backlash", joint, None, {}, probability, share, gain, (), rivals, "")
 
 
 def test_a_cause_of_little_weight_leaves_the_verdict_decided() -> None:
@@ -54,5 +54,5 @@ def test_what_weighs_most_comes_first() -> None:
 
 
 def test_fixes_that_are_not_the_marker_come_before_what_may_wait() -> None:
-    outliers = replace(_cause("outliers", 1.0, 0.0, 0.0), stability_percent=None)
+    outliers = replace(_cause("outliers", 1.0, 0.0, 0.0), effect="outliers")
     assert [cause.where for cause in in_order([_cause("small", 1.0, 1.0, 2.0), outliers])] == ["outliers", "small"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bodyschema.diagnosis.assess.stability import bagged
+from bodyschema.diagnosis.assess.rivals import bagged
 from bodyschema.diagnosis.search.held_out import Blocks
 
 ROWS, LEAD = 200, 6.0

@@ -79,12 +79,6 @@ def with_zeros(robot: RobotDescription) -> DiagnosisFile:
     return found_in(robot, 2, *(Effect.at(robot, "joint_offset", at, values=[size]) for at, size in HIDDEN.items()))
 
 
-@pytest.mark.soak
-def test_causes_that_larger_tolerances_could_follow_are_named_again_by_resamplings(with_zeros: DiagnosisFile) -> None:
-    assert with_zeros.stability is not None
-    assert with_zeros.stability.same_causes > 0.9 * with_zeros.stability.resampled
-
-
 def test_several_zeros_are_named_and_no_link_in_their_place(with_zeros: DiagnosisFile) -> None:
     file = with_zeros
     assert {(cause.effect, cause.where) for cause in file.causes} == {("joint_offset", joint) for joint in HIDDEN}
@@ -112,6 +106,15 @@ def test_an_interval_allows_for_other_sizes_of_the_tolerances(robot: RobotDescri
     integrated = fit.covariance[place, place]
     monkeypatch.setattr("bodyschema.diagnosis.fit.fit._NODES", np.zeros(1))
     assert integrated > 1.2 * replace(fit).covariance[place, place]
+
+
+def test_a_slide_may_run_less_true_than_links_are_made(robot: RobotDescription) -> None:
+    rng = np.random.default_rng(5)
+    q = rng.uniform(robot.lower, robot.upper, (ROWS, len(robot.joints)))
+    recording = measured(robot, motion_of(q), Simulation(robot).positions(motion_of(q)))
+    fit = aligned(Observations.of(recording, Simulation(robot)), Simulation(robot)).tolerating(Scales(lengths=0.1))
+    ripple = Effect.at(robot, "joint_ripple", ELBOW, values=[5e-5, 0.0, 16.0])
+    assert fit.background.tolerates(replace(ripple, prismatic=True))
 
 
 def test_a_background_is_in_the_extended_simulation_and_comes_back(robot: RobotDescription, tmp_path: Path) -> None:
@@ -169,7 +172,8 @@ def test_sizes_that_do_not_show_are_bounded_by_the_data_alone(robot: RobotDescri
         start = aligned(Observations.of(recording, Simulation(robot)), Simulation(robot))
         found.append(tolerated(start.tolerating(Scales())))
     assert not any(one.seen.any() for one in found)
-    quiet, noisy = (one.most for one in found)
+    # No joint slides.
+    quiet, noisy = (one.most[:3] for one in found)
     assert (noisy > 4.0 * quiet).all()
 
 

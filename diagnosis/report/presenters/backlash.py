@@ -17,6 +17,7 @@ class Backlash(Presenter):
     """Present play in a drive."""
 
     effect = "backlash"
+    noun = "play of joint {joint}"
 
     def finding(self, found: Found) -> str:
         return f"{found.at} has {found.size('width')} of play"

@@ -14,6 +14,7 @@ class CameraFocal(Presenter):
     """Present a wrong focal length."""
 
     effect = "camera_focal"
+    noun = "a wrong focal length"
 
     def finding(self, found: Found) -> str:
         return f"the focal length is {100 * found.numbers['focal_error']:+.3g} % off: depth is scaled"

@@ -16,6 +16,7 @@ class CameraLatency(Presenter):
     """Present images whose time stamps are late."""
 
     effect = "camera_latency"
+    noun = "late images"
 
     def finding(self, found: Found) -> str:
         return f"images are stamped {1e3 * found.numbers['latency_s']:.3g} ms late"

@@ -14,6 +14,7 @@ class CameraMoved(Presenter):
     """Present a camera that was bumped."""
 
     effect = "camera_moved"
+    noun = "the {seen_by} having moved"
 
     def finding(self, found: Found) -> str:
         moved = "was bumped" if found.seen_by == "camera" else "moved"

@@ -9,6 +9,7 @@ class CameraPose(Presenter):
     """Present a camera that stands elsewhere."""
 
     effect = "camera_pose"
+    noun = "a wrong place of the {seen_by}"
 
     def finding(self, found: Found) -> str:
         return f"the {found.seen_by} stands {found.moved} off"

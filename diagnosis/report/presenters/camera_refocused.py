@@ -14,6 +14,7 @@ class CameraRefocused(Presenter):
     """Present a lens that refocused."""
 
     effect = "camera_refocused"
+    noun = "a lens that refocused"
 
     def finding(self, found: Found) -> str:
         return f"a lens refocused: its focal length changed by {100 * found.numbers['focal_error']:+.3g} %{found.when}"

@@ -14,6 +14,7 @@ class CameraScale(Presenter):
     """Present a wrong scale of what is measured."""
 
     effect = "camera_scale"
+    noun = "a wrong baseline"
 
     def finding(self, found: Found) -> str:
         error = f"{100 * found.numbers['scale_error']:+.3g} %"

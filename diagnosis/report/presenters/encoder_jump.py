@@ -14,6 +14,7 @@ class EncoderJump(Presenter):
     """Present a zero that jumped."""
 
     effect = "encoder_jump"
+    noun = "a jump of joint {joint}'s zero"
 
     def finding(self, found: Found) -> str:
         return f"the zero of {found.at} jumped by {found.signed('jump')}{found.when}"

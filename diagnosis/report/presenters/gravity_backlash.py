@@ -15,6 +15,7 @@ class GravityBacklash(Presenter):
     """Present play in a joint that hangs on one flank."""
 
     effect = "gravity_backlash"
+    noun = "play of joint {joint}, which hangs on one flank"
 
     def finding(self, found: Found) -> str:
         return f"{found.at} has {found.size('width')} of play and hangs on the flank to which the weight pulls it"

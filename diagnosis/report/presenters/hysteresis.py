@@ -14,6 +14,7 @@ class Hysteresis(Presenter):
     """Present friction behind an elastic drive."""
 
     effect = "hysteresis"
+    noun = "hysteresis of joint {joint}"
 
     def finding(self, found: Found) -> str:
         lag, length = found.size("lag"), found.size("length")

@@ -14,6 +14,7 @@ class JointCompliance(Presenter):
     """Present a joint that yields under the weight."""
 
     effect = "joint_compliance"
+    noun = "joint {joint} giving under the weight"
 
     def finding(self, found: Found) -> str:
         numbers = found.numbers

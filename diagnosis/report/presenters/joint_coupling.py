@@ -14,6 +14,7 @@ class JointCoupling(Presenter):
     """Present a joint that moves with another."""
 
     effect = "joint_coupling"
+    noun = "joint {joint} moving with joint {source}"
 
     def finding(self, found: Found) -> str:
         return f"{found.at} moves by {100 * found.numbers['ratio']:+.3g} % of joint {found.source}'s angle"

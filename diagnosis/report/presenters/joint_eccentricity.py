@@ -14,6 +14,7 @@ class JointEccentricity(Presenter):
     """Present an encoder that sits off its axis."""
 
     effect = "joint_eccentricity"
+    noun = "an eccentric encoder of joint {joint}"
 
     def finding(self, found: Found) -> str:
         return f"the encoder of {found.at} sits off its axis: ±{found.numbers['amplitude_rad'] * DEG:.2g}° once a turn"

@@ -16,6 +16,7 @@ class JointOffset(Presenter):
     """Present a wrong joint zero."""
 
     effect = "joint_offset"
+    noun = "a wrong zero of joint {joint}"
 
     def finding(self, found: Found) -> str:
         return f"the zero of {found.at} is off by {found.signed('offset')}"

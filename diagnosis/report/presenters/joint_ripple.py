@@ -14,6 +14,7 @@ class JointRipple(Presenter):
     """Present a periodic error of a drive."""
 
     effect = "joint_ripple"
+    noun = "a ripple of joint {joint}"
 
     def finding(self, found: Found) -> str:
         numbers = found.numbers

@@ -17,6 +17,7 @@ class JointScale(Presenter):
     """Present a wrong gear ratio."""
 
     effect = "joint_scale"
+    noun = "a wrong ratio of joint {joint}"
 
     def finding(self, found: Found) -> str:
         error = found.numbers["scale_error"]

@@ -16,6 +16,7 @@ class LensDistortion(Presenter):
     """Present lenses that still distort."""
 
     effect = "lens_distortion"
+    noun = "lens distortion"
 
     def finding(self, found: Found) -> str:
         return f"the lenses still distort: k1 = {found.numbers['k1']:+.3g}"

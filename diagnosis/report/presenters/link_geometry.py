@@ -14,6 +14,7 @@ class LinkGeometry(Presenter):
     """Present a link that differs from the URDF."""
 
     effect = "link_geometry"
+    noun = "a wrong link before joint {joint}"
 
     def finding(self, found: Found) -> str:
         parts = ((found.shift, "in", found.shifts), (found.turn, "about", found.turns))

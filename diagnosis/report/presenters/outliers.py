@@ -15,6 +15,7 @@ class Outliers(Presenter):
     """Present fixes that are not the marker."""
 
     effect = "outliers"
+    noun = "fixes that are not the marker"
 
     def finding(self, found: Found) -> str:
         return f"{100 * found.numbers['share']:.2g} % of the fixes are not the marker"

@@ -11,6 +11,7 @@ class Payload(Presenter):
     """Present a mass that the URDF lacks."""
 
     effect = "payload"
+    noun = "an unknown mass on the hand"
 
     def finding(self, found: Found) -> str:
         return f"the hand carries {found.numbers['mass_kg']:.2g} kg that the URDF does not have"

@@ -163,9 +163,11 @@ class Presenter(ABC):
 
     Attributes:
         effect: name of the effect.
+        noun: the cause in a few words without figures, with {joint}, {source} and {seen_by} to fill in.
     """
 
     effect: ClassVar[str]
+    noun: str
 
     @abstractmethod
     def finding(self, found: Found) -> str:
@@ -185,6 +187,7 @@ class PlainPresenter(Presenter):
 
     def __init__(self, kind: EffectType) -> None:
         self._kind = kind
+        self.noun = kind.name.replace("_", " ") + (" at joint {joint}" if kind.at_joint else "")
 
     def finding(self, found: Found) -> str:
         return self._kind.finding("" if found.where is None else found.at, found.numbers)

@@ -6,6 +6,7 @@ from importlib import import_module
 from pkgutil import iter_modules
 
 from bodyschema.diagnosis.report import presenters
+from bodyschema.diagnosis.report.result import Indistinguishable
 from bodyschema.effects import EFFECT_TYPES
 
 from .presenter import PlainPresenter, Presenter
@@ -14,6 +15,20 @@ from .presenter import PlainPresenter, Presenter
 def presenter_of(effect: str) -> Presenter:
     """Return the presenter of an effect; a plain one for an effect that has none of its own."""
     return PRESENTERS.get(effect) or PlainPresenter(EFFECT_TYPES[effect])
+
+
+def named(effect: str, where: str | None, source: str | None, seen_by: str = "camera") -> str:
+    """Return a cause in a few words without figures.
+
+    Args:
+        seen_by: the kind of measuring device, as in `DiagnosisFile`.
+    """
+    return presenter_of(effect).noun.format(joint=where, source=source, seen_by=seen_by)
+
+
+def rival_named(rival: Indistinguishable, seen_by: str = "camera") -> str:
+    """Return a rival in a few words."""
+    return rival.what or named(rival.effect, rival.where, rival.source, seen_by)
 
 
 def built_in() -> dict[str, Presenter]:

@@ -19,6 +19,7 @@ class Settling(Presenter):
     """Present a joint that was read before it came to rest."""
 
     effect = "settling"
+    noun = "joint {joint} read before it rests"
 
     def finding(self, found: Found) -> str:
         missing = f"{100 * found.numbers['fraction']:.2g} %"

@@ -21,6 +21,7 @@ class ThermalDrift(Presenter):
     """Present a slow drift of what is measured."""
 
     effect = "thermal_drift"
+    noun = "a drift that settles"
 
     def finding(self, found: Found) -> str:
         constant = f"{found.numbers['time_constant_s']:.0f} s"

@@ -11,6 +11,7 @@ class ToolOffset(Presenter):
     """Present a marker that sits elsewhere on the hand."""
 
     effect = "tool_offset"
+    noun = "a wrong place of the marker"
 
     def finding(self, found: Found) -> str:
         return f"the marker sits {found.shift} beside its place on the hand"

@@ -16,6 +16,7 @@ class ToolSlip(Presenter):
     """Present a marker that slipped on the hand."""
 
     effect = "tool_slip"
+    noun = "a marker that slipped"
 
     def finding(self, found: Found) -> str:
         return f"the marker slipped by {found.shift}{found.when}"
