@@ -85,7 +85,7 @@ class Grid:
         parameters.minMarkerDistanceRate, parameters.perspectiveRemovePixelPerCell = 0.03, 8
         corners, ids, _ = cv2.aruco.ArucoDetector(self._tags, parameters).detectMarkers(grey)
         numbers = [] if ids is None else np.ravel(np.asarray(ids)).tolist()
-        return {int(id): np.reshape(np.asarray(quad), (4, 2)) for id, quad in zip(numbers, corners, strict=True)}
+        return {int(id): np.asarray(quad, np.float64).reshape(4, 2) for id, quad in zip(numbers, corners, strict=True)}
 
     @property
     def _tags(self) -> Any:
