@@ -12,7 +12,8 @@ import numpy as np
 from bodyschema.interfaces.protocols import MarkerSource
 from bodyschema.interfaces.records import MarkerFix, MarkerMiss
 
-# Frames that are judged, and the share of them that has to contradict: a reflection may be taken for the marker at times.
+# Frames that are judged, and the share of them that has to contradict: a reflection may be taken for the marker at
+# times.
 JUDGED, MANY = 20, 0.2
 SIGMAS = 4.0
 DEPTH_ERROR = 0.02  # of the distance, as the maker promises up to 2 m
