@@ -35,7 +35,7 @@ WORDS: Mapping[Reason, str] = {
     Reason.NOT_BORNE: "zero-force is off",
 }
 REMEDIES: Mapping[Reason, str] = {
-    Reason.NO_MARKER: "Is it in sight of both eyes, large enough in both images, and are [vision] marker, colour, "
+    Reason.NO_MARKER: "Is it in sight of all eyes, large enough in their images, and are [vision] marker, colour, "
     "number and light right?",
     Reason.AT_BORDER: "Bring it nearer to the middle of both images.",
     Reason.OCCLUDED: "Is a hand, a cable or the tool before it?",
@@ -58,7 +58,8 @@ REMEDIES: Mapping[Reason, str] = {
     "shows it.",
     Reason.SIZE_MISMATCH: "Is its size in [vision] right? Else it is the calibration of other cameras, or they were "
     "moved: `bodyschema calibrate cameras --check`.",
-    Reason.AMBIGUOUS: "Take other things of its colour, or the second tag of its number, out of sight.",
+    Reason.AMBIGUOUS: "Take other things of its colour, or the second tag of its number, out of sight. Tilt a single "
+    "tag, or come nearer.",
     Reason.NO_JOINTS: "Do the encoders answer, and is [vision.cameras] latency_s right? `bodyschema calibrate latency` "
     "measures it.",
     Reason.STALE: "Read the encoders more often, or raise [daemon] max_reading_gap_s.",

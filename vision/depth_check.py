@@ -12,7 +12,9 @@ import numpy as np
 from bodyschema.interfaces.protocols import MarkerSource
 from bodyschema.interfaces.records import MarkerFix, MarkerMiss
 
-JUDGED = 20  # frames
+# Frames that are judged, and the share of them that has to contradict: a reflection may be taken for the marker at
+# times.
+JUDGED, MANY = 20, 0.2
 SIGMAS = 4.0
 DEPTH_ERROR = 0.02  # of the distance, as the maker promises up to 2 m
 
@@ -40,15 +42,14 @@ class DepthChecked:
     @property
     def health(self) -> tuple[str, ...]:
         """A persistent contradiction, with what to do."""
-        if len(self._apart) < JUDGED:
+        wrong = [(eyes, depth) for eyes, depth, sigmas in self._apart if sigmas > SIGMAS]
+        if len(self._apart) < JUDGED or len(wrong) < MANY * JUDGED:
             return ()
-        eyes, depth, sigmas = np.median(self._apart, axis=0)
-        if sigmas <= SIGMAS:
-            return ()
+        eyes, depth = np.median(wrong, axis=0)
         return (
-            f"the depth image has the marker at {depth:.3f} m where the two eyes measure {eyes:.3f} m: "
-            "is something else taken for the marker? If not, run the device's own calibration (RealSense Viewer, "
-            "On-Chip Calibration)",
+            f"the depth image has the marker at {depth:.3f} m where the two eyes measure {eyes:.3f} m, in {len(wrong)} "
+            f"of {JUDGED} frames: is something else taken for the marker? If not, run the device's own calibration "
+            "(RealSense Viewer, On-Chip Calibration)",
         )
 
     def __enter__(self) -> Self:

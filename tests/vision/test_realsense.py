@@ -183,10 +183,10 @@ def test_missing_sdk_is_a_missing_extra(monkeypatch) -> None:
 
 
 class Fixed:
-    """A `MarkerSource` at 0.8 m, and a depth image that says something else."""
+    """A `MarkerSource` at 0.8 m, and a depth image that says something else in every n-th frame."""
 
-    def __init__(self, depth_m: float) -> None:
-        self._depth_m = depth_m
+    def __init__(self, depth_m: float, every: int) -> None:
+        self._depth_m, self._every, self._frames = depth_m, every, 0
 
     def __enter__(self) -> Fixed:
         return self
@@ -200,12 +200,13 @@ class Fixed:
         )
 
     def depth_m(self, u: float, v: float) -> float:
-        return self._depth_m
+        self._frames += 1
+        return 0.78 if self._frames % self._every else self._depth_m
 
 
-@pytest.mark.parametrize(("depth_m", "complaints"), [(0.78, 0), (0.95, 1)])
-def test_depth_that_contradicts_is_reported(depth_m, complaints) -> None:
-    scene = Fixed(depth_m)
+@pytest.mark.parametrize(("depth_m", "every", "complaints"), [(0.78, 1, 0), (0.95, 1, 1), (0.95, 3, 1), (0.95, 9, 0)])
+def test_depth_that_contradicts_in_many_frames_is_reported(depth_m, every, complaints) -> None:
+    scene = Fixed(depth_m, every)
     with DepthChecked(scene, scene, in_front_m=0.02) as checked:
         for _ in range(50):
             checked.read(0.1)

@@ -192,6 +192,16 @@ def test_a_covered_pattern_leaves_bleeding_unknown() -> None:
     assert np.trace(covered.cov_px) > 10.0 * np.trace(plain.cov_px)
 
 
+def test_the_least_error_of_an_edge_is_not_added_to_noise(monkeypatch) -> None:
+    answers = []
+    for least_px in (0.0, 0.0007):
+        monkeypatch.setattr("bodyschema.vision.tags.edge._FLOOR_PX", least_px)
+        answers.append(measured(sheet()))
+    first, then = answers
+    assert isinstance(first, TagImage)
+    assert np.array_equal(first.cov_px, then.cov_px)
+
+
 def test_bent_edges_are_claimed_to_be_less_sure() -> None:
     # Less than half a wave along each edge, 0.1 px high, as a lens or curled paper bends them.
     grey = grey_of(seen(sheet()))

@@ -18,8 +18,8 @@ from bodyschema.interfaces.records import FloatArray, ImageArray
 
 from .edge import SQUARE, leave, sampled
 
-# Samples along a row of modules: one a pixel, but no more and no fewer than this.
-_FEWEST, _MOST = 16, 80
+# Most samples along a row of modules; else one a pixel.
+_MOST = 80
 # Neighbouring samples share pixels: factor of the standard deviation of independent ones.
 _SHARED = 2.0
 # Share of the samples that the pattern has to explain; the usual bleeding, in parts of the blur, where it does not.
@@ -46,7 +46,7 @@ def bleed(grey: ImageArray, corners_px: FloatArray, blur_px: float, modules: Flo
     sides = np.linalg.norm(np.roll(corners_px, -1, axis=0) - corners_px, axis=1) / length
     width, height = float(sides[::2].mean()), float(sides[1::2].mean())
     # From the middle of one black border to that of the other.
-    counts = [int(min(max(round((length - 1.0) * module), _FEWEST), _MOST)) for module in (width, height)]
+    counts = [int(min(round((length - 1.0) * module), _MOST)) for module in (width, height)]
     x, y = (0.5 + (np.arange(count) + 0.5) * (length - 1.0) / count for count in counts)
     across, down = np.meshgrid(x, y)
     there = np.stack([across, down, np.ones_like(across)], axis=-1) @ np.asarray(to_px, np.float64).T

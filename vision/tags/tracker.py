@@ -186,8 +186,8 @@ class TagTracker:
             if stayed is None:
                 return Reason.AMBIGUOUS
             best = stayed
-        # What the claimed noise does not explain, nor chance (1-sigma), is taken for more noise.
-        unexplained = max(misfit - math.sqrt(2.0 / freedom), 1.0)
+        # What the claimed noise does not explain, nor chance (2-sigma), is taken for more noise.
+        unexplained = max(misfit - 2.0 * math.sqrt(2.0 / freedom), 1.0)
         return Pose(best.rotation, best.x, best.cov * unexplained, best.squares)
 
     def _minima(self, estimator: PoseEstimator, seen: list[dict[int, TagImage]]) -> list[Pose]:
