@@ -115,8 +115,7 @@ class Config:
     def load(cls, file: Path, environment: Mapping[str, str] = os.environ) -> Config:
         """Read robot.toml, its URDF and the environment.
 
-        Raises:
-            ConfigError: something is unknown, missing or wrong; the message names file, line, key and remedy.
+        Raise ConfigError if something is unknown, missing or wrong; the message names file, line, key and remedy.
         """
         raw, text = read_toml(file)
         known = [field.encode_name for field in msgspec.structs.fields(Tables)]
@@ -182,8 +181,7 @@ class Config:
     def with_state_dir(self, folder: Path) -> Config:
         """Return a copy with another folder for store and checkpoint, relative to the working directory.
 
-        Raises:
-            ConfigError: `folder` is a file.
+        Raise ConfigError if `folder` is a file.
         """
         if os.path.exists(folder) and not os.path.isdir(folder):
             raise ConfigError("is a file, and store and checkpoint need a folder", file=folder, remedy=_STATE_REMEDY)

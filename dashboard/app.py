@@ -31,7 +31,7 @@ _HEADERS = HEADERS | {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
         "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-    ),
+    )
 }
 
 
@@ -104,7 +104,6 @@ class Commands(Protocol):
 
     def command(self, process: Process, name: CommandName) -> str:
         """Return the process's reply; BusError if it does not answer, RequestError if it refuses."""
-        ...
 
 
 class Pictures(Protocol):
@@ -112,7 +111,6 @@ class Pictures(Protocol):
 
     def picture(self) -> bytes:
         """Return the newest one as JPEG; BusError if no sampler with cameras answers, RequestError before the first."""
-        ...
 
 
 class Processes(Commands, Pictures, Protocol):
@@ -124,15 +122,12 @@ class Diagnosing(Protocol):
 
     def start(self) -> int:
         """Start a diagnosis and return its number; RequestError if one is running."""
-        ...
 
     def stop(self) -> None:
         """End the running diagnosis; RequestError if none is running."""
-        ...
 
     def report(self) -> bytes | None:
         """Return the last report; None if there is none."""
-        ...
 
 
 class Shapes(Protocol):
@@ -140,11 +135,9 @@ class Shapes(Protocol):
 
     def document(self) -> BodyDocument:
         """Return its links and shapes."""
-        ...
 
     def mesh(self, number: int) -> bytes | None:
         """Return a mesh of the document; None if there is none with this number."""
-        ...
 
 
 class _Endpoints:

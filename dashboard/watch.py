@@ -135,9 +135,7 @@ class Watch:
     def command(self, process: Process, name: CommandName) -> str:
         """Send a command to a process and return its reply.
 
-        Raises:
-            BusError: it does not answer.
-            RequestError: it refused.
+        Raise BusError if it does not answer. Raise RequestError if it refused.
         """
         payload = encode(CommandRequest(name))
         reply = self._sessions[process].ask_one(self._keys.command(process), payload, timeout_s=COMMAND_LIMIT_S)
@@ -146,9 +144,7 @@ class Watch:
     def picture(self) -> bytes:
         """Return the sampler's newest camera picture with detections, as JPEG; at most one request each half second.
 
-        Raises:
-            BusError: the sampler does not answer, or has no cameras.
-            RequestError: no frame has come yet.
+        Raise BusError if the sampler does not answer, or has no cameras. Raise RequestError if no frame has come yet.
         """
         with self._picturing:
             now = self._clock.now()
@@ -160,8 +156,7 @@ class Watch:
     def history(self, newest: int) -> History:
         """Return the sampler's newest pairs, `newest` of them, to be read page by page.
 
-        Raises:
-            BusError: the sampler does not answer.
+        Raise BusError if the sampler does not answer.
         """
         status = self._sampler.status
         if status is None or not self._sampler.answers:

@@ -20,23 +20,18 @@ class Port(Protocol):
     @property
     def baud(self) -> int:
         """Bits per second."""
-        ...
 
     def write(self, data: bytes) -> None:
         """Send `data`."""
-        ...
 
     def receive(self, until: float) -> bytes:
         """Return what has arrived, else what arrives next; empty when nothing arrives before `until` on the clock."""
-        ...
 
     def flush(self) -> None:
         """Discard what has arrived."""
-        ...
 
     def close(self) -> None:
         """Release the port."""
-        ...
 
 
 def without_echo(port: Port, clock: Clock, latency_s: float) -> Port:

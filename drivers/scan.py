@@ -24,23 +24,18 @@ class ScannedPort(Protocol):
     @property
     def baud(self) -> int:
         """Bits per second."""
-        ...
 
     def write(self, data: bytes) -> None:
         """Send `data`."""
-        ...
 
     def receive(self, until: float) -> bytes:
         """Return what has arrived, else what arrives next; empty when nothing arrives before `until` on the clock."""
-        ...
 
     def flush(self) -> None:
         """Discard what has arrived."""
-        ...
 
     def close(self) -> None:
         """Release the port."""
-        ...
 
 
 class Scanner(Protocol):
@@ -49,16 +44,13 @@ class Scanner(Protocol):
     @property
     def protocol(self) -> str:
         """Name of the protocol."""
-        ...
 
     @property
     def bauds(self) -> Sequence[int]:
         """Possible baud rates, likely ones first [bit/s]."""
-        ...
 
     def scan(self, name: str, port: ScannedPort, clock: Clock, latency_s: float) -> Iterator[FoundServo]:
         """Yield the servos on the open port `name` in the order of their IDs. Never write to a register."""
-        ...
 
 
 OpenPort = Callable[[str, int, Clock], ScannedPort]

@@ -50,9 +50,8 @@ class SerialLine:
     def open(cls, port: str, baud: int, now: Callable[[], float] = time.monotonic) -> SerialLine:
         """Open `port` exclusively.
 
-        Raises:
-            BusLost: there is no such port (any more).
-            SourceError: it is in use, or this user may not open it.
+        Raise BusLost if there is no such port (any more). Raise SourceError if it is in use, or this user may not open
+        it.
         """
         try:
             device = serial.Serial(port, baud, timeout=0, exclusive=True)

@@ -23,25 +23,20 @@ class Sensor(Protocol):
     @property
     def joint(self) -> str:
         """The joint's name."""
-        ...
 
     @property
     def label(self) -> str:
         """Name of the sensor on its device."""
-        ...
 
     @property
     def ticks_per_turn(self) -> int | None:
         """Ticks after which the reading repeats; None for a sensor that does not wrap."""
-        ...
 
     def angle(self, ticks: int) -> float:
         """Return the joint angle [rad] at a position with its turns [ticks]."""
-        ...
 
     def ticks(self, angle: float) -> float:
         """Return the position [ticks] at a joint angle [rad]."""
-        ...
 
 
 class TurnCount:
@@ -54,11 +49,7 @@ class TurnCount:
     """
 
     def __init__(
-        self,
-        limits: Sequence[tuple[float, float]],
-        last_pose: Sequence[float] | None,
-        max_move_deg: float,
-        table: str,
+        self, limits: Sequence[tuple[float, float]], last_pose: Sequence[float] | None, max_move_deg: float, table: str
     ) -> None:
         """Start without a reading.
 

@@ -69,12 +69,7 @@ Done = Callable[[Diagnosed], None]
 
 
 def diagnose_all(
-    jobs: Sequence[Job],
-    asked: Asked,
-    out: Path | None,
-    cluster: Client,
-    told: Told,
-    done: Done,
+    jobs: Sequence[Job], asked: Asked, out: Path | None, cluster: Client, told: Told, done: Done
 ) -> list[Diagnosed]:
     """Diagnose all recordings; a failed one is reported as such, and does not end the others.
 

@@ -145,8 +145,7 @@ def _relative(path: str | Path, old: Path, new: Path) -> str:
 def tables_elsewhere(robot: RobotDescription, folder: Path) -> dict[str, Any]:
     """Return the tables of a robot.toml in `folder` with the same URDF and a store of its own.
 
-    Raises:
-        ConfigError: the original robot.toml can no longer be read.
+    Raise ConfigError if the original robot.toml can no longer be read.
     """
     tables, _ = read_toml(robot.file)
     tables["daemon"] = tables.get("daemon", {}) | {"state_dir": STATE_DIR}
@@ -164,11 +163,7 @@ def _tables(robot: RobotDescription, geometry: CalibratedGeometry, folder: Path)
     tables = tables_elsewhere(robot, folder)
     for added in EXTENSIONS:  # the geometry was learnt without them
         tables.pop(added, None)
-    tables["robot"] |= {
-        "urdf": robot.tree.file.name,
-        "marker_xyz": geometry.marker_xyz.tolist(),
-        "marker_known": True,
-    }
+    tables["robot"] |= {"urdf": robot.tree.file.name, "marker_xyz": geometry.marker_xyz.tolist(), "marker_known": True}
     tables["camera"] |= {
         "xyz": geometry.T_parent_camera[:3, 3].tolist(),
         "rpy": rpy_of(geometry.T_parent_camera[:3, :3]).tolist(),

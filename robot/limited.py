@@ -31,9 +31,8 @@ class UnfitFile(OSError):
 def check_regular(file: Path) -> None:
     """Check that `file` can be given to a library that reads it to its end.
 
-    Raises:
-        UnfitFile: it is a device, a pipe or a socket, which may have no end.
-        OSError: it is a folder, or cannot be examined.
+    Raise UnfitFile if it is a device, a pipe or a socket, which may have no end. Raise OSError if it is a folder, or
+    cannot be examined.
     """
     _require_regular(os.stat(file).st_mode)
 

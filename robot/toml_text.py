@@ -81,8 +81,7 @@ def difference(file: Path, edited: str) -> list[str]:
 def write_edited(file: Path, edited: str) -> Path:
     """Replace a file by its edited text; return the name under which the old one is kept.
 
-    Raises:
-        ConfigError: nothing could be written.
+    Raise ConfigError if nothing could be written.
     """
     try:
         return replace_kept(file, edited.encode())

@@ -89,8 +89,7 @@ class UrdfTree:
     def load(cls, file: Path) -> UrdfTree:
         """Read `file`.
 
-        Raises:
-            RobotError: the file is missing, not XML, not a URDF, or its links do not form a tree.
+        Raise RobotError if the file is missing, not XML, not a URDF, or its links do not form a tree.
         """
         root = parse_urdf(file)
         links = _by_name(root, "link", file)

@@ -50,19 +50,15 @@ class Judge(Protocol):
 
     def gazed(self, q: FloatArray) -> FloatArray:
         """Return q with the head turned to the marker."""
-        ...
 
     def in_images(self, q: FloatArray) -> np.ndarray:
         """Return a mask (n,) of the postures with the ball inside both images."""
-        ...
 
     def clear(self, q: FloatArray) -> bool:
         """Return True if nothing blocks the view at one posture (d,)."""
-        ...
 
     def visible(self, q: FloatArray) -> np.ndarray:
         """Return a mask (n,) of the postures that pass both checks."""
-        ...
 
 
 class GuidePath:

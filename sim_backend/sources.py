@@ -67,8 +67,7 @@ class SimJoints:
     def read(self, timeout_s: float) -> JointReading | None:
         """Return the next reading; None if the world waits longer than `timeout_s` for the camera to be read.
 
-        Raises:
-            SourceEnded: the world was closed.
+        Raise SourceEnded if the world was closed.
         """
         return self._world.next_reading(timeout_s)
 
@@ -94,9 +93,7 @@ class SimStereoCamera:
     def read(self, timeout_s: float) -> StereoFrame | None:
         """Return the next frame; None if none arrived within `timeout_s`.
 
-        Raises:
-            SourceEnded: the world was closed.
-            SourceLost: the renderer's process died.
+        Raise SourceEnded if the world was closed. Raise SourceLost if the renderer's process died.
         """
         return self._world.next_frame(timeout_s)
 

@@ -46,15 +46,12 @@ class Worker(Protocol):
 
     def work(self) -> bool:
         """Do one small piece of work; return False if there is none. SolverLostError: the solver has lost its pairs."""
-        ...
 
     def restart_solver(self) -> None:
         """Send the solver its pairs again."""
-        ...
 
     def solve_soon(self) -> None:
         """Request a solution: there has been no other work for a while."""
-        ...
 
 
 class Background:
@@ -154,8 +151,7 @@ def run_learners(configs: Sequence[Config], clock: Clock, wishes: SignalFlags, n
 def session_settings(configs: Sequence[Config]) -> dict[str, Any]:
     """Return zenoh's configuration of the one session of all robots.
 
-    Raises:
-        ConfigError: two have the same name, or their tables [zenoh] name different routers or certificates.
+    Raise ConfigError if two have the same name, or their tables [zenoh] name different routers or certificates.
     """
     settings = configs[0].zenoh_settings("learner")
     if len(configs) == 1:

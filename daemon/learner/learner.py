@@ -122,8 +122,7 @@ class Learner:
     def tick(self) -> None:
         """Do the main thread's periodic work: write a checkpoint when one is due.
 
-        Raises:
-            BaseException: the exception that ended one of the threads.
+        Raise BaseException if the exception that ended one of the threads.
         """
         if self._failure is not None:
             raise self._failure
@@ -306,8 +305,7 @@ class Learner:
     def reload(self) -> str:
         """Read robot.toml again; return a message about the result.
 
-        Raises:
-            ConfigError: robot.toml is invalid; nothing changed.
+        Raise ConfigError if robot.toml is invalid; nothing changed.
         """
         found = reload(self._config, TABLES, CHANGEABLE)
         self._config, self._settings = found.config, found.config.tables.learner

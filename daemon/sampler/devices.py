@@ -39,7 +39,6 @@ class KeepsRecord(Protocol):
     @property
     def record(self) -> Sequence[Device]:
         """For each joint: `joint`, and its identifying properties by name; empty until the devices were queried."""
-        ...
 
 
 class DeviceWatch:
@@ -157,9 +156,8 @@ class SamplerRules:
     def reload(self) -> str:
         """Read robot.toml again and return a message about the result; sampling continues meanwhile.
 
-        Raises:
-            ConfigError: robot.toml is invalid; nothing changed.
-            StoreError: the new session cannot be stored; nothing changed.
+        Raise ConfigError if robot.toml is invalid; nothing changed. Raise StoreError if the new session cannot be
+        stored; nothing changed.
         """
         with self._one_at_a_time:
             found = reload(self._config, TABLES, CHANGEABLE)
@@ -179,8 +177,7 @@ class SamplerRules:
     def trim(self) -> None:
         """Delete a batch of the pairs that are no longer kept, if there are any.
 
-        Raises:
-            StoreError: the disk is full or broken.
+        Raise StoreError if the disk is full or broken.
         """
         with self._deciding:
             deleted = self._store.trim(_kept(self._config.tables.daemon), self._wall.utc())

@@ -133,9 +133,8 @@ class Sampler:
     def run(self) -> None:
         """Sample until `stop`, or with `exit_at_end` until the sources end.
 
-        Raises:
-            StoreError: the store is damaged; the pair was not published, and no pair followed.
-            SourceError: a source could not be opened at the start.
+        Raise StoreError if the store is damaged; the pair was not published, and no pair followed. Raise SourceError if
+        a source could not be opened at the start.
         """
         self._service.tell("opening encoders and cameras")
         with ExitStack() as stack:

@@ -21,7 +21,6 @@ class TellsHealth(Protocol):
     @property
     def health(self) -> Sequence[str]:
         """Problems, with remedies."""
-        ...
 
 
 @runtime_checkable
@@ -42,7 +41,6 @@ class AsksForTurns(Protocol):
     def asks_for_turns(self) -> bool: ...
     def accept_turns(self) -> None:
         """Assume the turns nearest to the joints' last positions."""
-        ...
 
 
 def complaints_of(joints: JointSource) -> list[str]:
@@ -88,8 +86,7 @@ def _bus(bus: BusHealth) -> BusStatus:
 def accept_turns(encoders: object) -> str:
     """Set lost turn counts to the turns nearest to the last positions; return a message.
 
-    Raises:
-        RequestError: no turn count was lost.
+    Raise RequestError if no turn count was lost.
     """
     if not isinstance(encoders, AsksForTurns) or not encoders.asks_for_turns:
         raise RequestError("no joint has lost its turn count: there is nothing to accept")

@@ -27,15 +27,12 @@ class GroundTruth(Protocol):
 
     def change_tool(self, marker_xyz: tuple[float, float, float]) -> float:
         """Change the tool: put its marker at `marker_xyz` [m] in the marker link. Return the time [s] of the change."""
-        ...
 
     def true_chain(self) -> RigidChain:
         """Return the robot's true kinematic chain."""
-        ...
 
     def true_turn(self) -> FloatArray:
         """Return the true rotation of the marker on the hand, shape (3, 3)."""
-        ...
 
 
 @runtime_checkable
@@ -45,21 +42,17 @@ class Powered(Protocol):
     @property
     def name(self) -> str:
         """Name in commands: `<name>_on`, `<name>_off`."""
-        ...
 
     @property
     def state(self) -> str:
         """Off, on, or dropped: switched off by itself, until requested again."""
-        ...
 
     @property
     def complaints(self) -> tuple[str, ...]:
         """Problems, with remedies."""
-        ...
 
     def ask(self, on: bool) -> Future[str]:
         """Request torque on or off. The reading thread answers, unless the request is cancelled before."""
-        ...
 
 
 @runtime_checkable
@@ -69,26 +62,21 @@ class Head(Powered, Protocol):
     @property
     def head(self) -> tuple[str, ...]:
         """Names of its joints."""
-        ...
 
     @property
     def lower(self) -> FloatArray:
         """Their lower limits [rad] (g,)."""
-        ...
 
     @property
     def upper(self) -> FloatArray:
         """Their upper limits [rad] (g,)."""
-        ...
 
     @property
     def pose(self) -> tuple[float, FloatArray] | None:
         """Time [s] and angles of all joints [rad] (d,) of the newest reading; None while it has no torque."""
-        ...
 
     def aim(self, t: float, angles: FloatArray) -> None:
         """Request that its joints are at `angles` (g,) [rad] at `t` [s]."""
-        ...
 
 
 class TellsHealth(Protocol):
@@ -97,7 +85,6 @@ class TellsHealth(Protocol):
     @property
     def health(self) -> Sequence[str]:
         """Problems, with remedies."""
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +135,6 @@ class StampedJoints(JointSource, Protocol):
     @property
     def stamp_ns(self) -> int | None:
         """Time of the newest reading on that clock [ns]; None before any."""
-        ...
 
 
 class MarkerTopic(Source, Protocol):
@@ -157,16 +143,13 @@ class MarkerTopic(Source, Protocol):
     @property
     def period_s(self) -> float:
         """Minimum interval between two positions [s]."""
-        ...
 
     @property
     def has_sigma(self) -> bool:
         """True if messages include the uncertainty of a position."""
-        ...
 
     def publish(self, stamp_ns: int, x: FloatArray, sigma: FloatArray) -> None:
         """Publish a position [m] and its 1-sigma per axis [m], shapes (3,), at a time on the encoders' clock [ns]."""
-        ...
 
 
 class ToolRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -203,8 +186,7 @@ class TruthReply(msgspec.Struct, frozen=True):
 def answer_simulation(world: GroundTruth, clock: Clock, request: Request) -> bytes:
     """Answer an empty request with the ground truth; change the tool on a `ToolRequest`.
 
-    Raises:
-        RequestError: the tool is not three finite numbers, or is longer than `LONGEST_TOOL_M`.
+    Raise RequestError if the tool is not three finite numbers, or is longer than `LONGEST_TOOL_M`.
     """
     if not request.payload:
         chain = world.true_chain()

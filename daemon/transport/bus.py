@@ -111,11 +111,7 @@ class ZenohSession:
             plain = self._open.declare_publisher(key, encoding=zenoh.Encoding(JSON))
             return plain.put
         advanced = zenoh.ext.declare_advanced_publisher(
-            self._open,
-            key,
-            encoding=zenoh.Encoding(JSON),
-            cache=zenoh.ext.CacheConfig(cache),
-            publisher_detection=True,
+            self._open, key, encoding=zenoh.Encoding(JSON), cache=zenoh.ext.CacheConfig(cache), publisher_detection=True
         )
         return advanced.put
 
@@ -189,9 +185,8 @@ class ZenohSession:
     def ask_one(self, key: str, payload: bytes = b"", *, encoding: str = JSON, timeout_s: float = 5.0) -> bytes:
         """Return the one reply to a query.
 
-        Raises:
-            BusError: there is no answer under this key, or not in time.
-            RequestError: the request was refused.
+        Raise BusError if there is no answer under this key, or not in time. Raise RequestError if the request was
+        refused.
         """
         replies = self.ask(key, payload, encoding=encoding, timeout_s=timeout_s)
         if not replies:
@@ -281,11 +276,7 @@ class ZenohSession:
             del refused  # a query that is referenced is not yet answered
 
     def _answer(
-        self,
-        key: str,
-        reception: QueryLimiter[zenoh.Query],
-        handler: Callable[[Request], bytes],
-        encoding: str | None,
+        self, key: str, reception: QueryLimiter[zenoh.Query], handler: Callable[[Request], bytes], encoding: str | None
     ) -> None:
         while (taken := reception.take()) is not None:
             query, refused = taken

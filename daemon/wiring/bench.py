@@ -103,8 +103,7 @@ def open_bench(
 ) -> DryRun:
     """Return the arm of robot.toml behind `port` (several buses: each at `port`-NAME), not opened yet.
 
-    Raises:
-        ConfigError: no servos or encoders are configured, a fault is invalid, or a port's path is occupied.
+    Raise ConfigError if no servos or encoders are configured, a fault is invalid, or a port's path is occupied.
     """
     hardware = require_on_ports(config)
     asked = [AskedFault.parsed(text, config.robot.joints, _kinds(hardware)) for text in faults]
@@ -184,8 +183,7 @@ def _require_free(link: Path) -> None:
 def bench_robot_file(config: Config, bench: DryRun, port: Path) -> Path:
     """Write a copy of robot.toml beside `port`, with the bench's ports and its own state.
 
-    Raises:
-        ConfigError: another file is there, or it cannot be written.
+    Raise ConfigError if another file is there, or it cannot be written.
     """
     file = port.with_name(f"{port.name}.toml")
     tables, _ = read_toml(config.file)

@@ -58,8 +58,7 @@ def require_cameras(config: Config) -> CamerasConfig:
 def open_eyes(config: Config, clock: Clock) -> Eyes:
     """Return the cameras of robot.toml with unprocessed images, not opened yet.
 
-    Raises:
-        ConfigError: no cameras are configured.
+    Raise ConfigError if no cameras are configured.
     """
     return eyes_of(require_cameras(config), config.file.parent, clock)
 
@@ -83,8 +82,7 @@ def names_calibration(config: Config) -> bool:
 def camera_of(config: Config, eyes: Eyes) -> StereoCamera:
     """Return `eyes` with rectified images, not opened yet: by the calibration file, else by [camera].
 
-    Raises:
-        ConfigError: there is no calibration, or the file cannot be read.
+    Raise ConfigError if there is no calibration, or the file cannot be read.
     """
     cameras = require_cameras(config)
     if cameras.calibration is not None:
@@ -115,8 +113,7 @@ def _of_files(rig: Rig, cameras: CamerasConfig) -> Rig:
 def tracked_video(config: Config, file: Path) -> TrackedCamera:
     """Return a video of one camera with its tracker, not opened yet; lens and marker are those of robot.toml.
 
-    Raises:
-        ConfigError: there is no calibration of the camera, or the marker cannot be.
+    Raise ConfigError if there is no calibration of the camera, or the marker cannot be.
     """
     return _tracked(config, videos=VideosConfig(left=str(file.absolute()), speed=0.0))
 

@@ -20,25 +20,20 @@ class AnyServo(Protocol):
     @property
     def id(self) -> int:
         """ID on the bus."""
-        ...
 
     @property
     def baud(self) -> int:
         """Baud rate of the servo [bit/s]."""
-        ...
 
     @property
     def return_delay_s(self) -> float:
         """Delay between instruction and answer [s]."""
-        ...
 
     def angle(self, t: float) -> float:
         """Return the shaft angle at `t` [rad]."""
-        ...
 
     def reboot(self, t: float) -> None:
         """Restart as after a power cycle."""
-        ...
 
 
 ServoT = TypeVar("ServoT", bound=AnyServo)

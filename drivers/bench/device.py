@@ -45,16 +45,13 @@ class Device(Protocol):
 
     def send(self, data: bytes, t: float, baud: int) -> list[Reply]:
         """Send the host's `data`, whose first byte is on the wire at `t` [s], and return the answers in order."""
-        ...
 
     @property
     def speaks_at(self) -> float:
         """Time of the next unsolicited transmission [s]; infinity if there is none."""
-        ...
 
     def speak(self, until: float, baud: int) -> list[Reply]:
         """Return the unsolicited transmissions that begin by `until` and have not been returned yet."""
-        ...
 
 
 class OnlyAnswers:

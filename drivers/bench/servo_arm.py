@@ -84,11 +84,9 @@ class BenchServo(AnyServo, Protocol):
 
     def __setitem__(self, name: str, value: int) -> None:
         """Write a register as the servo itself does, bypassing all locks."""
-        ...
 
     def fail(self, bits: int) -> None:
         """Report a hardware error until the servo is rebooted."""
-        ...
 
 
 ServoT = TypeVar("ServoT", bound=BenchServo)

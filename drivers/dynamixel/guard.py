@@ -225,8 +225,7 @@ class Currents:
     def at(self, now: float, torques: FloatArray) -> FloatArray:
         """Return the currents [A] (n,) for the torques that hold the arm [N·m] (n,).
 
-        Raises:
-            Drop: the torques are not finite.
+        Raise Drop if the torques are not finite.
         """
         if torques.shape != self._limit.shape or not np.isfinite(torques).all():
             raise Drop("the model gives no torque for where the arm is. Look at the URDF's masses and joint limits")

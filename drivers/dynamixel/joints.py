@@ -184,15 +184,7 @@ def open_serial(config: BusConfig, clock: Clock) -> tuple[Port, float]:
 
 
 DYNAMIXEL = ServoVendor(
-    DynamixelConfig.table,
-    BY_NUMBER,
-    HARDWARE_ERRORS,
-    Bus,
-    Channel,
-    ways_of,
-    settings_of,
-    1,
-    TICK_S,
+    DynamixelConfig.table, BY_NUMBER, HARDWARE_ERRORS, Bus, Channel, ways_of, settings_of, 1, TICK_S
 )
 
 

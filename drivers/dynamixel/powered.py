@@ -148,8 +148,7 @@ class PoweredJoints(ABC):
     def _prepare(self, servo: IdentifiedServo) -> int:
         """Check the servo's own limits and return a goal with which its torque is safe to switch on.
 
-        Raises:
-            RequestError: the limits do not allow it.
+        Raise RequestError if the limits do not allow it.
         """
 
     @abstractmethod

@@ -148,10 +148,6 @@ class GazeConfig(PoweredConfig, frozen=True, forbid_unknown_fields=True, kw_only
                 )
         for joint, (lower, upper) in self.limits_deg.items():
             if joint not in self.joints:
-                yield (
-                    ("limits_deg",),
-                    f"{joint!r} is not one of its joints",
-                    did_you_mean(joint, self.joints),
-                )
+                yield (("limits_deg",), f"{joint!r} is not one of its joints", did_you_mean(joint, self.joints))
             elif lower >= upper:
                 yield ("limits_deg",), f"joint {joint!r}: the lower limit is not below the upper one", "Swap them"

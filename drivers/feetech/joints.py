@@ -218,11 +218,4 @@ class FeetechJoints(ServoJoints):
         super().__init__(FEETECH, config, joints, clock, open_port=open_port, limits=limits, last_pose=last_pose)
 
 
-FEETECH_SERVOS = Kind(
-    name="Feetech",
-    bauds=BAUDS,
-    version=STS,
-    models=BY_NUMBER,
-    errors=HARDWARE_ERRORS,
-    bus=Bus,
-)
+FEETECH_SERVOS = Kind(name="Feetech", bauds=BAUDS, version=STS, models=BY_NUMBER, errors=HARDWARE_ERRORS, bus=Bus)

@@ -72,11 +72,7 @@ def _transform(reader: CdrReader, seq: int | None) -> tuple[str, Report]:
 
 
 def _report(
-    header: Header,
-    x: tuple[float, ...],
-    turn: tuple[float, ...] | None,
-    cov: tuple[float, ...] | None,
-    seq: int | None,
+    header: Header, x: tuple[float, ...], turn: tuple[float, ...] | None, cov: tuple[float, ...] | None, seq: int | None
 ) -> Report:
     return Report(x, stamp_ns=header.stamp_ns, seq=seq, turn=turn, cov=cov, frame=header.frame.lstrip("/"))
 
@@ -113,11 +109,7 @@ class KeyReceiver:
             self._link = None
 
     def receive(self, until: float) -> Packet | None:
-        """Return the next message; None when none arrives by `until` [s].
-
-        Raises:
-            SourceLost: the router is gone.
-        """
+        """Return the next message; None when none arrives by `until` [s]. Raise SourceLost if the router is gone."""
         if self._link is None:
             return None
         sample = self._link.receive(until)

@@ -20,8 +20,7 @@ class CdrReader:
     def __init__(self, data: bytes) -> None:
         """Start behind the encapsulation header.
 
-        Raises:
-            Malformed: the header is invalid, the representation unsupported, or the message absurdly long.
+        Raise Malformed if the header is invalid, the representation unsupported, or the message absurdly long.
         """
         if len(data) > LARGEST_MESSAGE:
             raise Malformed(f"{len(data)} bytes are more than a message of joints has")

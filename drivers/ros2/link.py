@@ -44,24 +44,19 @@ class Link(Protocol):
     @property
     def overflowed(self) -> int:
         """Number of messages discarded because the queue was full."""
-        ...
 
     @property
     def is_connected(self) -> bool:
         """True while the router is reachable."""
-        ...
 
     def receive(self, until: float) -> Sample | None:
         """Return the next message; None when none arrives by `until` [s], or the router is gone."""
-        ...
 
     def tokens(self) -> Sequence[str]:
         """Return the liveliness tokens of all known publishers."""
-        ...
 
     def close(self) -> None:
         """Close the link."""
-        ...
 
 
 OpenLink = Callable[[Ros2Config, Clock], Link]
@@ -70,8 +65,7 @@ OpenLink = Callable[[Ros2Config, Clock], Link]
 def open_session(router: str, start: str = "ros2 run rmw_zenoh_cpp rmw_zenohd") -> zenoh.Session:
     """Open a session with this router only: it neither listens nor scouts. `start` is the command that starts it.
 
-    Raises:
-        SourceLost: the router is not there.
+    Raise SourceLost if the router is not there.
     """
     config = zenoh.Config()
     settings: dict[str, Any] = {
@@ -88,8 +82,7 @@ def open_session(router: str, start: str = "ros2 run rmw_zenoh_cpp rmw_zenohd") 
         return zenoh.open(config)
     except zenoh.ZError as error:
         raise SourceLost(
-            f"no zenoh router answers on {router}. Start it on the robot: {start}",
-            retry_s=RETRY_S,
+            f"no zenoh router answers on {router}. Start it on the robot: {start}", retry_s=RETRY_S
         ) from error
 
 
@@ -145,8 +138,7 @@ class ZenohLink:
 def open_zenoh(config: Ros2Config, clock: Clock) -> Link:
     """Subscribe to the joint states of the configured robot. The type's hash is a wildcard, so any ROS 2 version works.
 
-    Raises:
-        SourceLost: the router is not there.
+    Raise SourceLost if the router is not there.
     """
     key = rmw.topic_key(config.domain, config.topic, JOINT_STATE, rmw.ANY)
     if config.via == "ros2dds":

@@ -54,10 +54,7 @@ class MarkerPublisher:
         """Open the topic. Raise SourceLost when the router is not there."""
         self._session = session = open_session(self._config.router)
         domain, topic, name = self._config.domain, self._marker.topic, str(session.info.zid())
-        tokens = (
-            rmw.node_token(domain, name, NODE),
-            rmw.publisher_token(domain, name, NODE, topic, self._kind),
-        )
+        tokens = (rmw.node_token(domain, name, NODE), rmw.publisher_token(domain, name, NODE, topic, self._kind))
         self._tokens = [session.liveliness().declare_token(token) for token in tokens]
         self._gid = hashlib.blake2b(tokens[1].encode(), digest_size=rmw.GID_BYTES).digest()
         self._publisher = session.declare_publisher(rmw.topic_key(domain, topic, self._kind))

@@ -188,24 +188,19 @@ class Drive(Protocol):
     @property
     def holding(self) -> frozenset[str]:
         """Joints whose torque may be on now."""
-        ...
 
     @property
     def complaints(self) -> tuple[str, ...]:
         """Current problems, and what to do; from any thread."""
-        ...
 
     def open(self, buses: Mapping[str, Bus], servos: Sequence[IdentifiedServo]) -> None:
         """Accept the servos that were found, with torque verified off, in the order of the joints."""
-        ...
 
     def step(self, reading: JointReading | None, samples: Mapping[str, Sample | None]) -> str | None:
         """Run once each cycle, after the request, with the reading (None when it was rejected) and the newest samples.
 
         Return why the joints had to be released in this cycle, so that the other drives release theirs too; else None.
         """
-        ...
 
     def release(self, why: str | None) -> None:
         """Switch torque off and verify it on every joint as far as the bus allows. `why` is None at the regular end."""
-        ...

@@ -22,17 +22,14 @@ class AnyBus(Protocol):
     @property
     def port(self) -> str:
         """The serial port."""
-        ...
 
     @property
     def baud(self) -> int:
         """Bits per second."""
-        ...
 
     @property
     def latency_ms(self) -> float | None:
         """Latency of the adapter [ms]; None: read from the system."""
-        ...
 
 
 BusT = TypeVar("BusT", bound=AnyBus)

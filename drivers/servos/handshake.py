@@ -157,9 +157,7 @@ def require_all(findings: Iterable[Finding], ports: str) -> list[IdentifiedServo
 def switch_torque_off(bus: Bus, servo: IdentifiedServo) -> IdentifiedServo:
     """Switch its torque off where it is on, and make sure; the servo with what it was like.
 
-    Raises:
-        SourceLost: it does not answer.
-        SourceError: the torque stays on.
+    Raise SourceLost if it does not answer. Raise SourceError if the torque stays on.
     """
     had_torque = torque_is_on(bus, servo)
     if had_torque:

@@ -46,19 +46,15 @@ class Packets(Protocol):
 
     def ping(self, id: int) -> bytes:
         """Build PING."""
-        ...
 
     def read(self, id: int, address: int, size: int) -> bytes:
         """Build READ."""
-        ...
 
     def write(self, id: int, address: int, data: bytes) -> bytes:
         """Build WRITE."""
-        ...
 
     def take(self, received: bytes | bytearray, at: int) -> Status | None:
         """Return the status packet that begins at `at`; None when it is incomplete. Raise Garbled if there is none."""
-        ...
 
 
 HEADER, LARGEST_ID = b"\xff\xff", 0xFD

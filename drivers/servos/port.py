@@ -11,20 +11,15 @@ class Port(Protocol):
     @property
     def baud(self) -> int:
         """Bits per second."""
-        ...
 
     def write(self, data: bytes) -> None:
         """Send `data`. Raise BusLost when the port is gone."""
-        ...
 
     def receive(self, until: float) -> bytes:
         """Return what has arrived, else what arrives next; empty when nothing arrives before `until` on the clock."""
-        ...
 
     def flush(self) -> None:
         """Discard what has arrived."""
-        ...
 
     def close(self) -> None:
         """Release the port."""
-        ...

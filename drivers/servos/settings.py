@@ -36,11 +36,7 @@ class Setting:
     follows: str = ""
 
     def value(self, text: str) -> int:
-        """Parse the user's value.
-
-        Raises:
-            ConfigError: not a value of this setting, or out of range.
-        """
+        """Parse the user's value. Raise ConfigError if not a value of this setting, or out of range."""
         if text in self.words:
             return self.words[text]
         try:

@@ -96,8 +96,7 @@ class RenderProcess:
     def fetch(self, number: int, timeout_s: float) -> tuple[ImageArray, ...] | None:
         """Frame `number`, the earliest not yet fetched, as images of the caller's own; None after `timeout_s`.
 
-        Raises:
-            SourceLost: the renderer's process has died.
+        Raise SourceLost if the renderer's process has died.
         """
         if not select.select([self._answers], [], [], max(0.0, timeout_s))[0]:
             return None

@@ -43,9 +43,7 @@ class NatnetReceiver:
     def open(self) -> None:
         """Request the server's version and join its stream.
 
-        Raises:
-            SourceLost: it does not answer.
-            SourceError: it speaks another version of NatNet.
+        Raise SourceLost if it does not answer. Raise SourceError if it speaks another version of NatNet.
         """
         self.server, self.names, self._frames = None, {}, 0
         try:
@@ -67,8 +65,7 @@ class NatnetReceiver:
     def receive(self, until: float) -> Packet | None:
         """Return the next frame; None when none arrives by `until` [s].
 
-        Raises:
-            SourceLost: the server has been silent for seconds.
+        Raise SourceLost if the server has been silent for seconds.
         """
         while True:
             self._keep_alive()

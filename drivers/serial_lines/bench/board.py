@@ -135,8 +135,7 @@ class Listener:
     def after(self, t: float, timeout_s: float) -> JointReading | None:
         """Return the first reading measured after `t` [s]; None when there is none in time.
 
-        Raises:
-            BodyschemaError: the error that ended the reading.
+        Raise BodyschemaError if the error that ended the reading.
         """
         with self._told:
             self._told.wait_for(lambda: self._error is not None or self._is_after(t), timeout_s)
