@@ -61,10 +61,7 @@ class ClientConfig:
 
     @classmethod
     def load(cls, file: Path, environment: Mapping[str, str] = os.environ) -> ClientConfig:
-        """Read robot.toml; where something is wrong or the environment overrides it, as `Config` does.
-
-        Raise ConfigError if as `Config.load`.
-        """
+        """Read robot.toml; where something is wrong or the environment overrides it, as `Config.load` does."""
         if not any(variable.startswith(OVERRIDES) for variable in environment):
             try:
                 raw, text = read_toml(file)

@@ -46,8 +46,6 @@ class Diagnoses:
         """Initialise without a diagnosis.
 
         Args:
-            robot_file: the robot's description.
-            joints: their names.
             history: returns this number of the newest pairs.
             tell: called with the state whenever it changes, from any thread.
         """

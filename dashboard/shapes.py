@@ -156,19 +156,19 @@ def _sent(
     place = {key: number for number, key in enumerate(buffers)}
     found = {
         link: [
-            _link_shape(each, place.get((each.mesh, each.sizes)))
+            LinkShape(
+                each.kind,
+                list(each.sizes),
+                [*each.T_link_shape[:3, 3].tolist(), *quaternions(each.T_link_shape[None, :3, :3])[0].tolist()],
+                None if each.rgba is None else list(each.rgba),
+                place.get((each.mesh, each.sizes)),
+            )
             for each in parts
             if each.kind != "mesh" or (each.mesh, each.sizes) in place
         ]
         for link, parts in shapes.items()
     }
     return LinkShapes(found, list(buffers.values()), said)
-
-
-def _link_shape(shape: Shape, mesh: int | None) -> LinkShape:
-    T = shape.T_link_shape
-    pose = [*T[:3, 3].tolist(), *quaternions(T[None, :3, :3])[0].tolist()]
-    return LinkShape(shape.kind, list(shape.sizes), pose, None if shape.rgba is None else list(shape.rgba), mesh)
 
 
 def _sentences(meshes: MeshSet, before: int, after: int) -> Iterator[str]:

@@ -23,10 +23,12 @@ class Sensor(Protocol):
     @property
     def joint(self) -> str:
         """The joint's name."""
+        ...
 
     @property
     def label(self) -> str:
         """Name of the sensor on its device."""
+        ...
 
     @property
     def ticks_per_turn(self) -> int | None:
@@ -34,9 +36,11 @@ class Sensor(Protocol):
 
     def angle(self, ticks: int) -> float:
         """Return the joint angle [rad] at a position with its turns [ticks]."""
+        ...
 
     def ticks(self, angle: float) -> float:
         """Return the position [ticks] at a joint angle [rad]."""
+        ...
 
 
 class TurnCount:

@@ -19,11 +19,10 @@ from bodyschema.robot.limited import read_at_most
 def descriptions(named: Sequence[Path]) -> list[Path]:
     """Return descriptions of robots, each once: files, and of a folder those in it and in its subfolders.
 
+    Raise ConfigError if a folder has none.
+
     Of a folder's TOML files, those with a table `[robot]` count, because calibrations and other files are there too. Of
     a subfolder, its robot.toml counts.
-
-    Raises:
-        ConfigError: a folder has none.
     """
     found: list[Path] = []
     for path in named:

@@ -204,15 +204,14 @@ DOES_NOT_FIT = (ArithmeticError, LookupError, TypeError, ValueError)
 def go_on(new: Callable[[], OnlineLearner], checkpoint: Path, robot: str) -> tuple[OnlineLearner, str | None]:
     """Restore the learner from the newest usable checkpoint.
 
+    Raise CheckpointError if an unusable checkpoint cannot be moved aside.
+
     Args:
         new: creates a learner without data.
         checkpoint: the newest; an unusable one is kept next to it under another name.
 
     Returns:
         The learner, and a message about what was wrong, or None.
-
-    Raises:
-        CheckpointError: an unusable checkpoint cannot be moved aside.
     """
     said: list[str] = []
     for file in generations(checkpoint):

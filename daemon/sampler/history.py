@@ -64,7 +64,7 @@ def _read(raw: bytes) -> PairMessage | Unreadable:
 def answer_pairs(reader: PairReader, request: Request) -> bytes:
     """Answer `pairs?from=SEQ;to=SEQ` with at most `LARGEST_REPLY` stored pairs, bounds inclusive and optional.
 
-    Raise RequestError if an unknown parameter, or one that is not a sequence number.
+    Raise RequestError for an unknown parameter, or one that is not a sequence number.
     """
     unknown = [name for name in request.parameters if name not in ("from", "to")]
     if unknown:

@@ -119,18 +119,15 @@ class ReconnectingSource(Generic[R_co]):
             self.losses += 1
         else:
             self._wait_s = min(2 * self._wait_s, LONGEST_WAIT_S)
-            self._tell_refusal(error)
+            # Problems that need a person are logged, each once.
+            if not isinstance(error, SourceLost) and str(error) != self._refused:
+                self._refused = str(error)
+                log.warning("%s cannot be taken again: %s; trying on", self._name, error)
         self._is_open = False
         said = error.brief if isinstance(error, SourceLost) else error
         self.trouble = f"{self._name} are lost ({said}); trying to open them again"
         soon_s = error.retry_s if isinstance(error, SourceLost) else None
         self._next_try = self._wall.now() + (self._wait_s if soon_s is None else soon_s)
-
-    def _tell_refusal(self, error: SourceError) -> None:
-        """Log problems that need a person, each once."""
-        if not isinstance(error, SourceLost) and str(error) != self._refused:
-            self._refused = str(error)
-            log.warning("%s cannot be taken again: %s; trying on", self._name, error)
 
 
 # A disk that takes longer per pair costs frames [s].
@@ -172,7 +169,7 @@ class ResilientWriter:
         return pair
 
     def attempt(self, write: Callable[[], T]) -> T | None:
-        """Return the result of `write`; None if the disk did not accept it. Raise StoreError if as for `append`."""
+        """Return the result of `write`; None if the disk did not accept it. Raise StoreError as `append` does."""
         begun = self._wall.now()
         try:
             return write()

@@ -27,12 +27,15 @@ class GroundTruth(Protocol):
 
     def change_tool(self, marker_xyz: tuple[float, float, float]) -> float:
         """Change the tool: put its marker at `marker_xyz` [m] in the marker link. Return the time [s] of the change."""
+        ...
 
     def true_chain(self) -> RigidChain:
         """Return the robot's true kinematic chain."""
+        ...
 
     def true_turn(self) -> FloatArray:
         """Return the true rotation of the marker on the hand, shape (3, 3)."""
+        ...
 
 
 @runtime_checkable
@@ -42,17 +45,21 @@ class Powered(Protocol):
     @property
     def name(self) -> str:
         """Name in commands: `<name>_on`, `<name>_off`."""
+        ...
 
     @property
     def state(self) -> str:
         """Off, on, or dropped: switched off by itself, until requested again."""
+        ...
 
     @property
     def complaints(self) -> tuple[str, ...]:
         """Problems, with remedies."""
+        ...
 
     def ask(self, on: bool) -> Future[str]:
         """Request torque on or off. The reading thread answers, unless the request is cancelled before."""
+        ...
 
 
 @runtime_checkable
@@ -62,14 +69,17 @@ class Head(Powered, Protocol):
     @property
     def head(self) -> tuple[str, ...]:
         """Names of its joints."""
+        ...
 
     @property
     def lower(self) -> FloatArray:
         """Their lower limits [rad] (g,)."""
+        ...
 
     @property
     def upper(self) -> FloatArray:
         """Their upper limits [rad] (g,)."""
+        ...
 
     @property
     def pose(self) -> tuple[float, FloatArray] | None:
@@ -79,12 +89,14 @@ class Head(Powered, Protocol):
         """Request that its joints are at `angles` (g,) [rad] at `t` [s]."""
 
 
+@runtime_checkable
 class TellsHealth(Protocol):
     """A device that reports its health."""
 
     @property
     def health(self) -> Sequence[str]:
         """Problems, with remedies."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,10 +155,12 @@ class MarkerTopic(Source, Protocol):
     @property
     def period_s(self) -> float:
         """Minimum interval between two positions [s]."""
+        ...
 
     @property
     def has_sigma(self) -> bool:
         """True if messages include the uncertainty of a position."""
+        ...
 
     def publish(self, stamp_ns: int, x: FloatArray, sigma: FloatArray) -> None:
         """Publish a position [m] and its 1-sigma per axis [m], shapes (3,), at a time on the encoders' clock [ns]."""

@@ -69,13 +69,17 @@ class Identity:
         for name in (tls.ca, tls.certificate, *secret):
             if name is not None:
                 _check_file(folder / name, secret=name in secret)
+
+        def found(name: str | None) -> Path | None:
+            return None if name is None else (folder / name).absolute()
+
         return cls(
             ca=(folder / tls.ca).absolute(),
-            certificate=None if tls.certificate is None else (folder / tls.certificate).absolute(),
-            key=None if tls.key is None else (folder / tls.key).absolute(),
+            certificate=found(tls.certificate),
+            key=found(tls.key),
             user=None if login is None else login.user,
-            password_file=None if login is None else (folder / login.password_file).absolute(),
-            users_file=None if users_file is None else (folder / users_file).absolute(),
+            password_file=None if login is None else found(login.password_file),
+            users_file=found(users_file),
         )
 
     @property
@@ -131,16 +135,11 @@ class Route:
         return " or ".join(self.endpoints)
 
 
-def host_of(endpoint: str) -> str:
-    """Return the host in a zenoh endpoint, without the brackets of IPv6."""
-    return endpoint.partition("/")[2].partition("?")[0].partition("#")[0].rpartition(":")[0].strip("[]")
-
-
 def is_local(endpoint: str) -> bool:
     """Return True if only this machine can reach the endpoint."""
     if endpoint.startswith("unixsock-stream/"):
         return True
-    host = host_of(endpoint)
+    host = endpoint.partition("/")[2].partition("?")[0].partition("#")[0].rpartition(":")[0].strip("[]")  # of IPv6
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:

@@ -354,7 +354,7 @@ def joint_vector(name: str, values: Sequence[float], joints: tuple[str, ...]) ->
 def joint_angles(request: JointsRequest, joints: tuple[str, ...]) -> FloatArray:
     """Return the request's joint angles, shape (n, d) [rad].
 
-    Raise RequestError if as `joint_rows`, or a value is impossible for a joint.
+    Raise RequestError as `joint_rows` does, or if a value is impossible for a joint.
     """
     import numpy as np
 

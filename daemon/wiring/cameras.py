@@ -127,10 +127,15 @@ def tracked_images(config: Config, folder: Path) -> TrackedCamera:
 def _tracked(config: Config, **layout: VideosConfig | ImagesConfig) -> TrackedCamera:
     given = cameras_of(config)
     cameras = CamerasConfig(calibration=None if given is None else given.calibration, **layout)  # pyright: ignore[reportArgumentType]
-    vision = msgspec.structs.replace(config.tables.vision, cameras=cameras, further_cameras=())
-    seen = config.with_tables(msgspec.structs.replace(config.tables, vision=vision))
+    seen = seen_through(config, cameras)
     camera = camera_of(seen, open_eyes(seen, SystemClock()))
-    return TrackedCamera(camera, tracker_of(camera.calibration, vision))
+    return TrackedCamera(camera, tracker_of(camera.calibration, seen.tables.vision))
+
+
+def seen_through(config: Config, cameras: CamerasConfig) -> Config:
+    """Return the configuration with `cameras` as the only ones."""
+    vision = msgspec.structs.replace(config.tables.vision, cameras=cameras, further_cameras=())
+    return config.with_tables(msgspec.structs.replace(config.tables, vision=vision))
 
 
 def require_usable(config: Config) -> None:

@@ -47,13 +47,11 @@ def learnt_colour_table(images: Sequence[Path], at: tuple[float, float] | None) 
 def moving_colour_table(eyes: StereoEyes, clock: Clock, seconds: float, tell: Callable[[str], None]) -> str:
     """Return the table [vision.colour] of the ball that moves in the left image during `seconds` [s].
 
+    Raise ColourUnlearnt if nothing colourful moved. Raise SourceError if the cameras cannot be opened.
+
     Args:
         eyes: cameras that are not open; they are closed again afterwards.
         tell: called with instructions and with problems of the cameras.
-
-    Raises:
-        ColourUnlearnt: nothing colourful moved.
-        SourceError: the cameras cannot be opened.
     """
     from bodyschema.vision.ball.colour_model import colour_of_the_moving, colour_table
 

@@ -29,10 +29,8 @@ class Reply:
 Fault = Callable[[Reply, Random], Reply]
 
 
-class Faults(Protocol):
-    """Function that applies faults to each answer."""
-
-    def __call__(self, reply: Reply) -> Reply: ...
+Faults = Callable[[Reply], Reply]
+"""Applies faults to each answer."""
 
 
 def no_faults(reply: Reply) -> Reply:
@@ -45,22 +43,22 @@ class Device(Protocol):
 
     def send(self, data: bytes, t: float, baud: int) -> list[Reply]:
         """Send the host's `data`, whose first byte is on the wire at `t` [s], and return the answers in order."""
+        ...
 
     @property
     def speaks_at(self) -> float:
         """Time of the next unsolicited transmission [s]; infinity if there is none."""
+        ...
 
     def speak(self, until: float, baud: int) -> list[Reply]:
         """Return the unsolicited transmissions that begin by `until` and have not been returned yet."""
+        ...
 
 
 class OnlyAnswers:
     """A device that never sends on its own."""
 
-    @property
-    def speaks_at(self) -> float:
-        """Infinity: never."""
-        return math.inf
+    speaks_at = math.inf
 
     def speak(self, until: float, baud: int) -> list[Reply]:
         """Return an empty list."""

@@ -96,7 +96,6 @@ class CdrWriter:
     """Writer of one message, with zero padding."""
 
     def __init__(self, *, big_endian: bool = False) -> None:
-        """Start with the encapsulation header."""
         self._order = ">" if big_endian else "<"
         self._data = bytearray(b"\x00\x00\x00\x00" if big_endian else b"\x00\x01\x00\x00")
 

@@ -107,7 +107,6 @@ def encode_pose(
     """Encode geometry_msgs/PoseWithCovarianceStamped.
 
     Args:
-        header: of the message.
         x: position [m], 3 numbers.
         quaternion: orientation (x, y, z, w).
         covariance: of position [m²] and rotations about the fixed axes [rad²], 6 × 6 by rows.

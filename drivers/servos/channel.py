@@ -80,7 +80,6 @@ class Channel(ABC):
     """
 
     def __init__(self, servo: IdentifiedServo) -> None:
-        """Start without answers."""
         self.servo = servo
         self.newest: Sample | None = None
         self.doubts = 0
@@ -169,7 +168,6 @@ class Punctuality:
     """Detector of readings that were delayed so much that their time is less certain than usual."""
 
     def __init__(self) -> None:
-        """Start without readings."""
         self._unsure: deque[float] = deque(maxlen=_SETTINGS.lately)
 
     def is_usual(self, unsure: float) -> bool:
@@ -188,10 +186,12 @@ class Drive(Protocol):
     @property
     def holding(self) -> frozenset[str]:
         """Joints whose torque may be on now."""
+        ...
 
     @property
     def complaints(self) -> tuple[str, ...]:
         """Current problems, and what to do; from any thread."""
+        ...
 
     def open(self, buses: Mapping[str, Bus], servos: Sequence[IdentifiedServo]) -> None:
         """Accept the servos that were found, with torque verified off, in the order of the joints."""
