@@ -1,3 +1,1 @@
 """Sampler and learner: the two processes, their store, their zenoh interface, and the command line."""
-
-from __future__ import annotations

@@ -61,11 +61,7 @@ class ClientConfig:
 
     @classmethod
     def load(cls, file: Path, environment: Mapping[str, str] = os.environ) -> ClientConfig:
-        """Read robot.toml; where something is wrong or the environment overrides it, as `Config` does.
-
-        Raises:
-            ConfigError: as `Config.load`.
-        """
+        """Read robot.toml; where something is wrong or the environment overrides it, as `Config.load` does."""
         if not any(variable.startswith(OVERRIDES) for variable in environment):
             try:
                 raw, text = read_toml(file)
@@ -111,8 +107,7 @@ class ClientConfig:
     def joint_limits(self) -> Mapping[str, tuple[str, float, float]]:
         """By joint of the URDF, its type and its limits [rad; m if it slides].
 
-        Raises:
-            ConfigError: the URDF is not one.
+        Raise ConfigError if the URDF is not one.
         """
         try:
             found = ElementTree.fromstring(read_at_most(self.urdf), ElementTree.XMLParser(target=_Plain())).findall(

@@ -113,11 +113,7 @@ class Config:
 
     @classmethod
     def load(cls, file: Path, environment: Mapping[str, str] = os.environ) -> Config:
-        """Read robot.toml, its URDF and the environment.
-
-        Raises:
-            ConfigError: something is unknown, missing or wrong; the message names file, line, key and remedy.
-        """
+        """Read robot.toml, its URDF and the environment. Raise ConfigError with file, line, key and remedy."""
         raw, text = read_toml(file)
         known = [field.encode_name for field in msgspec.structs.fields(Tables)]
         for name in raw:
@@ -182,8 +178,7 @@ class Config:
     def with_state_dir(self, folder: Path) -> Config:
         """Return a copy with another folder for store and checkpoint, relative to the working directory.
 
-        Raises:
-            ConfigError: `folder` is a file.
+        Raise ConfigError if `folder` is a file.
         """
         if os.path.exists(folder) and not os.path.isdir(folder):
             raise ConfigError("is a file, and store and checkpoint need a folder", file=folder, remedy=_STATE_REMEDY)
@@ -193,11 +188,6 @@ class Config:
     def with_tables(self, tables: Tables) -> Config:
         """Return a copy with other settings."""
         return replace(self, tables=tables)
-
-    def reread(self) -> Config:
-        """Load the file again with the same command-line settings. Raise ConfigError as `load` does."""
-        again = Config.load(self.file)
-        return again if self.given_state_dir is None else again.with_state_dir(self.given_state_dir)
 
     def route(self, process: str) -> Route:
         """Return the endpoint and identity with which a client connects to `sampler` or `learner`."""

@@ -3,5 +3,3 @@
 All data come over zenoh, so this is a process of its own, next to the others or elsewhere. It needs the extra `view`;
 no other package imports it.
 """
-
-from __future__ import annotations

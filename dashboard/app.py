@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import TYPE_CHECKING, Literal
 
 import msgspec
 from starlette.applications import Starlette
@@ -20,18 +20,22 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from bodyschema.daemon.service.local_web import HEADERS, host_refusal
-from bodyschema.daemon.transport.keys import CommandName
 from bodyschema.daemon.transport.wire import CommandReply, decode, encode
-from bodyschema.dashboard.documents import BodyDocument, Process
+from bodyschema.dashboard.documents import Process
 from bodyschema.dashboard.hub import Follower, Hub, HubFullError
 from bodyschema.interfaces.errors import BusError, RequestError
+
+if TYPE_CHECKING:
+    from bodyschema.dashboard.diagnosing import Diagnoses
+    from bodyschema.dashboard.shapes import Body
+    from bodyschema.dashboard.watch import Watch
 
 _READING = ("GET", "HEAD")
 _HEADERS = HEADERS | {
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
         "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-    ),
+    )
 }
 
 
@@ -99,58 +103,10 @@ class PageCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     command: Literal["pause", "resume", "tool_changed", "rollback"]
 
 
-class Commands(Protocol):
-    """Sends commands to processes."""
-
-    def command(self, process: Process, name: CommandName) -> str:
-        """Return the process's reply; BusError if it does not answer, RequestError if it refuses."""
-        ...
-
-
-class Pictures(Protocol):
-    """Gives pictures of the cameras."""
-
-    def picture(self) -> bytes:
-        """Return the newest one as JPEG; BusError if no sampler with cameras answers, RequestError before the first."""
-        ...
-
-
-class Processes(Commands, Pictures, Protocol):
-    """Both processes, as far as the page needs them."""
-
-
-class Diagnosing(Protocol):
-    """Runs diagnoses, one after the other."""
-
-    def start(self) -> int:
-        """Start a diagnosis and return its number; RequestError if one is running."""
-        ...
-
-    def stop(self) -> None:
-        """End the running diagnosis; RequestError if none is running."""
-        ...
-
-    def report(self) -> bytes | None:
-        """Return the last report; None if there is none."""
-        ...
-
-
-class Shapes(Protocol):
-    """Gives the robot as it looks."""
-
-    def document(self) -> BodyDocument:
-        """Return its links and shapes."""
-        ...
-
-    def mesh(self, number: int) -> bytes | None:
-        """Return a mesh of the document; None if there is none with this number."""
-        ...
-
-
 class _Endpoints:
     """Endpoints of the page's routes."""
 
-    def __init__(self, hub: Hub, processes: Processes, diagnoses: Diagnosing, shapes: Shapes) -> None:
+    def __init__(self, hub: Hub, processes: Watch, diagnoses: Diagnoses, shapes: Body) -> None:
         self._hub, self._processes, self._diagnoses, self._shapes = hub, processes, diagnoses, shapes
         self._for_shapes = asyncio.Semaphore(_MOST_FOR_SHAPES)
 
@@ -206,7 +162,7 @@ class _Endpoints:
         return Response(page, media_type="text/html", headers={"Content-Security-Policy": _REPORT_POLICY})
 
 
-def application(hub: Hub, processes: Processes, diagnoses: Diagnosing, shapes: Shapes) -> Starlette:
+def application(hub: Hub, processes: Watch, diagnoses: Diagnoses, shapes: Body) -> Starlette:
     """Return the page's application on the documents of `hub`."""
     page = _Endpoints(hub, processes, diagnoses, shapes)
     routes = [

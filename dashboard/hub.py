@@ -52,18 +52,13 @@ class Follower:
 
 
 class Hub:
-    """Documents as JSON, each replaced as a whole; usable from any thread."""
+    """Documents as JSON, each replaced as a whole, until it is `closed`; usable from any thread."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._documents: dict[str, bytes] = {}
         self._followers: set[Follower] = set()
-        self._closed = False
-
-    @property
-    def closed(self) -> bool:
-        """True after `close`."""
-        return self._closed
+        self.closed = False
 
     def put(self, topic: str, document: object) -> None:
         """Replace a document; followers get it if it differs."""
@@ -83,8 +78,7 @@ class Hub:
     def follow(self) -> Follower:
         """Return a follower, to be passed to `leave` in the end; it starts with all documents.
 
-        Raises:
-            HubFullError: too many follow.
+        Raise HubFullError if too many follow.
         """
         with self._lock:
             if len(self._followers) >= MOST_FOLLOWERS:
@@ -101,6 +95,6 @@ class Hub:
     def close(self) -> None:
         """Close the hub: let every follower end."""
         with self._lock:
-            self._closed = True
+            self.closed = True
             for follower in self._followers:
                 follower.wake()

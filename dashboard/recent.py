@@ -74,14 +74,10 @@ class RecentPairs:
 
 
 def cloud(pairs: list[Pair], predict: Callable[[list[list[float]]], PredictReply]) -> CloudDocument:
-    """Return the model's residuals at pairs.
+    """Return the model's residuals at pairs. Raise BusError if the learner does not answer.
 
     Args:
-        pairs: the pairs.
         predict: queries the learner; RequestError while it has no model.
-
-    Raises:
-        BusError: the learner does not answer.
     """
     if not pairs:
         return NOTHING

@@ -7,7 +7,6 @@ import numpy as np
 from bodyschema.daemon.transport.status import LearnerStatus
 from bodyschema.daemon.transport.wire import PredictReply
 from bodyschema.interfaces.records import FloatArray, Pair
-from bodyschema.learning.status import LearntFigure
 from bodyschema.robot.description import RobotDescription, link_poses
 from bodyschema.robot.hand_eye import MarkerPose
 from bodyschema.robot.rpy import pose_of
@@ -39,7 +38,8 @@ def arm(
     T_camera = robot.camera.pose
     q, x = np.array([pair.q for pair in pairs]), np.array([pair.x for pair in pairs])
     if calibration is not None:
-        T_camera = pose_of(_learnt(calibration.camera_xyz), _learnt(calibration.camera_rpy))
+        figures = (calibration.camera_xyz, calibration.camera_rpy)
+        T_camera = pose_of(*(np.array([figure.learnt for figure in each]) for each in figures))
         for k, name in enumerate(robot.joints):
             zero = calibration.zeros.get(name)
             q[:, k] += 0.0 if zero is None else zero.value
@@ -47,37 +47,25 @@ def arm(
     T_root_cameras = poses[robot.camera.parent_link] @ T_camera
     measured = np.einsum("nij,nj->ni", T_root_cameras[:, :3, :3], x) + T_root_cameras[:, :3, 3]
     newest = np.array([poses[link][-1] for link in robot.tree.links])
-    predicted = None if reply is None else _moved(T_root_cameras[-1], np.array(reply.x[0]))
+    R, place = T_root_cameras[-1, :3, :3], T_root_cameras[-1, :3, 3]
+    predicted = None if reply is None else R @ np.array(reply.x[0]) + place
+    radii = None
+    if reply is not None and noise_m is not None:
+        radii = (_RADIUS_95 * np.hypot(np.array(reply.sigma[0]), noise_m)).tolist()
     return ArmDocument(
         pair=pairs[-1].seq,
         links=_pose_numbers(newest),
         camera=_pose_numbers(T_root_cameras[-1:])[0],
         hand=robot.tree.links.index(robot.robot.marker_link),
-        measured=_numbers(measured[-1]),
+        measured=measured[-1].round(_DECIMALS).tolist(),
         trail=measured[:-1].round(_DECIMALS).tolist(),
-        predicted=None if predicted is None else _numbers(predicted),
+        predicted=None if predicted is None else predicted.round(_DECIMALS).tolist(),
         measured_pose=MarkerPose.of(pairs[-1].x, pairs[-1].cov, pairs[-1].R, pairs[-1].cov_R),
         predicted_pose=None if reply is None or reply.poses is None else reply.poses[0],
-        radii=None if reply is None or noise_m is None else _radii(np.array(reply.sigma[0]), noise_m),
+        radii=radii,
         apart_m=None if predicted is None else float(np.linalg.norm(predicted - measured[-1])),
         placed=calibration is not None or robot.camera.pose_known,
     )
-
-
-def _radii(sigma: FloatArray, noise_m: float) -> list[float]:
-    return (_RADIUS_95 * np.hypot(sigma, noise_m)).tolist()
-
-
-def _learnt(figures: list[LearntFigure]) -> FloatArray:
-    return np.array([figure.learnt for figure in figures])
-
-
-def _moved(T: FloatArray, point: FloatArray) -> FloatArray:
-    return T[:3, :3] @ point + T[:3, 3]
-
-
-def _numbers(point: FloatArray) -> list[float]:
-    return point.round(_DECIMALS).tolist()
 
 
 def _pose_numbers(T: FloatArray) -> list[list[float]]:

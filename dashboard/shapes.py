@@ -137,8 +137,7 @@ class Body:
 def read_shapes(urdf: Path) -> LinkShapes:
     """Return the visual shapes of all links of a URDF, and their meshes with few triangles.
 
-    Raises:
-        RobotError: the URDF cannot be read.
+    Raise RobotError if the URDF cannot be read.
     """
     meshes, shapes = MeshSet(urdf, MOST_TRIANGLES), link_shapes(parse_urdf(urdf))
     named = [(shape.mesh, shape.sizes) for parts in shapes.values() for shape in parts if shape.kind == "mesh"]
@@ -157,19 +156,19 @@ def _sent(
     place = {key: number for number, key in enumerate(buffers)}
     found = {
         link: [
-            _link_shape(each, place.get((each.mesh, each.sizes)))
+            LinkShape(
+                each.kind,
+                list(each.sizes),
+                [*each.T_link_shape[:3, 3].tolist(), *quaternions(each.T_link_shape[None, :3, :3])[0].tolist()],
+                None if each.rgba is None else list(each.rgba),
+                place.get((each.mesh, each.sizes)),
+            )
             for each in parts
             if each.kind != "mesh" or (each.mesh, each.sizes) in place
         ]
         for link, parts in shapes.items()
     }
     return LinkShapes(found, list(buffers.values()), said)
-
-
-def _link_shape(shape: Shape, mesh: int | None) -> LinkShape:
-    T = shape.T_link_shape
-    pose = [*T[:3, 3].tolist(), *quaternions(T[None, :3, :3])[0].tolist()]
-    return LinkShape(shape.kind, list(shape.sizes), pose, None if shape.rgba is None else list(shape.rgba), mesh)
 
 
 def _sentences(meshes: MeshSet, before: int, after: int) -> Iterator[str]:

@@ -33,12 +33,12 @@ S = TypeVar("S", SamplerStatus, LearnerStatus)
 
 
 class Heard(Generic[S]):
-    """Newest status of one process; any thread may use it."""
+    """Newest status of one process, and whether its liveliness token is there; any thread may use it."""
 
     def __init__(self, kind: type[S], endpoint: str, clock: Clock) -> None:
         self._kind, self._endpoint, self._clock = kind, endpoint, clock
         self._lock = threading.Lock()
-        self._alive = False
+        self.alive = False
         self._heard_at: float | None = None
         self._heard_utc: float | None = None
         self._status: S | None = None
@@ -68,11 +68,6 @@ class Heard(Generic[S]):
             if status is not None:
                 self._status, self._fields = status, fields
 
-    def note_alive(self, alive: bool) -> None:
-        """Record that its liveliness token came, or is gone."""
-        with self._lock:
-            self._alive = alive
-
     @property
     def document(self) -> ProcessDocument:
         """State for the page."""
@@ -81,7 +76,7 @@ class Heard(Generic[S]):
 
     def _is_there(self) -> bool:
         recent = self._heard_at is not None and self._clock.now() - self._heard_at < SILENT_AFTER_S
-        return self._alive and recent
+        return self.alive and recent
 
 
 log = logging.getLogger(__name__)
@@ -95,10 +90,10 @@ COMMAND_LIMIT_S = 10.0
 class Watch:
     """Follows both processes while the with statement lasts; they may come and go."""
 
-    def __init__(self, config: Config, hub: Hub, clock: Clock | None = None) -> None:
+    def __init__(self, config: Config, hub: Hub) -> None:
         """Initialise without opening anything; documents go to `hub`."""
         self._config, self._hub = config, hub
-        self._clock = SystemClock() if clock is None else clock
+        self._clock = SystemClock()
         self._keys = Keys(config.robot.name)
         routes: dict[Process, Route] = {"sampler": config.route("sampler"), "learner": config.route("learner")}
         self._sampler = Heard(SamplerStatus, str(routes["sampler"]), self._clock)
@@ -135,9 +130,7 @@ class Watch:
     def command(self, process: Process, name: CommandName) -> str:
         """Send a command to a process and return its reply.
 
-        Raises:
-            BusError: it does not answer.
-            RequestError: it refused.
+        Raise BusError if it does not answer. Raise RequestError if it refused.
         """
         payload = encode(CommandRequest(name))
         reply = self._sessions[process].ask_one(self._keys.command(process), payload, timeout_s=COMMAND_LIMIT_S)
@@ -146,9 +139,7 @@ class Watch:
     def picture(self) -> bytes:
         """Return the sampler's newest camera picture with detections, as JPEG; at most one request each half second.
 
-        Raises:
-            BusError: the sampler does not answer, or has no cameras.
-            RequestError: no frame has come yet.
+        Raise BusError if the sampler does not answer, or has no cameras. Raise RequestError if no frame has come yet.
         """
         with self._picturing:
             now = self._clock.now()
@@ -160,8 +151,7 @@ class Watch:
     def history(self, newest: int) -> History:
         """Return the sampler's newest pairs, `newest` of them, to be read page by page.
 
-        Raises:
-            BusError: the sampler does not answer.
+        Raise BusError if the sampler does not answer.
         """
         status = self._sampler.status
         if status is None or not self._sampler.answers:
@@ -177,7 +167,7 @@ class Watch:
         for process, heard in heard_of.items():
             session = self._sessions[process]
             session.subscribe(self._keys.status(process), lambda payload, heard=heard: heard.take(payload, time.time()))
-            session.watch(self._keys.alive(process), heard.note_alive)
+            session.watch(self._keys.alive(process), lambda alive, heard=heard: setattr(heard, "alive", alive))
 
     def _work(self) -> None:
         while True:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import grp
 import os
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from .scan import serial_ports
+from .serial_line import serial_ports
 
 MANY_TROUBLES = 0.01  # share of lost readings that deserves a warning
 READ_S = 1.0  # how long a check of the rate lasts
@@ -37,6 +37,17 @@ class Check:
     state: State
     said: str
     fix: str = ""
+
+
+def warned(subject: str, said: str, fix: str, *, when: bool) -> Check:
+    """Return a check that is a warning with a remedy `when` something degrades the arm, else in order."""
+    return Check(subject, "warning", said, fix) if when else Check(subject, "ok", said)
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return the lines of a table whose columns are aligned."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,8 +93,6 @@ def port_checks(name: str, port: str, root: Path = ROOT, *, ours: Collection[int
     """Yield the checks of the port of the bus `name`. Open nothing.
 
     Args:
-        name: of the bus.
-        port: path of the port.
         root: of the file system, for /dev, /proc and /sys.
         ours: processes that are expected to have it open.
     """
@@ -114,7 +123,10 @@ def _permission(subject: str, port: str) -> Iterator[Check]:
     if os.access(port, os.R_OK | os.W_OK):
         return
     number = os.stat(port).st_gid
-    group = _group(number)
+    try:
+        group = grp.getgrgid(number).gr_name
+    except KeyError:
+        group = str(number)
     if number in os.getgroups():
         yield Check(subject, "wrong", f"{port} may not be opened by its group {group}", "bodyschema install udev")
         return
@@ -124,13 +136,6 @@ def _permission(subject: str, port: str) -> Iterator[Check]:
         f"{port} may not be opened: you are not in the group {group}",
         f"sudo usermod -aG {group} $USER    # then log in again",
     )
-
-
-def _group(number: int) -> str:
-    try:
-        return grp.getgrgid(number).gr_name
-    except KeyError:
-        return str(number)
 
 
 def _naming(subject: str, port: str, root: Path) -> Iterator[Check]:
@@ -151,7 +156,5 @@ def _latency(port: str, root: Path) -> Iterator[Check]:
     except (OSError, ValueError):
         return
     said = f"the adapter keeps bytes back for up to {latency_ms} ms"
-    if latency_ms > LONGEST_LATENCY_MS:
-        yield Check("latency timer", "warning", said, "bodyschema install udev    # then plug the adapter in again")
-    else:
-        yield Check("latency timer", "ok", said)
+    fix = "bodyschema install udev    # then plug the adapter in again"
+    yield warned("latency timer", said, fix, when=latency_ms > LONGEST_LATENCY_MS)

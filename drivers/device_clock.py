@@ -14,6 +14,10 @@ KNOWN_AFTER_S = 1.0
 class _Settings:
     """Settings of the fit of a device's clock."""
 
+    # difference of the clock rates until it is estimated, and its later change
+    drift: float = 3e-4
+    # intervals that miss each other by less are still accepted
+    slack_s: float = 0.5e-3
     # largest difference of clock rates that is tolerated until the rate is estimated
     worst: float = 0.02
     window_s: float = 20.0
@@ -43,17 +47,10 @@ class DeviceClock:
     The ratio of the clock rates is estimated too: a clock without a crystal is off by a percent.
     """
 
-    def __init__(self, tick_s: float, ticks: int, *, drift: float = 3e-4, slack_s: float = 0.5e-3) -> None:
-        """Start without knowledge of the offset.
-
-        Args:
-            tick_s: length of a tick.
-            ticks: the stamps count from 0 to this, excluded.
-            drift: difference of the clock rates until it is estimated, and its later change.
-            slack_s: intervals that miss each other by less are still accepted.
-        """
-        self._tick_s, self._ticks, self._slack_s = tick_s, ticks, slack_s
-        self._rate, self._spread, self._drift = 1.0, drift, drift
+    def __init__(self, tick_s: float, ticks: int) -> None:
+        """Start without knowledge of the offset; the stamps count ticks of `tick_s` from 0 to `ticks`, excluded."""
+        self._tick_s, self._ticks = tick_s, ticks
+        self._rate, self._spread = 1.0, _SETTINGS.drift
         self._low = self._high = 0.0  # bounds of host time minus device time
         self._host_s = self._device_s = 0.0  # of the last event
         self._is_known = False
@@ -75,7 +72,7 @@ class DeviceClock:
         device_s = self._unwrapped(stamp, ((earliest + latest) - (low + high)) / (2 * self._rate))
         first = device_s * self._rate + low
         last = (device_s + self._tick_s) * self._rate + high
-        slack_s = self._slack_s if self._is_known else self._slack_s + _SETTINGS.worst * (latest - self._begin[1])
+        slack_s = _SETTINGS.slack_s + (0.0 if self._is_known else _SETTINGS.worst * (latest - self._begin[1]))
         if first > latest + slack_s or last < earliest - slack_s:
             return None
         offsets = self._offsets(earliest, latest, device_s)
@@ -107,7 +104,7 @@ class DeviceClock:
         if unsure_s / passed_s < max(self._spread, abs(rate - self._rate)):
             turned = (self._rate - rate) * self._device_s  # keeps the offset at the present unchanged
             self._low, self._high = self._low + turned, self._high + turned
-            self._rate, self._spread = rate, max(self._drift, unsure_s / passed_s)
+            self._rate, self._spread = rate, max(_SETTINGS.drift, unsure_s / passed_s)
         if passed_s > RELEARN_AFTER_S:
             self._begin = (earliest, latest, self._device_s)
 
@@ -203,12 +200,11 @@ def _edge_below(points: list[tuple[float, float]], x: float) -> tuple[tuple[floa
     """Return the edge of the lower convex hull of `points` (sorted by x) at `x`."""
     hull: list[tuple[float, float]] = []
     for point in points:
-        while len(hull) > 1 and _turns_down(hull[-2], hull[-1], point):
+        while len(hull) > 1:
+            (x0, y0), (x1, y1) = hull[-2:]
+            if (x1 - x0) * (point[1] - y0) > (y1 - y0) * (point[0] - x0):
+                break
             hull.pop()
         hull.append(point)
     last = next(k for k, corner in enumerate(hull) if k > 0 and corner[0] >= x)
     return hull[last - 1], hull[last]
-
-
-def _turns_down(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> bool:
-    return (b[0] - a[0]) * (c[1] - a[1]) <= (b[1] - a[1]) * (c[0] - a[0])

@@ -15,7 +15,7 @@ HOST_S = 3e-3  # the operating system's share of the delay
 
 
 class Port(Protocol):
-    """An open serial port."""
+    """An open serial port: `bodyschema.drivers.serial_line.SerialLine`, or an emulated one."""
 
     @property
     def baud(self) -> int:
@@ -23,8 +23,7 @@ class Port(Protocol):
         ...
 
     def write(self, data: bytes) -> None:
-        """Send `data`."""
-        ...
+        """Send `data`. Raise BusLost when the port is gone."""
 
     def receive(self, until: float) -> bytes:
         """Return what has arrived, else what arrives next; empty when nothing arrives before `until` on the clock."""
@@ -32,19 +31,15 @@ class Port(Protocol):
 
     def flush(self) -> None:
         """Discard what has arrived."""
-        ...
 
     def close(self) -> None:
         """Release the port."""
-        ...
 
 
 def without_echo(port: Port, clock: Clock, latency_s: float) -> Port:
     """Return `port`, wrapped to remove its adapter's echo if there is one. Send a byte to find out.
 
     Args:
-        port: the open port.
-        clock: the clock.
         latency_s: longest time that the adapter holds bytes back.
     """
     port.flush()
@@ -59,17 +54,14 @@ class EchoFree:
     """A port whose adapter echoes what is sent."""
 
     def __init__(self, port: Port, clock: Clock) -> None:
-        """Start with no echo outstanding."""
         self._port, self._clock = port, clock
         self._own = bytearray()
 
     @property
     def baud(self) -> int:
-        """Bits per second."""
         return self._port.baud
 
     def write(self, data: bytes) -> None:
-        """Send `data`."""
         self._own += data
         self._port.write(data)
 
@@ -82,14 +74,12 @@ class EchoFree:
         return b""
 
     def flush(self) -> None:
-        """Discard what has arrived."""
         while self._own and (data := self._port.receive(self._clock.now())):
             self._without_own(data)
         if not self._own:
             self._port.flush()
 
     def close(self) -> None:
-        """Release the port."""
         self._port.close()
 
     def _without_own(self, data: bytes) -> bytes:

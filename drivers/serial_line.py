@@ -20,6 +20,14 @@ DEFAULT_LATENCY_S = 4e-3  # for adapters that do not report their latency
 LATENCY_OF = "/sys/bus/usb-serial/devices/{}/latency_timer"
 
 
+def serial_ports(root: Path = Path("/")) -> list[str]:
+    """Return the USB serial ports of this machine, by their persistent names where there are any."""
+    by_id = sorted((root / "dev/serial/by-id").glob("*"))
+    named = {link.resolve() for link in by_id}
+    others = [port for pattern in ("ttyUSB*", "ttyACM*") for port in sorted((root / "dev").glob(pattern))]
+    return [str(port) for port in (*by_id, *(port for port in others if port.resolve() not in named))]
+
+
 class BusLost(SourceLost):
     """The port, or the device behind it, was lost, or is not there yet."""
 
@@ -50,9 +58,8 @@ class SerialLine:
     def open(cls, port: str, baud: int, now: Callable[[], float] = time.monotonic) -> SerialLine:
         """Open `port` exclusively.
 
-        Raises:
-            BusLost: there is no such port (any more).
-            SourceError: it is in use, or this user may not open it.
+        Raise BusLost if there is no such port (any more). Raise SourceError if it is in use, or this user may not open
+        it.
         """
         try:
             device = serial.Serial(port, baud, timeout=0, exclusive=True)

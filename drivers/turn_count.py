@@ -33,7 +33,6 @@ class Sensor(Protocol):
     @property
     def ticks_per_turn(self) -> int | None:
         """Ticks after which the reading repeats; None for a sensor that does not wrap."""
-        ...
 
     def angle(self, ticks: int) -> float:
         """Return the joint angle [rad] at a position with its turns [ticks]."""
@@ -54,11 +53,7 @@ class TurnCount:
     """
 
     def __init__(
-        self,
-        limits: Sequence[tuple[float, float]],
-        last_pose: Sequence[float] | None,
-        max_move_deg: float,
-        table: str,
+        self, limits: Sequence[tuple[float, float]], last_pose: Sequence[float] | None, max_move_deg: float, table: str
     ) -> None:
         """Start without a reading.
 

@@ -1,3 +1,1 @@
 """Many robots at once: their processes, a comparison of their models, and the diagnosis of all their recordings."""
-
-from __future__ import annotations

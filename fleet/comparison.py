@@ -124,19 +124,18 @@ class TypeComparison(msgspec.Struct, frozen=True):
     units: tuple[Unit, ...]
 
 
-def common_poses(coverages: Sequence[Mapping[str, JointRange]], joints: tuple[str, ...], seed: int = 0) -> FloatArray:
+def common_poses(coverages: Sequence[Mapping[str, JointRange]], joints: tuple[str, ...]) -> FloatArray:
     """Return poses (n, d) [rad, m] from the median ranges of the robots.
 
-    One robot that hardly moved does not matter.
+    Raise RequestError if no robot reports the ranges of its joints.
 
-    Raises:
-        RequestError: no robot reports the ranges of its joints.
+    One robot that hardly moved does not matter.
     """
     ranges = [[(each[joint].low, each[joint].high) for joint in joints] for each in coverages]
     if not ranges:
         raise RequestError("no sampler of these robots answers, so the ranges of their joints are unknown")
     low, high = np.sort(np.median(np.array(ranges), axis=0), axis=1).T
-    return np.random.default_rng(seed).uniform(low, high, (_SETTINGS.poses, len(joints)))
+    return np.random.default_rng(0).uniform(low, high, (_SETTINGS.poses, len(joints)))
 
 
 def compared(joints: tuple[str, ...], q: FloatArray, models: Sequence[Model]) -> TypeComparison:
@@ -157,10 +156,11 @@ def compared(joints: tuple[str, ...], q: FloatArray, models: Sequence[Model]) ->
             in_support=model.in_support,
             is_off=bool(odd[k]) or each.rms_mm > far[k] if judged else None,
             odd=odd[k],
-            camera_moved_mm=_camera_moved(model.calibration),
-            camera_turned_deg=_camera_turned(model.calibration),
+            camera_moved_mm=moved[0],
+            camera_turned_deg=moved[1],
         )
         for k, (model, each) in enumerate(zip(models, apart, strict=True))
+        for moved in [_camera_moved(model.calibration)]
     )
     low, high = (tuple(map(float, ends)) for ends in (q.min(axis=0), q.max(axis=0)))
     return TypeComparison(joints, len(q), low, high, units)
@@ -233,19 +233,15 @@ def _spread(values: FloatArray) -> float:
     return float(np.median(np.abs(told - np.median(told))) / _quantile(0.75))
 
 
-def _camera_moved(found: ChainCalibration | None) -> float | None:
+def _camera_moved(found: ChainCalibration | None) -> tuple[float, float] | tuple[None, None]:
+    """Return the distance [mm] and the turn [°] from the camera pose in robot.toml."""
     if found is None:
-        return None
-    return 1e3 * math.dist([each.drawn for each in found.camera_xyz], [each.learnt for each in found.camera_xyz])
-
-
-def _camera_turned(found: ChainCalibration | None) -> float | None:
-    if found is None:
-        return None
+        return None, None
+    moved = math.dist([each.drawn for each in found.camera_xyz], [each.learnt for each in found.camera_xyz])
     drawn, learnt = (
         Rotation.from_euler("xyz", [getattr(each, which) for each in found.camera_rpy]) for which in ("drawn", "learnt")
     )
-    return math.degrees((drawn.inv() * learnt).magnitude())
+    return 1e3 * moved, math.degrees((drawn.inv() * learnt).magnitude())
 
 
 def by_type(members: Sequence[Member]) -> tuple[dict[tuple[str, ...], list[Member]], list[str]]:

@@ -69,17 +69,13 @@ Done = Callable[[Diagnosed], None]
 
 
 def diagnose_all(
-    jobs: Sequence[Job],
-    asked: Asked,
-    out: Path | None,
-    cluster: Client,
-    told: Told,
-    done: Done,
+    jobs: Sequence[Job], asked: Asked, out: Path | None, cluster: Client, told: Told, done: Done
 ) -> list[Diagnosed]:
     """Diagnose all recordings; a failed one is reported as such, and does not end the others.
 
+    Raise RecordingError if the folder cannot be written.
+
     Args:
-        jobs: the recordings.
         asked: settings of the diagnoses.
         out: a folder for each recording is written here.
         cluster: a client of the scheduler; running work is cancelled if this ends early.
@@ -88,9 +84,6 @@ def diagnose_all(
 
     Returns:
         The results, in the order of the jobs.
-
-    Raises:
-        RecordingError: the folder cannot be written.
     """
     from distributed import as_completed
 
@@ -123,15 +116,14 @@ def diagnose_all(
 def workers(scheduler: str | None, jobs: int, count: int | None = None) -> Iterator[Client]:
     """Yield a client of the scheduler at an address; without one, of processes on this machine.
 
+    Raise ConfigError if the scheduler does not answer, or has no workers.
+
     Dask gives each process one thread of BLAS.
 
     Args:
         scheduler: its address; None starts processes here.
         jobs: number of recordings.
         count: of processes; None: one for each core, and no more than jobs.
-
-    Raises:
-        ConfigError: the scheduler does not answer, or has no workers.
     """
     from dask import config
     from distributed import Client, LocalCluster

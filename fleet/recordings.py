@@ -33,11 +33,9 @@ class Job:
 def jobs(recordings: Sequence[Path], folder: Path | None, robot: Path | None) -> list[Job]:
     """Return the given recordings and those in a folder, each with `robot` or the robot.toml next to it.
 
-    A recording has the name of its file; if two files have the same name, that of the folder and the file.
+    Raise RequestError if no recording was given. Raise RecordingError if the folder does not exist, or has none.
 
-    Raises:
-        RequestError: no recording was given.
-        RecordingError: the folder does not exist, or has none.
+    A recording has the name of its file; if two files have the same name, that of the folder and the file.
     """
     found = [*recordings, *([] if folder is None else _in(folder))]
     files = list(dict.fromkeys(found))

@@ -10,17 +10,19 @@ A chain is a product of transforms, of which a camera sees only the whole. How i
 
 from __future__ import annotations
 
+import operator
+from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Self
 
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
 from kbmaps import RigidChain
-from kbmaps.rotations import exponentials
 
 from .description import RobotDescription
-from .urdf import UrdfJoint, inverse, standing
+from .urdf import UrdfJoint, inverse, joint_motion, standing
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +53,11 @@ class CalibratedGeometry:
             zeros: joint offsets (d,) [rad, m], as in `kbmaps.ChainReport`.
         """
         way = _Way.of(robot)
-        at_zero = [_joint_motion(chain, k, value) for k, value in enumerate(zeros)]
-        frames = _moved_frames(chain, T_measured_nominal, at_zero)
+        joints = zip(chain.axes, chain.prismatic, zeros, strict=True)
+        at_zero = [joint_motion(axis, bool(prismatic), value) for axis, prismatic, value in joints]
+        # Of the joints and the marker, with all joints at zero, in the nominal measurement frame.
+        moved = [inverse(zero) @ fixed for zero, fixed in zip(at_zero, chain.fixed[1:], strict=True)]
+        frames = _frames([inverse(T_measured_nominal) @ chain.fixed[0], *moved])
         drawn = _frames(robot.chain.fixed)
         T_camera_parent = T_measured_nominal @ inverse(robot.camera.pose)
         if way.upward[0]:
@@ -99,24 +104,5 @@ class _Way:
         return way
 
 
-def _moved_frames(chain: RigidChain, T_measured_nominal: FloatArray, at_zero: list[FloatArray]) -> list[FloatArray]:
-    """Return frames of the joints and the marker (d+1) with all joints at zero, in the nominal measurement frame."""
-    parts = [inverse(T_measured_nominal) @ chain.fixed[0]]
-    parts += [inverse(zero) @ fixed for zero, fixed in zip(at_zero, chain.fixed[1:], strict=True)]
-    return _frames(np.array(parts))
-
-
-def _frames(transforms: FloatArray) -> list[FloatArray]:
-    frames = [transforms[0]]
-    for transform in transforms[1:]:
-        frames.append(frames[-1] @ transform)
-    return frames
-
-
-def _joint_motion(chain: RigidChain, k: int, value: float) -> FloatArray:
-    motion = np.eye(4)
-    if chain.prismatic[k]:
-        motion[:3, 3] = value * chain.axes[k]
-    else:
-        motion[:3, :3] = exponentials((value * chain.axes[k])[None])[0][0]
-    return motion
+def _frames(transforms: Iterable[FloatArray]) -> list[FloatArray]:
+    return list(accumulate(transforms, operator.matmul))

@@ -29,7 +29,6 @@ MARKER_LINK = "calibrated_marker"
 ROBOT_FILE = "robot.toml"
 # What an extended.toml adds to robot.toml: `bodyschema.effects.files` reads and writes it.
 EXTENSIONS = ("effects", "background", "unexplained")
-_ROUNDING = 1e-12
 # What is next to nothing for a simulator, which would else give a link without a mass one of its own.
 _NO_MASS = (
     '<inertial><mass value="1e-6"/><inertia ixx="1e-9" ixy="0" ixz="0" iyy="1e-9" iyz="0" izz="1e-9"/></inertial>'
@@ -43,6 +42,8 @@ def write_calibrated(
 ) -> Path:
     """Write `robot` with another geometry as a URDF and a robot.toml into `folder`, which is made if need be.
 
+    Raise ConfigError if one of the files is there already, or they cannot be written.
+
     Meshes stay where they are; their relative names are made to lead there, names with a scheme are left. Store and
     checkpoint will be kept in a folder of their own.
 
@@ -52,9 +53,6 @@ def write_calibrated(
 
     Returns:
         The path of the robot.toml.
-
-    Raises:
-        ConfigError: one of the files is there already, or they cannot be written.
     """
     urdf, toml = folder / robot.tree.file.name, folder / ROBOT_FILE
     texts = {
@@ -87,10 +85,16 @@ def calibrated_urdf(robot: RobotDescription, geometry: CalibratedGeometry, folde
         if joint.get("name") in geometry.T_parent_joint:
             _set_origin(etree, joint, geometry.T_parent_joint[joint.get("name")])
     for joint in root.iterfind("joint[axis]"):
-        _set_unit_axis(joint.find("axis"), robot.tree.joint(joint.get("name")).axis)
+        # pybullet would scale the travel of a prismatic joint by the length of its axis.
+        element, unit = joint.find("axis"), robot.tree.joint(joint.get("name")).axis
+        given = np.array([float(number) for number in element.get("xyz", "1 0 0").split()])
+        if not np.allclose(given, unit, rtol=0.0, atol=1e-12):
+            element.set("xyz", _numbers(unit))
     for element in (*root.iter("mesh"), *root.iter("texture")):
         if element.get("filename"):
-            element.set("filename", _moved_mesh(element.get("filename"), robot.tree.file, folder))
+            name = element.get("filename")
+            if "://" not in name and not os.path.isabs(name):  # relative to the URDF
+                element.set("filename", _relative(name, robot.tree.file.parent, folder))
     T_link_marker = np.eye(4)
     T_link_marker[:3, 3] = geometry.marker_xyz
     _set_frame(etree, root, CAMERA_LINK, robot.camera.parent_link, geometry.T_parent_camera)
@@ -104,13 +108,6 @@ def _set_origin(etree: Any, joint: Any, pose: FloatArray) -> None:
         origin = etree.SubElement(joint, "origin")
     origin.set("xyz", _numbers(pose[:3, 3]))
     origin.set("rpy", _numbers(rpy_of(pose[:3, :3])))
-
-
-def _set_unit_axis(element: Any, unit: FloatArray) -> None:
-    """Write a unit axis; pybullet would scale the travel of a prismatic joint by the length of its axis."""
-    given = np.array([float(number) for number in element.get("xyz", "1 0 0").split()])
-    if np.abs(given - unit).max() > _ROUNDING:
-        element.set("xyz", _numbers(unit))
 
 
 def _set_frame(etree: Any, root: Any, name: str, parent: str, pose: FloatArray) -> None:
@@ -130,13 +127,6 @@ def _set_frame(etree: Any, root: Any, name: str, parent: str, pose: FloatArray) 
         root.append(element)
 
 
-def _moved_mesh(name: str, urdf: Path, folder: Path) -> str:
-    """Return a mesh name that is relative to `urdf` as one relative to `folder`; keep absolute paths and URLs."""
-    if "://" in name or os.path.isabs(name):
-        return name
-    return _relative(name, urdf.parent, folder)
-
-
 def _relative(path: str | Path, old: Path, new: Path) -> str:
     """Return `path`, given relative to the folder `old`, relative to the folder `new`."""
     return Path(os.path.relpath(old.resolve() / path, new.resolve())).as_posix()
@@ -145,8 +135,7 @@ def _relative(path: str | Path, old: Path, new: Path) -> str:
 def tables_elsewhere(robot: RobotDescription, folder: Path) -> dict[str, Any]:
     """Return the tables of a robot.toml in `folder` with the same URDF and a store of its own.
 
-    Raises:
-        ConfigError: the original robot.toml can no longer be read.
+    Raise ConfigError if the original robot.toml can no longer be read.
     """
     tables, _ = read_toml(robot.file)
     tables["daemon"] = tables.get("daemon", {}) | {"state_dir": STATE_DIR}
@@ -164,11 +153,7 @@ def _tables(robot: RobotDescription, geometry: CalibratedGeometry, folder: Path)
     tables = tables_elsewhere(robot, folder)
     for added in EXTENSIONS:  # the geometry was learnt without them
         tables.pop(added, None)
-    tables["robot"] |= {
-        "urdf": robot.tree.file.name,
-        "marker_xyz": geometry.marker_xyz.tolist(),
-        "marker_known": True,
-    }
+    tables["robot"] |= {"urdf": robot.tree.file.name, "marker_xyz": geometry.marker_xyz.tolist(), "marker_known": True}
     tables["camera"] |= {
         "xyz": geometry.T_parent_camera[:3, 3].tolist(),
         "rpy": rpy_of(geometry.T_parent_camera[:3, :3]).tolist(),

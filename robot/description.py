@@ -116,9 +116,8 @@ class RobotDescription:
     def load(cls, file: Path) -> RobotDescription:
         """Read robot.toml and its URDF; the tables other than [robot] and [camera] are the daemon's to check.
 
-        Raises:
-            ConfigError: robot.toml cannot be read, or has an unknown, missing or wrong key (with its line).
-            RobotError: URDF and robot.toml do not fit each other.
+        Raise ConfigError if robot.toml cannot be read, or has an unknown, missing or wrong key (with its line). Raise
+        RobotError if URDF and robot.toml do not fit each other.
         """
         tables, text = read_toml(file)
         return cls.from_tables(tables, text, file)
@@ -152,7 +151,9 @@ class RobotDescription:
         limits = []
         for name in robot.joints:
             with blamed_on("robot", "joints", naming=name):
-                limits.append(_moving(tree, name))
+                limits.append(joint := tree.joint(name))
+                if joint.kind not in MOVING:
+                    raise RobotError(f"joint {name!r} is fixed", remedy="Take it out of joints")
         for name in robot.held_at:
             with blamed_on("robot", "held_at", name):
                 tree.joint(name)
@@ -180,6 +181,11 @@ class RobotDescription:
     def name(self) -> str:
         """The robot's name."""
         return self.robot.name
+
+    @property
+    def limits(self) -> list[tuple[float, float]]:
+        """Lower and upper limit of each joint [rad, of a prismatic joint m]."""
+        return list(zip(self.lower.tolist(), self.upper.tolist(), strict=True))
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -251,13 +257,6 @@ def _calibration(camera: CameraSection) -> StereoCalibration | None:
     return StereoCalibration(**{"baseline_m": 0.0} | parts, pixel_sigma=camera.pixel_sigma)  # pyright: ignore[reportArgumentType]
 
 
-def _moving(tree: UrdfTree, name: str) -> UrdfJoint:
-    joint = tree.joint(name)
-    if joint.kind not in MOVING:
-        raise RobotError(f"joint {name!r} is fixed", remedy="Take it out of joints")
-    return joint
-
-
 @contextmanager
 def _blamed_on(file: Path, text: str, *keys: str, naming: str | None = None) -> Iterator[None]:
     """Add `file` and the line of the key, or of `naming` in its value, to RobotErrors that name no file."""
@@ -268,16 +267,9 @@ def _blamed_on(file: Path, text: str, *keys: str, naming: str | None = None) -> 
             raise
         line = line_of(text, keys)
         if line is not None and naming is not None:
-            line = _line_naming(text, naming, line)
+            lines = enumerate(text.splitlines()[line - 1 :], line)
+            line = next((k for k, found in lines if f'"{naming}"' in found or f"'{naming}'" in found), line)
         raise RobotError(error.what, file=file, line=line, remedy=error.remedy) from None
-
-
-def _line_naming(text: str, name: str, first: int) -> int:
-    """Return the number of the first line from `first` on with `name` in quotes; `first` if no line has it."""
-    for number, line in enumerate(text.splitlines()[first - 1 :], first):
-        if f'"{name}"' in line or f"'{name}'" in line:
-            return number
-    return first
 
 
 def link_poses(robot: RobotDescription, q: FloatArray) -> dict[str, FloatArray]:

@@ -122,11 +122,10 @@ Calibrations = Mapping[str, MotorCalibration]
 def read_calibration(file: Path, motors: Sequence[str] = ()) -> dict[str, MotorCalibration]:
     """Read LeRobot's calibration of an arm, by motor.
 
+    Raise ConfigError if it cannot be read, is of an older LeRobot, or a number in it cannot be.
+
     Args:
         motors: those that have to be there.
-
-    Raises:
-        ConfigError: it cannot be read, is of an older LeRobot, or a number in it cannot be.
     """
     again = "Let `lerobot-calibrate` write it again"
     try:
@@ -134,7 +133,7 @@ def read_calibration(file: Path, motors: Sequence[str] = ()) -> dict[str, MotorC
     except OSError as error:
         raise ConfigError(f"cannot be read: {error.strerror}", file=file, remedy=where_calibrations_are()) from error
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        if _is_of_old_lerobot(file):
+        if re.search(rb'"(calib_mode|start_pos|motor_names)"', read_at_most(file)):
             raise ConfigError(
                 "is a calibration of LeRobot before version 0.3, which counts angles in another way",
                 file=file,
@@ -163,10 +162,6 @@ def calibration_json(calibrations: Calibrations) -> str:
 def where_calibrations_are() -> str:
     """Return a sentence that tells where LeRobot keeps its calibration files."""
     return "LeRobot keeps them in ~/.cache/huggingface/lerobot/calibration, in robots/ and teleoperators/"
-
-
-def _is_of_old_lerobot(file: Path) -> bool:
-    return re.search(rb'"(calib_mode|start_pos|motor_names)"', read_at_most(file)) is not None
 
 
 @dataclass(frozen=True, slots=True)
@@ -204,10 +199,9 @@ def corrections(
 ) -> list[Correction]:
     """Return what becomes of the homing offsets when `offsets_rad` are added to the joints' readings.
 
-    The ends of the ranges stay, and so do LeRobot's 0° and −100…100: their places in the arm move by the offset.
+    Raise KeyError if a joint of `servos` with an offset is not among the motors.
 
-    Raises:
-        KeyError: a joint of `servos` with an offset is not among the motors.
+    The ends of the ranges stay, and so do LeRobot's 0° and −100…100: their places in the arm move by the offset.
     """
     found: list[Correction] = []
     for servo in servos:

@@ -53,7 +53,9 @@ class Pointing:
         # Derivative by finite differences: one batch of positions costs less than a Jacobian.
         nudged = q[:, None] + _SETTINGS.nudge * np.eye(q.shape[1])[self._joints]
         rows = np.concatenate([q, nudged.reshape(-1, q.shape[1])])
-        missed = self._off_centre(positions(rows))
+        # Tangents (n, 2) of the angles to the image centre, seen from the middle of the baseline.
+        x = positions(rows) - self._half_baseline
+        missed = x[:, :2] / np.maximum(x[:, 2:], _SETTINGS.nearest_m) - self._centre
         off_centre = missed[: len(q)]
         changed = missed[len(q) :].reshape(*nudged.shape[:2], 2)
         J = ((changed - off_centre[:, None]) / _SETTINGS.nudge).swapaxes(1, 2)
@@ -66,14 +68,6 @@ class Pointing:
     def clipped(self, angles: FloatArray) -> FloatArray:
         """Return angles (…, g) within the limits."""
         return np.clip(angles, self._lower, self._upper)
-
-    def _off_centre(self, x: FloatArray) -> FloatArray:
-        """Return the tangents (n, 2) of the angles between the image centre and markers at x (n, 3).
-
-        They are seen from the middle of the baseline.
-        """
-        x = x - self._half_baseline
-        return x[:, :2] / np.maximum(x[:, 2:], _SETTINGS.nearest_m) - self._centre
 
 
 def _damped_step(J: FloatArray, error: FloatArray) -> FloatArray:

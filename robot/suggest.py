@@ -33,7 +33,9 @@ def with_choices(message: str, kind: Any) -> str:
     if wrong is None:
         return message
     keys = key_path(wrong["path"] or "")
-    choices = _choices(hint_at(kind, keys))
+    hint = hint_at(kind, keys)
+    found = [hint, *get_args(hint)]
+    choices = next(([str(value) for value in get_args(c)] for c in found if get_origin(c) is Literal), [])
     known = f", known are: {', '.join(choices)}" if choices else ""
     return f"{'.'.join(keys)}: {wrong['value']} is unknown{known}"
 
@@ -57,8 +59,3 @@ def struct_in(hint: Any) -> type[msgspec.Struct] | None:
     if isinstance(hint, type) and issubclass(hint, msgspec.Struct):
         return hint
     return next((found for inner in get_args(hint) if (found := struct_in(inner)) is not None), None)
-
-
-def _choices(hint: Any) -> list[str]:
-    found = [hint, *get_args(hint)]
-    return next(([str(value) for value in get_args(c)] for c in found if get_origin(c) is Literal), [])

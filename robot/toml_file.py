@@ -26,6 +26,11 @@ Count = Annotated[int, msgspec.Meta(ge=1)]
 # One chunk of a zenoh key: no separators, no wild cards, and not the @ that hides a chunk from wild cards.
 NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.-]*\Z"  # `$` would let a line break follow
 
+# Of zenoh; sockets in the file system have no port.
+# Up to 65535. Sockets in the file system have no port.
+_PORT = "([1-9][0-9]{0,3}|[1-5][0-9]{4}|6[0-4][0-9]{3}|65[0-4][0-9]{2}|655[0-2][0-9]|6553[0-5])"
+ENDPOINT = re.compile(rf"(tcp|udp|tls|quic|ws)/.+:{_PORT}|unixsock-stream/.+")
+
 _UNKNOWN = re.compile(r"Object contains unknown field `(?P<field>[^`]*)`(?: - at `\$(?P<path>[^`]*)`)?")
 _HEADER = re.compile(r"\s*\[\[?([^\]]+)\]\]?")
 _KEY = re.compile(r"\s*([A-Za-z0-9_.\"'-]+)\s*=")
@@ -47,7 +52,6 @@ def read_toml(
     """Return the tables of `file` and its text. Raise ConfigError with the line when it cannot be read.
 
     Args:
-        file: to be read.
         written_by: the command that writes such a file, as the remedy if it does not exist.
         damaged: the remedy for invalid text in a file not written by hand; by default that for a robot.toml.
     """
@@ -120,10 +124,6 @@ def convert(tables: object, kind: type[T], *, file: Path, text: str, prefix: tup
     """Convert `tables` to the struct `kind`. Raise ConfigError with the line of an unknown, missing or wrong key.
 
     Args:
-        tables: as parsed.
-        kind: the struct.
-        file: for messages.
-        text: of the file.
         prefix: the keys of `tables` in the file.
     """
     for keys, what in _unusable(tables, prefix):
@@ -140,8 +140,9 @@ def line_in_entry(text: str, name: str, place: int, key: str | None = None) -> i
     `name` may be dotted. Return the line of the entry's heading if it has no such key, and that of the array if it is
     written in another way.
     """
-    lines = text.splitlines()
-    headings = [k for k, line in enumerate(lines) if (m := _HEADER.match(line)) and _is_entry(line, m[1], name)]
+    lines, wanted = text.splitlines(), _dotted(name)
+    entries = ((k, _HEADER.match(line)) for k, line in enumerate(lines) if line.lstrip().startswith("[["))
+    headings = [k for k, header in entries if header and _dotted(header[1]) == wanted]
     if place >= len(headings):
         return line_of(text, (name,))
     first = headings[place]
@@ -151,10 +152,6 @@ def line_in_entry(text: str, name: str, place: int, key: str | None = None) -> i
         if key is not None and (given := _KEY.match(line)) and _dotted(given[1]) == (key,):
             return number
     return first + 1
-
-
-def _is_entry(line: str, header: str, name: str) -> bool:
-    return line.lstrip().startswith("[[") and _dotted(header) == _dotted(name)
 
 
 def line_of(text: str, keys: tuple[str, ...]) -> int | None:

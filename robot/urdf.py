@@ -89,8 +89,7 @@ class UrdfTree:
     def load(cls, file: Path) -> UrdfTree:
         """Read `file`.
 
-        Raises:
-            RobotError: the file is missing, not XML, not a URDF, or its links do not form a tree.
+        Raise RobotError if the file is missing, not XML, not a URDF, or its links do not form a tree.
         """
         root = parse_urdf(file)
         links = _by_name(root, "link", file)
@@ -174,8 +173,9 @@ def chain_between(
 ) -> RigidChain:
     """Return the rigid chain from the measurement frame to the marker.
 
+    Raise RobotError if a joint does not lie between the links, or the order along the path is another one.
+
     Args:
-        tree: the URDF.
         joints: names in the order of q; each has to lie between the two links.
         held_at: positions [rad or m] of the other joints on the path; 0 where not named.
         start: the link that carries the camera.
@@ -185,9 +185,6 @@ def chain_between(
 
     Returns:
         A chain whose joints are `joints`, in this order, which is also their order along the path.
-
-    Raises:
-        RobotError: a joint does not lie between the links, or the order along the path is another one.
     """
     way = tree.path(start, end)
     mimicking = next((joint for joint, _ in way if joint.mimics), None)
@@ -199,9 +196,10 @@ def chain_between(
     for name in joints:
         tree.joint(name)
         if name not in on_way:
+            movable = ", ".join(joint.name for joint, _ in way if joint.kind in MOVING) or "none"
             raise RobotError(
                 f"joint {name!r} does not move the marker: it is not between the links {start!r} and {end!r}",
-                remedy=f"Take it out of joints (between them are: {_movable(way)})",
+                remedy=f"Take it out of joints (between them are: {movable})",
             )
     if tuple(on_way) != joints:
         raise RobotError(
@@ -254,36 +252,38 @@ def motions(joint: UrdfJoint, positions: FloatArray) -> FloatArray:
     return T
 
 
+def joint_motion(axis: FloatArray, prismatic: bool, value: float) -> FloatArray:
+    """Return the transform (4, 4) of a joint at `value`: a rotation about its axis [rad] or a slide along it [m]."""
+    T = np.eye(4)
+    if prismatic:
+        T[:3, 3] = value * axis
+    else:
+        T[:3, :3] = exponentials((value * axis)[None])[0][0]
+    return T
+
+
 def inverse(T: FloatArray) -> FloatArray:
     """Return the inverse of a transform (4, 4)."""
     return np.linalg.inv(T).astype(np.float64)
 
 
-def _movable(way: list[tuple[UrdfJoint, bool]]) -> str:
-    return ", ".join(joint.name for joint, _ in way if joint.kind in MOVING) or "none"
+def _wrong(element: Any, file: Path, what: str, remedy: str = "") -> RobotError:
+    return RobotError(what, file=file, line=element.sourceline, remedy=remedy)
 
 
 def _joint(element: Any, file: Path) -> UrdfJoint:
-    name, kind, line = element.get("name"), element.get("type", ""), element.sourceline
+    name, kind = element.get("name"), element.get("type", "")
     if kind not in MOVING | {"fixed"}:
-        raise RobotError(
-            f"joint {name!r} is of the type {kind!r}",
-            file=file,
-            line=line,
-            remedy="Use revolute, continuous, prismatic or fixed joints",
-        )
+        remedy = "Use revolute, continuous, prismatic or fixed joints"
+        raise _wrong(element, file, f"joint {name!r} is of the type {kind!r}", remedy)
     axis = _numbers(element.find("axis"), "xyz", (1.0, 0.0, 0.0), file)
     length = math.hypot(*axis)  # hypot does not overflow
     if kind != "fixed" and not SHORTEST_AXIS < length < 1.0 / SHORTEST_AXIS:
         what = "no length" if length == 0 else f"the length {length:.3g}"
-        raise RobotError(
-            f"the axis of joint {name!r} has {what}", file=file, line=line, remedy='Write <axis xyz="0 0 1"/>'
-        )
+        raise _wrong(element, file, f"the axis of joint {name!r} has {what}", 'Write <axis xyz="0 0 1"/>')
     lower, upper = _limits(element, kind, file)
     if lower > upper:
-        raise RobotError(
-            f"joint {name!r} has its lower limit above its upper one", file=file, line=line, remedy="Swap them"
-        )
+        raise _wrong(element, file, f"joint {name!r} has its lower limit above its upper one", "Swap them")
     return UrdfJoint(
         name=name,
         kind=kind,
@@ -301,12 +301,7 @@ def _point_mass(name: str, link: Any, file: Path) -> PointMass:
     inertial = link.find("inertial")
     [mass] = _numbers(inertial.find("mass"), "value", (0.0,), file)
     if mass < 0.0:
-        raise RobotError(
-            f"link {name!r} has a mass of {mass:g} kg",
-            file=file,
-            line=inertial.sourceline,
-            remedy="Give a mass of 0 or more",
-        )
+        raise _wrong(inertial, file, f"link {name!r} has a mass of {mass:g} kg", "Give a mass of 0 or more")
     return PointMass(float(mass), frozen_array(_origin(inertial, file)[:3, 3]))
 
 
@@ -316,12 +311,8 @@ def _limits(joint: Any, kind: str, file: Path) -> tuple[float, float]:
         return -np.pi, np.pi
     [lower], [upper] = (_numbers(limit, side, (0.0,), file) for side in ("lower", "upper"))
     if kind == "prismatic" and max(abs(lower), abs(upper)) > LARGEST_PLACE_M:
-        raise RobotError(
-            f"<limit> of {_owner(limit)} lets it slide {max(abs(lower), abs(upper)):.3g} m away",
-            file=file,
-            line=limit.sourceline,
-            remedy="Give metres",
-        )
+        what = f"<limit> of {_owner(limit)} lets it slide {max(abs(lower), abs(upper)):.3g} m away"
+        raise _wrong(limit, file, what, "Give metres")
     return float(lower), float(upper)
 
 
@@ -332,12 +323,8 @@ def _origin(element: Any, file: Path) -> FloatArray:
     T[:3, :3] = rotation_of(_numbers(origin, "rpy", (0.0, 0.0, 0.0), file))
     T[:3, 3] = _numbers(origin, "xyz", (0.0, 0.0, 0.0), file)
     if np.abs(T[:3, 3]).max() > LARGEST_PLACE_M:
-        raise RobotError(
-            f"the <origin> of {_owner(origin)} is {np.abs(T[:3, 3]).max():.3g} m away",
-            file=file,
-            line=origin.sourceline,
-            remedy="Give metres",
-        )
+        what = f"the <origin> of {_owner(origin)} is {np.abs(T[:3, 3]).max():.3g} m away"
+        raise _wrong(origin, file, what, "Give metres")
     return T
 
 
@@ -352,11 +339,7 @@ def _numbers(element: Any, attribute: str, default: tuple[float, ...], file: Pat
         numbers = np.empty(0)
     if len(numbers) != len(default) or not np.isfinite(numbers).all():
         wanted = "a finite number" if len(default) == 1 else f"{len(default)} finite numbers"
-        raise RobotError(
-            f"<{element.tag} {attribute}={_short(text)}> of {_owner(element)} is not {wanted}",
-            file=file,
-            line=element.sourceline,
-        )
+        raise _wrong(element, file, f"<{element.tag} {attribute}={_short(text)}> of {_owner(element)} is not {wanted}")
     return numbers
 
 
@@ -377,14 +360,9 @@ def _by_name(root: Any, tag: str, file: Path) -> dict[str, Any]:
     for element in root.iterfind(tag):
         name = element.get("name")
         if not name:
-            raise RobotError(f"a <{tag}> has no name", file=file, line=element.sourceline)
+            raise _wrong(element, file, f"a <{tag}> has no name")
         if name in found:
-            raise RobotError(
-                f"two {tag}s have the same name, {name!r}",
-                file=file,
-                line=element.sourceline,
-                remedy="Rename one of them",
-            )
+            raise _wrong(element, file, f"two {tag}s have the same name, {name!r}", "Rename one of them")
         found[name] = element
     return found
 
@@ -393,12 +371,8 @@ def _link_named(joint: Any, end: str, file: Path) -> str:
     found = joint.find(end)
     link = None if found is None else found.get("link")
     if not link:
-        raise RobotError(
-            f"joint {joint.get('name')!r} names no {end} link",
-            file=file,
-            line=joint.sourceline,
-            remedy=f'Write <{end} link="..."/> in it',
-        )
+        what = f"joint {joint.get('name')!r} names no {end} link"
+        raise _wrong(joint, file, what, f'Write <{end} link="..."/> in it')
     return link
 
 
@@ -425,16 +399,12 @@ def parse_urdf(file: Path) -> Any:
     if root.getroottree().docinfo.doctype:
         raise RobotError("a URDF with a DOCTYPE is not accepted", file=file, line=1, remedy="Delete the DOCTYPE")
     if root.tag != "robot":
-        raise RobotError(f"the root element is <{root.tag}>, not <robot>", file=file, line=root.sourceline)
+        raise _wrong(root, file, f"the root element is <{root.tag}>, not <robot>")
     macro = next((element for element in root.iter("{*}*") if "xacro" in str(etree.QName(element).namespace)), None)
     if macro is not None:
-        raise RobotError(
-            "this is a xacro file, of which a URDF is made first",
-            file=file,
-            line=macro.sourceline,
-            remedy=f"With ROS: `xacro {file.name} > made.urdf`, with the arguments that its makers document; then set "
-            'urdf = "made.urdf" in [robot]',
-        )
+        remedy = f"With ROS: `xacro {file.name} > made.urdf`, with the arguments that its makers document; then set "
+        what = "this is a xacro file, of which a URDF is made first"
+        raise _wrong(macro, file, what, f'{remedy}urdf = "made.urdf" in [robot]')
     if sum(1 for _ in root.iter("link", "joint")) > 2 * MOST_LINKS:
         raise RobotError(f"the URDF has more than {MOST_LINKS:,} links", file=file, remedy="Keep the arm's alone")
     return root

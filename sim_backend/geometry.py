@@ -29,13 +29,6 @@ def turn_of_z(direction: FloatArray) -> FloatArray:
     return np.stack([x, np.cross(direction, x), direction], axis=1)
 
 
-def joint_motion(axis: FloatArray, prismatic: bool, value: float) -> FloatArray:
-    """Return the transform (4, 4) of a joint at `value`: a rotation about its axis [rad] or a slide along it [m]."""
-    if prismatic:
-        return transform(np.zeros(3), axis * value)
-    return transform(axis * value, np.zeros(3))
-
-
 def cross_matrix(vector: FloatArray) -> FloatArray:
     """Return the skew-symmetric matrix (3, 3) of `vector` (3,): its product with x is the cross product vector × x."""
     x, y, z = vector
@@ -46,19 +39,3 @@ def turn_between(R_from: FloatArray, R_to: FloatArray) -> FloatArray:
     """Return the rotation axis (3,) from one orientation (3, 3) to another, times the sine of the angle."""
     R = R_to @ R_from.T
     return np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
-
-
-def quaternion_of(R: FloatArray) -> list[float]:
-    """Return the unit quaternion x, y, z, w of a rotation matrix (3, 3) (Shepperd 1978)."""
-    # Rows of 4 q qᵀ; the one with the largest diagonal element is well conditioned.
-    (a, b, c), (d, e, f), (g, h, i) = R
-    products = np.array(
-        [
-            [1 + a - e - i, b + d, c + g, h - f],
-            [b + d, 1 - a + e - i, f + h, c - g],
-            [c + g, f + h, 1 - a - e + i, d - b],
-            [h - f, c - g, d - b, 1 + a + e + i],
-        ]
-    )
-    row = products[products.diagonal().argmax()]
-    return (row / np.linalg.norm(row)).tolist()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from bodyschema.sim_backend.truth import JointRoles, chain_from_root
 
 from .bullet import Body
 from .config import GuideConfig
+from .sight import Sight
 from .truth import TrueRobot
 
 
@@ -45,73 +46,50 @@ class _Settings:
 _SETTINGS = _Settings()
 
 
-class Judge(Protocol):
-    """Interface to judge the visibility of the marker at postures q (n, d)."""
-
-    def gazed(self, q: FloatArray) -> FloatArray:
-        """Return q with the head turned to the marker."""
-        ...
-
-    def in_images(self, q: FloatArray) -> np.ndarray:
-        """Return a mask (n,) of the postures with the ball inside both images."""
-        ...
-
-    def clear(self, q: FloatArray) -> bool:
-        """Return True if nothing blocks the view at one posture (d,)."""
-        ...
-
-    def visible(self, q: FloatArray) -> np.ndarray:
-        """Return a mask (n,) of the postures that pass both checks."""
-        ...
-
-
 class GuidePath:
     """Postures along the path, at constant speed in the joint space of all learnt joints.
+
+    Raise ConfigError if the ball is visible at hardly any posture.
 
     Args:
         lower, upper: joint limits (d,); guided joints stay within.
         guided: indices of the guided joints.
         step: Euclidean distance over all learnt joints, the gaze's included, between postures [rad].
 
-    Raises:
-        ConfigError: the ball is visible at hardly any posture.
+    Attributes:
+        waypoints: visible postures (n, d) between which the path runs; it begins at the first.
     """
 
     def __init__(
         self,
-        judge: Judge,
+        sight: Sight,
         lower: FloatArray,
         upper: FloatArray,
         guided: tuple[int, ...],
         step: float,
         rng: np.random.Generator,
     ) -> None:
-        self._judge, self._guided, self._step, self._rng = judge, list(guided), step, rng
+        self._sight, self._guided, self._step, self._rng = sight, list(guided), step, rng
         margin = _SETTINGS.limit_margin * (upper - lower)
         self._lower, self._upper = lower + margin, upper - margin
-        self._pool = self._visible_postures()
-        self._unvisited = list(range(1, len(self._pool)))
-        self._at = self._before = self._pool[0]
+        self.waypoints = self._visible_postures()
+        self._unvisited = list(range(1, len(self.waypoints)))
+        self._at = self._before = self.waypoints[0]
         self._next = self._choose(self._at)
         self._left_over = 0.0
-
-    @property
-    def waypoints(self) -> FloatArray:
-        """Visible postures (n, d) between which the path runs; it begins at the first."""
-        return self._pool
 
     def hop(self) -> FloatArray:
         """Return the postures (n, d) on the way to the next waypoint; n is 0 if it is nearer than a step."""
         start, end = self._at, self._next
         after = self._choose(end)
-        curve = self._judge.gazed(np.clip(self._curve(start, end, after), self._lower, self._upper))
+        curve = self._sight.gazed(np.clip(self._curve(start, end, after), self._lower, self._upper))
         self._before, self._at, self._next = start, curve[-1], after
         return self._at_even_steps(np.vstack([start, curve]))
 
     def replan(self, posture: FloatArray) -> None:
         """Draw new visible postures (the tool has changed) and go on from `posture` (d,) to the nearest."""
-        self._pool = self._visible_postures()
-        self._unvisited = list(range(len(self._pool)))
+        self.waypoints = self._visible_postures()
+        self._unvisited = list(range(len(self.waypoints)))
         self._at = self._before = posture
         self._left_over = 0.0
         self._next = self._choose(posture)
@@ -140,19 +118,19 @@ class GuidePath:
     def _choose(self, start: FloatArray) -> FloatArray:
         """Return the nearest unvisited posture with a free view all along the hop, else that with the best view."""
         if not self._unvisited:
-            self._pool = self._visible_postures()
-            self._unvisited = list(range(len(self._pool)))
-        hops = self._pool[self._unvisited] - start
+            self.waypoints = self._visible_postures()
+            self._unvisited = list(range(len(self.waypoints)))
+        hops = self.waypoints[self._unvisited] - start
         nearest = np.argsort(np.linalg.norm(hops[:, self._guided], axis=1), kind="stable")[: _SETTINGS.candidates]
         best, best_share = int(nearest[0]), -1.0
         for candidate in nearest:
-            between = self._judge.gazed(start + np.array(_SETTINGS.checks)[:, None] * hops[candidate])
-            share = float(self._judge.visible(between).mean())
+            between = self._sight.gazed(start + np.array(_SETTINGS.checks)[:, None] * hops[candidate])
+            share = float(self._sight.visible(between).mean())
             if share > best_share:
                 best, best_share = int(candidate), share
             if share == 1.0:
                 break
-        return self._pool[self._unvisited.pop(best)]
+        return self.waypoints[self._unvisited.pop(best)]
 
     def _visible_postures(self) -> FloatArray:
         """Sample postures (n, d) uniformly over the guided joints' ranges, and return those with a visible ball."""
@@ -163,9 +141,9 @@ class GuidePath:
                 self._lower[self._guided], self._upper[self._guided], (_SETTINGS.batch, len(self._guided))
             )
             for few in np.split(q, _SETTINGS.batch // _SETTINGS.at_once):
-                few = self._judge.gazed(few)
-                for posture in few[self._judge.in_images(few)]:
-                    if self._judge.clear(posture):
+                few = self._sight.gazed(few)
+                for posture in few[self._sight.in_images(few)]:
+                    if self._sight.clear(posture):
                         found.append(posture)
                     if len(found) == _SETTINGS.postures:
                         return np.array(found)
@@ -177,14 +155,8 @@ class GuidePath:
         return np.array(found)
 
 
-@dataclass(frozen=True, slots=True)
-class Goals:
-    """Targets of the hand, step by step.
-
-    Attributes:
-        wrist: poses of the wrist link in the world (n, 4, 4).
-        elbow: places of the elbow link (n, 3) [m].
-    """
+class Goals(NamedTuple):
+    """Targets of the hand, step by step: wrist poses in the world (n, 4, 4), and places of the elbow (n, 3) [m]."""
 
     wrist: FloatArray
     elbow: FloatArray

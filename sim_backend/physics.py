@@ -113,7 +113,10 @@ class TorqueFreeArm:
             body.bullet.changeDynamics(
                 body.id, joint, jointDamping=damping, linearDamping=0, angularDamping=0, physicsClientId=body.client
             )
-        self._motors_off()
+        for k in self._guided:  # pybullet gives every joint a braking motor
+            body.bullet.setJointMotorControl2(
+                body.id, body.joints[k], body.bullet.VELOCITY_CONTROL, force=0.0, physicsClientId=body.client
+            )
 
     def step(self, gaze_target: FloatArray) -> None:
         """One step of physics with the gazing joints' servos at the true angles `gaze_target` (g,) [rad]."""
@@ -139,22 +142,8 @@ class TorqueFreeArm:
             )
         body.bullet.stepSimulation(physicsClientId=body.client)
 
-    def _motors_off(self) -> None:
-        """pybullet gives every joint a braking motor; take it away from the guided ones."""
-        body = self._body
-        for k in self._guided:
-            body.bullet.setJointMotorControl2(
-                body.id, body.joints[k], body.bullet.VELOCITY_CONTROL, force=0.0, physicsClientId=body.client
-            )
 
-
-_SLOWEST_PHYSICS_HZ = 240
-
-
-def physics_rate(encoder_hz: int, camera_hz: int) -> int:
-    """Return the steps a second: at least 240, and a multiple of both the encoder and the camera rate."""
-    common = lcm(encoder_hz, camera_hz)
-    return common * max(1, -(-_SLOWEST_PHYSICS_HZ // common))
+_SLOWEST_PHYSICS_HZ = 240  # pybullet's default
 
 
 class Physics:
@@ -162,13 +151,13 @@ class Physics:
 
     def __init__(self, truth: TrueRobot, calibration: StereoCalibration, config: SimConfig) -> None:
         self._truth, self._calibration, self._config = truth, calibration, config
-        self.rate_hz = physics_rate(config.encoders.rate_hz, config.camera.rate_hz)
+        common = lcm(config.encoders.rate_hz, config.camera.rate_hz)
+        self.rate_hz = common * max(1, -(-_SLOWEST_PHYSICS_HZ // common))
         self.steps = 0
         self.urdf = physics_urdf(truth)
         self.marker_xyz = np.array(truth.robot.robot.marker_xyz)
-        self._encoders = Encoders(
-            config.encoders, truth.offsets, truth.robot.chain.prismatic, generator(config.seed, Stream.ENCODERS)
-        )
+        rng = generator(config.seed, Stream.ENCODERS)
+        self._encoders = Encoders(config.encoders, truth.offsets, truth.robot.chain.prismatic, rng)
         self._paths = JointPaths(truth, self.rate_hz, config.camera.rate_hz, begins=1.0 / config.camera.rate_hz)
         self._exit = ExitStack()
 

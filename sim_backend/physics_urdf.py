@@ -6,6 +6,7 @@ pybullet is given what was understood here, and nothing else of the file: malfor
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import cache
 from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
@@ -39,23 +40,16 @@ _ROD_RGBA = "0.55 0.57 0.6 1"
 _SIZES = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length"), "capsule": ("radius", "length")}
 # TinyRenderer takes 0.3 µs for a triangle, and a stereo frame is four pictures: 8,000 cost some 10 ms of CPU a frame.
 MOST_TRIANGLES = 8_000
-# A hull tells what is in the way. It is that of the outermost points in these directions (Fibonacci's sphere).
-_TURNS, _HEIGHTS = np.pi * (1.0 + 5.0**0.5) * np.arange(100), np.linspace(-1.0, 1.0, 100)
-_RADII = np.sqrt(1.0 - _HEIGHTS**2)
-_DIRECTIONS = np.vstack(
-    [np.column_stack([_RADII * np.cos(_TURNS), _RADII * np.sin(_TURNS), _HEIGHTS]), np.eye(3), -np.eye(3)]
-)
 
 
 def physics_urdf(truth: TrueRobot) -> PhysicsUrdf:
     """Return the URDF of `truth`: joint frames replaced by the true ones, joints that are not learnt locked.
 
+    Raise RobotError if the robot has more links than pybullet takes, or joints too far apart.
+
     Meshes have few triangles. What cannot be drawn is left out, and links whose meshes are missing or malformed are
     rods between their joints. Links that state no inertia get a small one. Textures are left out: no other file of the
     machine's is read because a URDF names it.
-
-    Raises:
-        RobotError: the robot has more links than pybullet takes, or joints too far apart.
     """
     return _Writer(truth).written()
 
@@ -81,7 +75,7 @@ class _Writer:
         # `UrdfTree.load` has refused entities and the like.
         self._source = ElementTree.fromstring(read_at_most(self._file))
         self._meshes = Meshes(self._file)
-        self._left_out: dict[str, None] = {}  # in order, each once
+        self._left_out: list[str] = []
         self._rods: set[str] = set()
         self._moving = _moved(truth.robot.tree)
         self._colours = {
@@ -129,14 +123,11 @@ class _Writer:
                 added = list(self._rods_of(name, kind))
             link.extend(added)
 
-    def _leave_out(self, what: str) -> None:
-        self._left_out[what] = None
-
     def _inertial(self, source: ElementTree.Element) -> ElementTree.Element:
         inertial = source.find("inertial")
         inertia = _SMALL if inertial is None else _inertia(inertial)
         if inertia is None:
-            self._leave_out(f"the inertia of the link {source.attrib['name']!r}, which no body can have")
+            self._left_out.append(f"the inertia of the link {source.attrib['name']!r}, which no body can have")
             inertia = _SMALL
         element = ElementTree.Element("inertial")
         _add_origin(element, inertia.xyz, inertia.rpy)
@@ -149,14 +140,14 @@ class _Writer:
         geometry = source.find("geometry/*")
         pose = _origin(source)
         if geometry is None or pose is None:
-            self._leave_out(f"a {source.tag} of the link {link!r} without geometry or place")
+            self._left_out.append(f"a {source.tag} of the link {link!r} without geometry or place")
             return None
         element = _shape_at(source.tag, *pose)
         into = ElementTree.SubElement(element, "geometry")
         if geometry.tag == "mesh":
             scale = floats(geometry.get("scale", "1 1 1"), 3)
             if scale is None or not all(scale):
-                self._leave_out(f"a mesh of the link {link!r} with the scale {geometry.get('scale')!r}")
+                self._left_out.append(f"a mesh of the link {link!r} with the scale {geometry.get('scale')!r}")
                 return None
             name = self._meshes.add(geometry.get("filename", ""), scale, drawn=source.tag == "visual")
             if name is None:
@@ -165,7 +156,7 @@ class _Writer:
         else:
             sizes = {key: _sizes(geometry.get(key), 3 if key == "size" else 1) for key in _SIZES.get(geometry.tag, ())}
             if not sizes or not all(sizes.values()):
-                self._leave_out(f"a {geometry.tag} of the link {link!r} with an invalid size")
+                self._left_out.append(f"a {geometry.tag} of the link {link!r} with an invalid size")
                 return None
             ElementTree.SubElement(into, geometry.tag, {key: _numbers(size or ()) for key, size in sizes.items()})
         if source.tag == "visual":
@@ -233,7 +224,7 @@ class _Writer:
             faults = [f"{name}: {why}" for name, why in meshes.unusable.items()]
             yield f"meshes that cannot be used: {first_few(faults, '; ')}. The simulation continues without{drawn}"
         if self._left_out:
-            left_out = first_few(list(self._left_out), "; ")
+            left_out = first_few(list(dict.fromkeys(self._left_out)), "; ")
             yield f"the simulation leaves out what it cannot take of {self._file}: {left_out}"
 
 
@@ -271,13 +262,25 @@ class Meshes(MeshSet):
         return files, coarser if count < before else ""
 
 
+@cache
+def _directions() -> FloatArray:
+    """Return unit vectors (106, 3), evenly spread: Fibonacci's sphere and the axes."""
+    turns, heights = np.pi * (1.0 + 5.0**0.5) * np.arange(100), np.linspace(-1.0, 1.0, 100)
+    radii = np.sqrt(1.0 - heights**2)
+    sphere = np.column_stack([radii * np.cos(turns), radii * np.sin(turns), heights])
+    return np.vstack([sphere, np.eye(3), -np.eye(3)])
+
+
 def _hull(triangles: FloatArray) -> FloatArray:
-    """Return about the convex hull of triangles as triangles (m, 3, 3); of what is flat its box, 1 mm thick."""
+    """Return about the convex hull of triangles as triangles (m, 3, 3); of what is flat its box, 1 mm thick.
+
+    It tells what is in the way, and is that of the outermost points in some directions.
+    """
     from scipy.spatial import ConvexHull, QhullError  # only large meshes need it, and it takes half a second
 
     points = triangles.reshape(-1, 3)
     low, high = points.min(axis=0), points.max(axis=0)
-    corners = points[np.unique((points @ _DIRECTIONS.T).argmax(axis=0))]
+    corners = points[np.unique((points @ _directions().T).argmax(axis=0))]
     try:
         return corners[ConvexHull(corners).simplices]
     except (QhullError, ValueError):

@@ -55,6 +55,8 @@ _SETTINGS = _Settings()
 class PosedWorld:
     """A robot that stands still in given postures when its encoders are read and its frames are taken.
 
+    Raise ConfigError if [camera] has no stereo calibration, or pybullet is not installed (both on entering).
+
     Each posture gives one reading and one frame with the same time. The same arguments reproduce them bit by bit.
 
     Args:
@@ -62,9 +64,6 @@ class PosedWorld:
         postures: reported joint angles (n, d) [rad or m] to go to; encoders report them in whole ticks.
         extension: the robot with effects, to which the random errors are added; None: no effects. Camera latency has
             no influence on a robot that stands still.
-
-    Raises:
-        ConfigError: [camera] has no stereo calibration, or pybullet is not installed (both on entering).
     """
 
     def __init__(
@@ -81,21 +80,19 @@ class PosedWorld:
         self._calibration = calibration = stereo_calibration(self.robot)
         self._truth = TrueRobot.draw(self.robot, self.config, self._extension)
         self._marker = np.array(self.robot.robot.marker_xyz)
-        self._encoders = Encoders(
-            self.config.encoders,
-            self._truth.offsets,
-            self.robot.chain.prismatic,
-            generator(self.config.seed, Stream.ENCODERS),
-        )
-        self._angles = self._true_angles()
+        rng = generator(self.config.seed, Stream.ENCODERS)
+        prismatic = self.robot.chain.prismatic
+        self._encoders = Encoders(self.config.encoders, self._truth.offsets, prismatic, rng)
+        count, beyond = len(self._postures), self._truth.beyond
+        motion = Motion(self._postures, PERIOD_S * np.arange(1.0, count + 1.0), np.zeros(count, dtype=np.int64))
+        unloaded = beyond.unloaded(motion) - self._truth.offsets
+        self._angles = unloaded + beyond.given_way(unloaded)  # true ones (n, d) [rad or m]
         urdf = physics_urdf(self._truth)
         for sentence in urdf.said:
             log.warning("%s", sentence)
         with ExitStack() as stack:
             self._body = stack.enter_context(Body(urdf, self.robot.joints))
-            link = self.robot.robot.marker_link
-            renderer = RenderProcess(urdf, self.robot.joints, link, self._truth.true_eyes(calibration), self.config)
-            self._renderer = stack.enter_context(renderer)
+            self._renderer = stack.enter_context(RenderProcess(urdf, self._truth, calibration, self.config))
             self._exit = stack.pop_all()
         self.joints = SimJoints(self)
         self.camera = SimStereoCamera(self, calibration)
@@ -153,14 +150,6 @@ class PosedWorld:
         self._body.set_angles(self._angles[number])
         row = Motion.at(self._postures[number], (number + 1) * PERIOD_S, PERIOD_S)
         return scene_of(self._body, self._truth, self._marker, self._calibration, row)
-
-    def _true_angles(self) -> FloatArray:
-        """Return the true joint angles in all postures (n, d) [rad or m]."""
-        count = len(self._postures)
-        times = PERIOD_S * np.arange(1.0, count + 1.0)
-        beyond, motion = self._truth.beyond, Motion(self._postures, times, np.zeros(count, dtype=np.int64))
-        unloaded = beyond.unloaded(motion) - self._truth.offsets
-        return unloaded + beyond.given_way(unloaded)
 
 
 def visible_postures(

@@ -50,12 +50,7 @@ class SimJoints:
     """The encoders of the simulated robot (a `JointSource`)."""
 
     def __init__(self, world: World) -> None:
-        self._world = world
-
-    @property
-    def joints(self) -> tuple[str, ...]:
-        """Names of the joints in the order of q."""
-        return self._world.robot.joints
+        self._world, self.joints = world, world.robot.joints
 
     def __enter__(self) -> Self:
         self._world.open_joints(True)
@@ -65,24 +60,15 @@ class SimJoints:
         self._world.open_joints(False)
 
     def read(self, timeout_s: float) -> JointReading | None:
-        """Return the next reading; None if the world waits longer than `timeout_s` for the camera to be read.
-
-        Raises:
-            SourceEnded: the world was closed.
-        """
+        """Return the next reading; None if the world waits longer for the camera to be read. Raise SourceEnded."""
         return self._world.next_reading(timeout_s)
 
 
 class SimStereoCamera:
-    """The eyes of the simulated robot (a `StereoCamera`)."""
+    """The eyes of the simulated robot, a `StereoCamera`; their lenses may differ from its calibration by effects."""
 
     def __init__(self, world: World, calibration: StereoCalibration) -> None:
-        self._world, self._calibration = world, calibration
-
-    @property
-    def calibration(self) -> StereoCalibration:
-        """The described calibration; the simulated lenses agree with it except for their simulated effects."""
-        return self._calibration
+        self._world, self.calibration = world, calibration
 
     def __enter__(self) -> Self:
         self._world.open_camera(True)
@@ -92,12 +78,7 @@ class SimStereoCamera:
         self._world.open_camera(False)
 
     def read(self, timeout_s: float) -> StereoFrame | None:
-        """Return the next frame; None if none arrived within `timeout_s`.
-
-        Raises:
-            SourceEnded: the world was closed.
-            SourceLost: the renderer's process died.
-        """
+        """Return the next frame, or None. Raise SourceEnded, or SourceLost if the renderer's process died."""
         return self._world.next_frame(timeout_s)
 
 
@@ -113,9 +94,7 @@ class Encoders:
         self, config: EncoderConfig, offsets: FloatArray, prismatic: np.ndarray, rng: np.random.Generator
     ) -> None:
         self._tick = np.where(prismatic, 1.0 / config.ticks_per_metre, 2 * np.pi / config.ticks_per_turn)
-        self._noise = config.noise_ticks
-        self._offsets = offsets
-        self._rng = rng
+        self._noise, self._offsets, self._rng = config.noise_ticks, offsets, rng
 
     def read(self, true: FloatArray) -> FloatArray:
         """Return the readings (d,) [rad or m] at the true angles, or drive positions, `true` (d,)."""

@@ -12,11 +12,11 @@ from bodyschema.effects.effect_type import ToolEffect
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray, frozen_array
 from bodyschema.robot.description import RobotDescription
-from bodyschema.robot.urdf import MOVING, UrdfJoint, UrdfTree, chain_between
+from bodyschema.robot.urdf import MOVING, UrdfJoint, UrdfTree, chain_between, joint_motion
 from kbmaps import RigidChain
 
-from .config import ErrorConfig, SimConfig
-from .geometry import joint_motion, rotation, transform
+from .config import SimConfig
+from .geometry import rotation, transform
 from .randomness import Stream, generator
 
 # The offset of a prismatic joint is known better than that of a revolute one: metres of error per radian.
@@ -57,7 +57,10 @@ class TrueRobot:
         errors = config.errors
         way = [joint.name for joint, _ in robot.tree.path(robot.camera.parent_link, robot.robot.marker_link)]
         moving = [name for name in way if robot.tree.joints[name].kind in MOVING]
-        offsets = {name: _offset(robot.tree.joints[name], errors, rng) for name in moving}
+        offsets: dict[str, float] = {}
+        for name in moving:
+            scale = _METRES_PER_RADIAN if robot.tree.joints[name].kind == "prismatic" else 1.0
+            offsets[name] = float(scale * errors.joint_offset_rad * rng.standard_normal())
         for effect in extension.all_effects:
             if effect.kind.is_zero:
                 offsets[effect.where or ""] -= effect.values[0]
@@ -126,11 +129,6 @@ def _bent(effects: Iterable[Effect]) -> list[Effect]:
     return [effect for effect in effects if not effect.kind.rigid]
 
 
-def _offset(joint: UrdfJoint, errors: ErrorConfig, rng: np.random.Generator) -> float:
-    scale = _METRES_PER_RADIAN if joint.kind == "prismatic" else 1.0
-    return float(scale * errors.joint_offset_rad * rng.standard_normal())
-
-
 def _pose_error(length: float, angle: float, rng: np.random.Generator) -> FloatArray:
     shift, turn = length * rng.standard_normal(3), angle * rng.standard_normal(3)
     return transform(turn, shift)
@@ -172,7 +170,11 @@ class JointRoles:
         wrist = robot.robot.marker_link
         if not guided:
             gaze, guided, wrist = (), gaze[::-1], robot.camera.parent_link
-        elbow = robot.tree.joints[robot.joints[guided[_half_way(robot, guided, wrist)]]].child
+        # The joint nearest to half the arm's length, with all joints at zero.
+        links = [*(robot.tree.joints[robot.joints[k]].child for k in guided), wrist]
+        origins = np.array([_origin(robot.tree, link) for link in links])
+        along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(origins, axis=0), axis=1))])
+        elbow = links[int(np.abs(along[:-1] - along[-1] / 2).argmin())]
         return cls(gaze=gaze, guided=guided, wrist=wrist, elbow=elbow)
 
 
@@ -190,14 +192,6 @@ def chain_from_root(truth: TrueRobot, roles: JointRoles, link: str) -> tuple[Rig
     names = tuple(truth.robot.joints[k] for k in indices)
     chain = chain_between(truth.tree, names, {}, start=root, end=link, T_start_camera=np.eye(4), marker_xyz=np.zeros(3))
     return with_offsets(chain, truth.offsets[list(indices)]), indices
-
-
-def _half_way(robot: RobotDescription, guided: tuple[int, ...], wrist: str) -> int:
-    """Return the index in `guided` of the joint nearest to half the arm's length, with all joints at zero."""
-    links = [*(robot.tree.joints[robot.joints[k]].child for k in guided), wrist]
-    origins = np.array([_origin(robot.tree, link) for link in links])
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(origins, axis=0), axis=1))])
-    return int(np.abs(along[:-1] - along[-1] / 2).argmin())
 
 
 def _origin(tree: UrdfTree, link: str) -> FloatArray:

@@ -48,6 +48,8 @@ class WorldStats:
 class SimWorld:
     """Simulated robot guided by hand, with its encoders and stereo cameras.
 
+    Raise ConfigError if [camera] has no stereo calibration, or pybullet is not installed (both on entering).
+
     Every read advances the world; nothing happens between reads. Simulated time therefore passes as fast as the
     readers read. The world never runs more than two frames, or a second of joint readings, ahead of an open source,
     so two threads may read joints and camera each at its own pace. The same description and configuration reproduce
@@ -56,9 +58,6 @@ class SimWorld:
     Args:
         robot: the robot as described; it needs a stereo calibration.
         extension: the robot with effects, to which the random errors are added; None: no effects.
-
-    Raises:
-        ConfigError: [camera] has no stereo calibration, or pybullet is not installed (both on entering).
     """
 
     def __init__(self, robot: RobotDescription, config: SimConfig, extension: Simulation | None = None) -> None:
@@ -83,13 +82,7 @@ class SimWorld:
             for sentence in self._physics.urdf.said:
                 log.warning("%s", sentence)
             self._renderer = stack.enter_context(
-                RenderProcess(
-                    self._physics.urdf,
-                    self.robot.joints,
-                    self.robot.robot.marker_link,
-                    self._truth.true_eyes(calibration),
-                    self.config,
-                )
+                RenderProcess(self._physics.urdf, self._truth, calibration, self.config)
             )
             self.joints = SimJoints(self)
             self.camera = SimStereoCamera(self, calibration)
@@ -149,8 +142,11 @@ class SimWorld:
     def open_camera(self, is_open: bool) -> None:
         """Start or stop taking frames for the camera; replace the renderer first if it has died."""
         with self._fetching, self._moved:
-            if is_open and self._renderer.process.poll() is not None:
-                self._renew_renderer()
+            if is_open and self._renderer.process.poll() is not None:  # the frames in progress are lost
+                self._renderer.__exit__(None, None, None)
+                self._renderer.__enter__()
+                self._delivered = self._taken
+                self._frame_times.clear()
             self._camera_open = is_open
             self._moved.notify_all()
 
@@ -159,8 +155,7 @@ class SimWorld:
         end = time.monotonic() + timeout_s
         with self._moved:
             while True:
-                self._check_running()
-                _check_open(self._joints_open)
+                self._check_open(self._joints_open)
                 if self._readings:
                     self._moved.notify_all()
                     return self._readings.popleft()
@@ -188,34 +183,24 @@ class SimWorld:
         """Advance until the renderer has frames to render ahead; return False if there is none in time."""
         with self._moved:
             while self._may_take_frame():
-                self._check_running()
-                _check_open(self._camera_open)
-                if self._may_keep_reading():
+                self._check_open(self._camera_open)
+                if len(self._readings) < _READINGS_AHEAD_S * self.config.encoders.rate_hz:
                     self._step()
                 elif self._frame_times:
                     break
                 elif not self._moved.wait(end - time.monotonic()):
                     return False
-            self._check_running()
-            _check_open(self._camera_open)
+            self._check_open(self._camera_open)
             return True
-
-    def _renew_renderer(self) -> None:
-        """Restart the renderer; the frames in progress are lost."""
-        self._renderer.__exit__(None, None, None)
-        self._renderer.__enter__()
-        self._delivered = self._taken
-        self._frame_times.clear()
 
     def _may_take_frame(self) -> bool:
         return not self._camera_open or self._taken - self._delivered < FRAMES_AHEAD
 
-    def _may_keep_reading(self) -> bool:
-        return len(self._readings) < _READINGS_AHEAD_S * self.config.encoders.rate_hz
-
-    def _check_running(self) -> None:
+    def _check_open(self, is_open: bool) -> None:
         if not self._running:
             raise SourceEnded("the simulated world has been closed")
+        if not is_open:
+            raise SourceError("the simulated source is not open; use it in a with statement")
 
     def _step(self) -> None:
         """Advance by one time step, then take the reading and the frame due at its end, in this order."""
@@ -242,11 +227,6 @@ class SimWorld:
         self._physics.change_tool(self._wanted_tool)
         self._wanted_tool = None
         self.stats.tool_changes += 1
-
-
-def _check_open(is_open: bool) -> None:
-    if not is_open:
-        raise SourceError("the simulated source is not open; use it in a with statement")
 
 
 def true_chain(
@@ -305,12 +285,11 @@ def guided_path(
 ) -> FloatArray:
     """Return noise-free encoder readings (n, d) [rad or m], `config.encoders.rate_hz` rows a second.
 
+    Raise ConfigError if [camera] describes no stereo pair (the hand keeps the marker in its view), or pybullet is not
+    installed.
+
     Args:
         tell: called with the simulated seconds done so far.
-
-    Raises:
-        ConfigError: [camera] describes no stereo pair (the hand keeps the marker in its view), or pybullet is not
-            installed.
     """
     calibration = stereo_calibration(robot)
     config = exact_encoders(config)

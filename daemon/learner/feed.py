@@ -45,7 +45,14 @@ class _Stored:
 
 
 class PairFeed:
-    """Feeds a `OnlineLearner`. `offer` and `wake` may be called from any thread, `step` from one only."""
+    """Feeds a `OnlineLearner`. `offer` and `wake` may be called from any thread, `step` from one only.
+
+    Attributes:
+        problem: reason why arriving pairs are not learnt, or None.
+        refused: reason why the last refused pair was refused, or None.
+        foreign: identity of the store that pairs arrive from although the learner learnt from another one, or None.
+        paused: pairs are left to history.
+    """
 
     def __init__(
         self, learning: OnlineLearner, history: History, clock: Clock, beat: Callable[[], None] = lambda: None
@@ -63,22 +70,12 @@ class PairFeed:
         self._waiting: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
         # Set by any thread: an item was not queued. All else belongs to `step`.
         self._missed = True
-        self._behind, self._paused = False, False
+        self._behind, self.paused = False, False
         self._retry_at = 0.0
-        self._refused: str | None = None
+        self.refused: str | None = None
         self._published: tuple[bytes, float] | None = None
         self._newest: _Stored | None = None
         self.restart()
-
-    @property
-    def problem(self) -> str | None:
-        """Reason why arriving pairs are not learnt, or None."""
-        return self._problem
-
-    @property
-    def refused(self) -> str | None:
-        """Reason why the last refused pair was refused, or None."""
-        return self._refused
 
     @property
     def behind(self) -> int:
@@ -97,11 +94,6 @@ class PairFeed:
             return None
         return self._clock.now() - newest.heard_at + _seconds(utc, newest.utc)
 
-    @property
-    def paused(self) -> bool:
-        """True while pairs are left to history."""
-        return self._paused
-
     def offer(self, payload: bytes) -> None:
         """Accept a published pair."""
         self._published = payload, self._clock.now()
@@ -117,11 +109,11 @@ class PairFeed:
 
     def pause(self) -> None:
         """Leave pairs to history until `resume`."""
-        self._paused = True
+        self.paused = True
 
     def resume(self) -> None:
         """Accept pairs again, starting with the missed ones."""
-        self._paused = False
+        self.paused = False
         self.wake()
 
     def restart(self) -> None:
@@ -129,16 +121,8 @@ class PairFeed:
         counters = self._learning.counters
         self._store, self._cursor = counters.store, counters.last_seq
         self._published = self._newest = None
-        self._problem: str | None = None
-        self._foreign: str | None = None
-
-    @property
-    def foreign_store(self) -> str | None:
-        """Identity of the store that pairs arrive from although the learner learnt from another one.
-
-        None if they agree.
-        """
-        return self._foreign
+        self.problem: str | None = None
+        self.foreign: str | None = None
 
     def step(self, timeout_s: float) -> None:
         """Process the offered pairs, or wait for one; catch up if some are missing."""
@@ -146,7 +130,7 @@ class PairFeed:
             payload = self._waiting.get(timeout=timeout_s)
         except queue.Empty:
             payload = None
-        if self._paused:
+        if self.paused:
             self._missed = True
             return
         if self._missed:
@@ -175,7 +159,7 @@ class PairFeed:
 
     def _catch_up(self) -> None:
         """Request all pairs after the last one, page by page."""
-        while not self._paused:
+        while not self.paused:
             self._beat()
             begin = self._cursor + 1
             try:
@@ -183,7 +167,7 @@ class PairFeed:
             except (BusError, RequestError) as error:
                 log.debug("history could not be asked: %s", error)
                 if isinstance(error, RequestError):
-                    self._problem = f"the sampler does not give the pairs from {begin} on: {error}"
+                    self.problem = f"the sampler does not give the pairs from {begin} on: {error}"
                 self._retry_at = self._clock.now() + RETRY_S
                 return
             self._note_stored(reply)
@@ -198,13 +182,13 @@ class PairFeed:
             self._behind = False
             return True
         if reply.last_seq < self._cursor:
-            self._problem = (
+            self.problem = (
                 f"the sampler's store ends at pair {reply.last_seq}, but {self._cursor} were learnt: it is an older "
                 "copy. Put the newer one back, or send the command reset_to_prior"
             )
-            self._foreign, self._behind = reply.store, False
+            self.foreign, self._behind = reply.store, False
             return True
-        self._problem = self._foreign = None
+        self.problem = self.foreign = None
         new = [message for message in reply.pairs if message.seq > self._cursor]
         for message in new:
             self._beat()
@@ -266,12 +250,12 @@ class PairFeed:
 
     def _refuse(self, error: RequestError) -> None:
         log.warning("a pair was refused: %s", error)
-        self._refused = str(error)
+        self.refused = str(error)
         self._learning.refuse()
 
     def _meet_foreign(self, store: str) -> None:
-        self._foreign = store
-        self._problem = (
+        self.foreign = store
+        self.problem = (
             f"pairs now come from the store {store}, but this learner learnt from {self._store}; they are not mixed. "
             "Send the command reset_to_prior to start again with the new store, or restore the old store"
         )

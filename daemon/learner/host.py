@@ -15,23 +15,22 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from typing import Any, Protocol
+from typing import Any
 
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.learner.findings import FindingTurns
-from bodyschema.daemon.learner.learner import LISTENING, LOOPS, Learner, more_rarely, status_line
+from bodyschema.daemon.learner.learner import LISTENING, LOOPS, Learner, more_rarely, show_name, status_line
 from bodyschema.daemon.learner.solver_pool import SolverPool
 from bodyschema.daemon.learner.solver_process import SolverLostError, SolverProcess
 from bodyschema.daemon.service.notify import Notifier
 from bodyschema.daemon.service.service import Service
 from bodyschema.daemon.service.signals import SignalFlags
-from bodyschema.daemon.service.thread_names import show_name
 from bodyschema.daemon.transport.access import Names, Subjects, access_control
 from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.identity import SECURE
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.wire import encode
-from bodyschema.interfaces.errors import BodyschemaError, ConfigError
+from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.waits import NICENESS, RETRY_S, STATUS_EVERY_S
 
@@ -39,22 +38,6 @@ IDLE_S = 0.02
 SOLVE_WHEN_IDLE_S = 0.5
 # A thread that waits for a lock gets it between two pieces of work.
 BREATH_S = 1e-4
-
-
-class Worker(Protocol):
-    """Source of the background work."""
-
-    def work(self) -> bool:
-        """Do one small piece of work; return False if there is none. SolverLostError: the solver has lost its pairs."""
-        ...
-
-    def restart_solver(self) -> None:
-        """Send the solver its pairs again."""
-        ...
-
-    def solve_soon(self) -> None:
-        """Request a solution: there has been no other work for a while."""
-        ...
 
 
 class Background:
@@ -65,7 +48,7 @@ class Background:
     """
 
     def __init__(
-        self, workers: Sequence[Worker], service: Service, clock: Clock, stop: threading.Event, *, share: float = 1.0
+        self, workers: Sequence[Learner], service: Service, clock: Clock, stop: threading.Event, *, share: float = 1.0
     ) -> None:
         self._workers, self._service, self._clock, self._stop = workers, service, clock, stop
         self._rest = 1.0 / share - 1.0
@@ -94,7 +77,9 @@ class Background:
             if worked:
                 self._stop.wait(max(self._rest * (time.thread_time() - begin), BREATH_S))
             elif not self._stop.wait(IDLE_S):
-                self._solve_what_rests()
+                for worker, since in zip(self._workers, self._idle_since, strict=True):
+                    if self._clock.now() - since > SOLVE_WHEN_IDLE_S:
+                        worker.solve_soon()
 
     def _round(self) -> bool:
         """Do one piece for each; return True if there was any."""
@@ -103,12 +88,6 @@ class Background:
             if busy:
                 self._idle_since[place] = self._clock.now()
         return any(worked)
-
-    def _solve_what_rests(self) -> None:
-        now = self._clock.now()
-        for worker, since in zip(self._workers, self._idle_since, strict=True):
-            if now - since > SOLVE_WHEN_IDLE_S:
-                worker.solve_soon()
 
 
 log = logging.getLogger(__name__)
@@ -123,13 +102,11 @@ SWITCH_INTERVAL_S = 2e-4
 def run_learners(configs: Sequence[Config], clock: Clock, wishes: SignalFlags, notifier: Notifier) -> None:
     """Learn and answer for all robots until `wishes` requests the end.
 
+    Raise ConfigError if the robots cannot be served by one process. Raise BusError if a learner's port is in use. Raise
+    CheckpointError if an unusable checkpoint cannot be moved aside.
+
     Args:
         notifier: is notified once everything is up, that every loop works, and of the learners' states.
-
-    Raises:
-        ConfigError: the robots cannot be served by one process.
-        BusError: a learner's port is in use.
-        CheckpointError: an unusable checkpoint cannot be moved aside.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     loops = LOOPS if len(configs) == 1 else (*(_loop(config) for config in configs), *LOOPS[1:])
@@ -154,8 +131,7 @@ def run_learners(configs: Sequence[Config], clock: Clock, wishes: SignalFlags, n
 def session_settings(configs: Sequence[Config]) -> dict[str, Any]:
     """Return zenoh's configuration of the one session of all robots.
 
-    Raises:
-        ConfigError: two have the same name, or their tables [zenoh] name different routers or certificates.
+    Raise ConfigError if two have the same name, or their tables [zenoh] name different routers or certificates.
     """
     settings = configs[0].zenoh_settings("learner")
     if len(configs) == 1:
@@ -245,19 +221,8 @@ def attend(
                 line = status_line(status)
                 service.tell(line if len(learners) == 1 else f"{len(learners)} robots; {status.robot}: {line}")
             if reloading:
-                _reload(learner, service)
+                service.follow(learner.reload)
             learner.tick()
         if failed:
             raise failed[0]
         time.sleep(TICK_S)
-
-
-def _reload(learner: Learner, service: Service) -> None:
-    """Reload; the result goes to the log, because the request came by a signal."""
-    service.reloading()
-    try:
-        log.info("robot.toml was read again: %s", learner.reload())
-    except BodyschemaError as error:
-        log.error("robot.toml was read again and is not followed: %s", error)
-    finally:
-        service.reloaded()

@@ -12,6 +12,7 @@ import logging
 import threading
 from collections.abc import Callable, Iterator
 from importlib.metadata import version
+from pathlib import Path
 
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.learner.answers import Answers, ExpectedMarker
@@ -21,7 +22,6 @@ from bodyschema.daemon.learner.findings import Changes, Findings, FindingTurns
 from bodyschema.daemon.sampler.history import Page, read_page
 from bodyschema.daemon.service.reload import reload
 from bodyschema.daemon.service.service import Service, with_health
-from bodyschema.daemon.service.thread_names import show_name
 from bodyschema.daemon.transport.bus import Request, ZenohSession
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.status import LearnerStatus
@@ -105,26 +105,20 @@ class Learner:
         listening.start()
         try:
             self._declare()
-            with self._publishing():
+            found = open_marker_topic(self._config, self._clock)
+            if found is None:
                 yield
+            else:
+                with ExpectedMarker(*found, lambda: self._learning.snapshot, self._clock).publishing():
+                    yield
         finally:
             self._stop.set()
             self._feed.wake()
             listening.join()
             self.checkpoint()
 
-    def _publishing(self) -> contextlib.AbstractContextManager[None]:
-        found = open_marker_topic(self._config, self._clock)
-        if found is None:
-            return contextlib.nullcontext()
-        return ExpectedMarker(*found, lambda: self._learning.snapshot, self._clock).publishing()
-
     def tick(self) -> None:
-        """Do the main thread's periodic work: write a checkpoint when one is due.
-
-        Raises:
-            BaseException: the exception that ended one of the threads.
-        """
+        """Write a checkpoint when one is due. Raise the exception that ended one of the threads."""
         if self._failure is not None:
             raise self._failure
         self._service.beat("status")
@@ -268,7 +262,7 @@ class Learner:
 
     def _reset_to_prior(self) -> str:
         with self._feed.lock:
-            foreign = self._feed.foreign_store
+            foreign = self._feed.foreign
             self._learning.reset_to_prior(forget_store=foreign is not None)
             self._changes.note(None)
             self._feed.restart()
@@ -306,8 +300,7 @@ class Learner:
     def reload(self) -> str:
         """Read robot.toml again; return a message about the result.
 
-        Raises:
-            ConfigError: robot.toml is invalid; nothing changed.
+        Raise ConfigError if robot.toml is invalid; nothing changed.
         """
         found = reload(self._config, TABLES, CHANGEABLE)
         self._config, self._settings = found.config, found.config.tables.learner
@@ -344,6 +337,12 @@ class Learner:
     def solve_soon(self) -> None:
         """Start the solver on all pairs learnt so far, since there is no other work."""
         self._learning.solve_soon()
+
+
+def show_name() -> None:
+    """Show the beginning of this thread's Python name in `top -H` and `ps -L`, where the system supports it."""
+    with contextlib.suppress(OSError):
+        Path(f"/proc/self/task/{threading.get_native_id()}/comm").write_text(threading.current_thread().name[:15])
 
 
 def more_rarely(robots: int) -> float:

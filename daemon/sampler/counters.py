@@ -8,10 +8,9 @@ from bodyschema.daemon.transport.status import JointRange
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import FloatArray, Reason
 from bodyschema.interfaces.rejections import REMEDIES
+from bodyschema.interfaces.waits import STATUS_EVERY_S
 from bodyschema.robot.description import RobotDescription
 
-# Rates are averaged over at least this long, so that single frames do not make them jump.
-RATE_WINDOW_S = 1.0
 # A complaint needs nearly all of the newest frames (10 s of a usual camera; fewer at the start) to be refused.
 NEWEST_FRAMES, FEWEST_FRAMES, NEARLY_ALL = 300, 30, 0.9
 # An arm at rest, or paused by an operator, is in order. The other reasons have complaints of their own.
@@ -94,7 +93,7 @@ class SamplerCounters:
         """Update the rates at the end of a window."""
         now = self._wall.now()
         passed = now - self._window_start
-        if passed < RATE_WINDOW_S:
+        if passed < STATUS_EVERY_S:  # a shorter window would make single frames show
             return
         counts = (self.readings, self.frames, self.pairs)
         rates = [(count - before) / passed for count, before in zip(counts, self._window_counts, strict=True)]

@@ -1,4 +1,4 @@
-"""Record which devices read the joints, and report how a change of them affects the pairs."""
+"""Record which devices read the joints, how a change of them affects the pairs, and how servos are."""
 
 from __future__ import annotations
 
@@ -14,10 +14,12 @@ import msgspec
 from bodyschema.daemon.config import Config, DaemonConfig
 from bodyschema.daemon.sampler.align import JointBuffer
 from bodyschema.daemon.sampler.gate import Gate
+from bodyschema.daemon.sampler.sources import TellsHealth
 from bodyschema.daemon.service.reload import reload
-from bodyschema.daemon.service.service import Service
-from bodyschema.interfaces.errors import BodyschemaError
+from bodyschema.daemon.transport.status import BusStatus, ServoStatus
+from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.protocols import Clock, JointSource
+from bodyschema.interfaces.servos import BusHealth, ServoHealth
 from bodyschema.recordings.store.retention import Keep
 from bodyschema.recordings.store.store import PairStore, Session
 from bodyschema.robot.limited import read_at_most
@@ -46,6 +48,7 @@ class DeviceWatch:
     """Records in the store which devices read the joints, and detects changes.
 
     Attributes:
+        kept: the record of this session; empty before there is one.
         changes: differences from the devices of earlier pairs, with remedies.
     """
 
@@ -60,21 +63,17 @@ class DeviceWatch:
         self._store, self._wall = store, wall
         stored = store.reader.devices()
         self._before: Sequence[Device] = stored[-1].record if stored else ()
-        self._kept: Sequence[Device] = ()
+        self.kept: Sequence[Device] = ()
         self.changes: list[str] = []
-
-    def note_again(self) -> None:
-        """Start the record of a new session."""
-        self._kept = ()
 
     def look(self) -> bool:
         """Store the record if it is new; return True if pairs from now on differ from earlier ones."""
         record = () if self._joints is None else self._joints.record
-        if not record or record == self._kept:
+        if not record or record == self.kept:
             return False
         found = differences(self._before, record)
         self._store.note_devices(self._wall.utc(), record)
-        self._before = self._kept = record
+        self._before = self.kept = record
         for said in found:
             log.warning("%s", said)
         self.changes += found
@@ -157,33 +156,24 @@ class SamplerRules:
     def reload(self) -> str:
         """Read robot.toml again and return a message about the result; sampling continues meanwhile.
 
-        Raises:
-            ConfigError: robot.toml is invalid; nothing changed.
-            StoreError: the new session cannot be stored; nothing changed.
+        Raise ConfigError if robot.toml is invalid; nothing changed. Raise StoreError if the new session cannot be
+        stored; nothing changed.
         """
         with self._one_at_a_time:
             found = reload(self._config, TABLES, CHANGEABLE)
             if found.changed:
                 self._follow(found.config)
-        message = found.message("sampler")
-        log.info("robot.toml was read again: %s", message)
-        return message
-
-    def reload_aside(self, service: Service) -> None:
-        """Run `reload` in a separate thread, because frames do not wait.
-
-        Log the result, as the request came by a signal.
-        """
-        threading.Thread(target=self._reload_for, args=(service,), name="reload").start()
+        return found.message("sampler")
 
     def trim(self) -> None:
         """Delete a batch of the pairs that are no longer kept, if there are any.
 
-        Raises:
-            StoreError: the disk is full or broken.
+        Raise StoreError if the disk is full or broken.
         """
+        rules = self._config.tables.daemon
+        most_bytes = None if rules.keep_mb is None else 1e6 * rules.keep_mb
         with self._deciding:
-            deleted = self._store.trim(_kept(self._config.tables.daemon), self._wall.utc())
+            deleted = self._store.trim(Keep(rules.keep_days, most_bytes, rules.keep_newest), self._wall.utc())
         if deleted:
             log.info("the oldest %d pairs were deleted, as [daemon] keep_days and keep_mb say", deleted)
 
@@ -191,20 +181,78 @@ class SamplerRules:
         session, rules = session_of(config, self._wall), config.tables.daemon
         with self._deciding:
             self._store.go_on_with(session)
-            self._devices.note_again()
+            self._devices.kept = ()
             self._gate.follow(rules)
             self._buffer.max_gap_s = rules.max_reading_gap_s
             self._config = config
 
-    def _reload_for(self, service: Service) -> None:
-        service.reloading()
-        try:
-            self.reload()
-        except BodyschemaError as error:
-            log.error("robot.toml was read again and is not followed: %s", error)
-        finally:
-            service.reloaded()
+
+@runtime_checkable
+class Servos(TellsHealth, Protocol):
+    """Encoders that are servos; see `bodyschema.drivers.servos.joints.ServoJoints`."""
+
+    @property
+    def servo_health(self) -> Sequence[ServoHealth]: ...
+    @property
+    def bus_health(self) -> Mapping[str, BusHealth]: ...
 
 
-def _kept(rules: DaemonConfig) -> Keep:
-    return Keep(rules.keep_days, None if rules.keep_mb is None else 1e6 * rules.keep_mb, rules.keep_newest)
+@runtime_checkable
+class AsksForTurns(Protocol):
+    """Encoders that may have lost a joint's turn count."""
+
+    @property
+    def asks_for_turns(self) -> bool: ...
+    def accept_turns(self) -> None:
+        """Assume the turns nearest to the joints' last positions."""
+
+
+def complaints_of(joints: JointSource) -> list[str]:
+    """Return the problems that the encoders report."""
+    return list(joints.health) if isinstance(joints, TellsHealth) else []
+
+
+def servos_of(joints: JointSource) -> dict[str, ServoStatus]:
+    """Return each joint's servo."""
+    if not isinstance(joints, Servos):
+        return {}
+    return {
+        servo.joint: ServoStatus(
+            bus=servo.bus,
+            id=servo.id,
+            model=servo.model,
+            firmware=servo.firmware,
+            homing_offset=servo.homing_offset,
+            drive_mode=servo.drive_mode,
+            voltage_v=None if servo.voltage_v is None else round(servo.voltage_v, 1),
+            temperature_c=servo.temperature_c,
+            current_a=None if servo.current_a is None else round(servo.current_a, 3),
+            troubles=list(servo.troubles),
+        )
+        for servo in joints.servo_health
+    }
+
+
+def buses_of(joints: JointSource) -> dict[str, BusStatus]:
+    """Return each bus's statistics since the start."""
+    if not isinstance(joints, Servos):
+        return {}
+    return {name: _bus(bus) for name, bus in joints.bus_health.items()}
+
+
+def _bus(bus: BusHealth) -> BusStatus:
+    failed = sum(bus.troubles.values())
+    answered = 1.0 - failed / bus.exchanges if bus.exchanges else 0.0
+    return BusStatus(bus.exchanges, round(answered, 5), dict(bus.troubles), bus.way)
+
+
+def accept_turns(encoders: object) -> str:
+    """Set lost turn counts to the turns nearest to the last positions; return a message.
+
+    Raise RequestError if no turn count was lost.
+    """
+    if not isinstance(encoders, AsksForTurns) or not encoders.asks_for_turns:
+        raise RequestError("no joint has lost its turn count: there is nothing to accept")
+    encoders.accept_turns()
+    log.info("accept_turns: the turns nearest to where the joints were are taken")
+    return "the turns nearest to where the joints were are taken; pairs go on in a new segment"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -15,13 +14,6 @@ from .align import joint_difference
 
 # This many consecutive fixes that agree with each other, but not with the previous position, are accepted.
 CONFIRMATIONS = 3
-
-
-@dataclass(frozen=True, slots=True)
-class Accepted:
-    """The measurement is a pair of this segment."""
-
-    segment: int
 
 
 class _Fix(NamedTuple):
@@ -42,6 +34,9 @@ class Gate:
     there in the elapsed time, or after `segment_gap_s`.
 
     With `any_step`, neither step nor speed is checked: a static recording has no path between its poses.
+
+    Attributes:
+        segment: number of the current segment; 0 before the first.
     """
 
     def __init__(self, rules: DaemonConfig, prismatic: NDArray[np.bool_], last: Pair | None = None) -> None:
@@ -52,7 +47,7 @@ class Gate:
         """
         self._prismatic = prismatic
         self.follow(rules)
-        self._segment = 0 if last is None else last.segment
+        self.segment = 0 if last is None else last.segment
         self._q: FloatArray | None = None if last is None else last.q
         self._t: float | None = None
         self._broken = True
@@ -65,17 +60,12 @@ class Gate:
         self._rules = rules
         self._degrees_per_unit = np.where(self._prismatic, 1 / rules.metres_per_degree, 180 / np.pi)
 
-    @property
-    def segment(self) -> int:
-        """Number of the current segment; 0 before the first."""
-        return self._segment
-
     def break_segment(self) -> None:
         """Start a new segment with the next pair, regardless of its step."""
         self._broken = True
         self._believed = None
 
-    def offer(self, t: float, q: FloatArray, x: FloatArray) -> Accepted | Reason:
+    def offer(self, t: float, q: FloatArray, x: FloatArray) -> int | Reason:
         """Return the segment if joint angles `q` [rad or m] (d,) and marker `x` [m] (3,) make a pair, else the reason.
 
         Args:
@@ -84,23 +74,20 @@ class Gate:
         rules = self._rules
         if not rules.any_step and not self._believe(_Fix(t, x)):
             return Reason.IMPLAUSIBLE_SPEED
-        step_deg = self._step_deg(q)
+        step_deg = np.inf
+        if self._q is not None:
+            step_deg = float(np.linalg.norm(joint_difference(q, self._q, self._prismatic) * self._degrees_per_unit))
         if step_deg < rules.min_step_deg and not rules.any_step:
             return Reason.TOO_NEAR
         paused = self._t is None or t - self._t > rules.segment_gap_s
         if self._broken or paused or step_deg > rules.max_step_deg:
-            self._segment += 1
+            self.segment += 1
         self._t, self._q, self._broken = t, q, False
-        return Accepted(self._segment)
+        return self.segment
 
     def is_too_fast(self, moved: FloatArray) -> bool:
         """Return True if joints that moved by `moved` [rad or m], (d,), within the time uncertainty make no pair."""
         return float(np.linalg.norm(moved * self._degrees_per_unit)) > self._rules.max_time_error_deg
-
-    def _step_deg(self, q: FloatArray) -> float:
-        if self._q is None:
-            return np.inf
-        return float(np.linalg.norm(joint_difference(q, self._q, self._prismatic) * self._degrees_per_unit))
 
     def _believe(self, fix: _Fix) -> bool:
         jumped = self._reachable(self._suspect, fix)

@@ -80,8 +80,7 @@ class ReconnectingSource(Generic[R_co]):
     def read(self, timeout_s: float) -> R_co | None:
         """Read like the source's `read`; also return None while the source is lost.
 
-        Raises:
-            SourceError: it came back as a device that only a new process may open.
+        Raise SourceError if it came back as a device that only a new process may open.
         """
         if not self._is_open and not self._try_again(timeout_s):
             return None
@@ -120,18 +119,15 @@ class ReconnectingSource(Generic[R_co]):
             self.losses += 1
         else:
             self._wait_s = min(2 * self._wait_s, LONGEST_WAIT_S)
-            self._tell_refusal(error)
+            # Problems that need a person are logged, each once.
+            if not isinstance(error, SourceLost) and str(error) != self._refused:
+                self._refused = str(error)
+                log.warning("%s cannot be taken again: %s; trying on", self._name, error)
         self._is_open = False
         said = error.brief if isinstance(error, SourceLost) else error
         self.trouble = f"{self._name} are lost ({said}); trying to open them again"
         soon_s = error.retry_s if isinstance(error, SourceLost) else None
         self._next_try = self._wall.now() + (self._wait_s if soon_s is None else soon_s)
-
-    def _tell_refusal(self, error: SourceError) -> None:
-        """Log problems that need a person, each once."""
-        if not isinstance(error, SourceLost) and str(error) != self._refused:
-            self._refused = str(error)
-            log.warning("%s cannot be taken again: %s; trying on", self._name, error)
 
 
 # A disk that takes longer per pair costs frames [s].
@@ -164,8 +160,7 @@ class ResilientWriter:
     def append(self, segment: int, q: FloatArray, fix: MarkerFix) -> Pair | None:
         """Return the committed pair; None if the disk did not accept it.
 
-        Raises:
-            StoreError: the store is damaged, or no longer a store.
+        Raise StoreError if the store is damaged, or no longer a store.
         """
         pair = self.attempt(lambda: self._store.append(segment, self._wall.utc(), q, fix))
         if pair is not None and self._refused is not None:
@@ -174,11 +169,7 @@ class ResilientWriter:
         return pair
 
     def attempt(self, write: Callable[[], T]) -> T | None:
-        """Return the result of `write`; None if the disk did not accept it.
-
-        Raises:
-            StoreError: as for `append`.
-        """
+        """Return the result of `write`; None if the disk did not accept it. Raise StoreError as `append` does."""
         begun = self._wall.now()
         try:
             return write()

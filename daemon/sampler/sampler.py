@@ -12,7 +12,14 @@ from importlib.metadata import version
 import numpy as np
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.sampler.devices import SamplerRules
+from bodyschema.daemon.sampler.devices import (
+    DeviceWatch,
+    SamplerRules,
+    accept_turns,
+    buses_of,
+    complaints_of,
+    servos_of,
+)
 from bodyschema.daemon.sampler.reconnect import ResilientWriter
 from bodyschema.daemon.sampler.sources import answer_simulation
 from bodyschema.daemon.service.service import Service, with_health
@@ -22,7 +29,6 @@ from bodyschema.daemon.transport.status import SamplerStatus
 from bodyschema.daemon.transport.wire import CommandReply, CommandRequest, decode, encode, pair_to_wire
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError, RequestError, SourceEnded
-from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import FloatArray, JointReading, MarkerFix, MarkerMiss, Reason
 from bodyschema.interfaces.waits import READ_S, SILENT_AFTER_S, STATUS_EVERY_S
 from bodyschema.recordings.store.file import LOW_DISK_BYTES, disk_free
@@ -30,13 +36,11 @@ from bodyschema.recordings.store.store import PairStore
 
 from .align import JointBuffer
 from .counters import SamplerCounters
-from .devices import DeviceWatch
-from .gate import Accepted, Gate
+from .gate import Gate
 from .gaze_loop import gaze_of
-from .history import answer_pairs
+from .history import LARGEST_REPLY, answer_pairs
 from .powered import asked
 from .reconnect import ReconnectingSource
-from .servo_status import accept_turns, buses_of, complaints_of, servos_of
 from .sources import Sources
 
 log = logging.getLogger(__name__)
@@ -44,7 +48,6 @@ log = logging.getLogger(__name__)
 JOINTS_TIMEOUT_S = 1.0  # how long a frame waits for the encoders to reach its time
 AROUND_S = 0.1  # [s] around a frame whose time is uncertain, to estimate the joints' speed
 ZERO_FORCE = "zero_force"  # value of [robot] hold, and name of the drive
-PAIR_CACHE = 1000
 # Loops that must keep running.
 LOOPS = ("encoders", "frames")
 
@@ -63,18 +66,15 @@ class Sampler:
         store: PairStore,
         *,
         exit_at_end: bool = False,
-        wall: Clock | None = None,
         service: Service | None = None,
     ) -> None:
         """Prepare a sampler over an open bus and an open store; `run` opens the sources.
 
+        Raise ConfigError if the encoders' joints differ from robot.toml's.
+
         Args:
             exit_at_end: return from `run` when the sources end, instead of continuing to serve the history.
-            wall: the machine's clock, for rates and UTC; all other times are the sources'.
             service: is notified once everything is up, that `LOOPS` work, and of the sampler's state.
-
-        Raises:
-            ConfigError: the encoders' joints differ from robot.toml's.
         """
         if sources.joints.joints != config.robot.joints:
             raise ConfigError(
@@ -84,7 +84,7 @@ class Sampler:
                 remedy="Make both the same, in the same order",
             )
         self._config, self._bus, self._store, self._exit_at_end = config, bus, store, exit_at_end
-        self._wall = SystemClock() if wall is None else wall
+        self._wall = SystemClock()  # for rates and UTC; all other times are the sources'
         self._service = Service.nobodys(self._wall) if service is None else service
         self._keys = Keys(config.robot.name)
         self._version = version("bodyschema")  # reads a file: once, while descriptors are available
@@ -106,7 +106,7 @@ class Sampler:
         self._storing = ResilientWriter(store, self._wall)
         self._tally = SamplerCounters(config.robot, self._wall, store.audit.joint_ranges)
         self._seq = store.audit.newest
-        self._publish = bus.publisher(self._keys.pair, cache=PAIR_CACHE)
+        self._publish = bus.publisher(self._keys.pair, cache=LARGEST_REPLY)
         self._publish_status = bus.publisher(self._keys.status("sampler"))
         self._stopping = self._reloading = False
         # Once a pause is acknowledged, no pair may follow.
@@ -133,9 +133,8 @@ class Sampler:
     def run(self) -> None:
         """Sample until `stop`, or with `exit_at_end` until the sources end.
 
-        Raises:
-            StoreError: the store is damaged; the pair was not published, and no pair followed.
-            SourceError: a source could not be opened at the start.
+        Raise StoreError if the store is damaged; the pair was not published, and no pair followed. Raise SourceError if
+        a source could not be opened at the start.
         """
         self._service.tell("opening encoders and cameras")
         with ExitStack() as stack:
@@ -277,8 +276,8 @@ class Sampler:
             return Reason.LATE_JOINTS
         return q
 
-    def _accept(self, verdict: Accepted, q: FloatArray, fix: MarkerFix) -> Reason | None:
-        pair = self._storing.append(verdict.segment, q, fix)
+    def _accept(self, segment: int, q: FloatArray, fix: MarkerFix) -> Reason | None:
+        pair = self._storing.append(segment, q, fix)
         if pair is None:
             self._gate.break_segment()
             return Reason.NOT_STORED
@@ -331,7 +330,9 @@ class Sampler:
         if way in ("on", "off"):
             return encode(CommandReply(command, self._power(name, on=way == "on")), request.encoding)
         if command == "reload":
-            return encode(CommandReply(command, self._rules.reload()), request.encoding)
+            message = self._rules.reload()
+            log.info("robot.toml was read again: %s", message)
+            return encode(CommandReply(command, message), request.encoding)
         if command not in ("pause", "resume"):
             raise RequestError(
                 f"the sampler has nothing to do with {command}. Send it to {self._keys.command('learner')}"
@@ -358,7 +359,8 @@ class Sampler:
         self._service.beat("frames")
         if self._reloading:
             self._reloading = False
-            self._rules.reload_aside(self._service)
+            # In a separate thread, because frames do not wait.
+            threading.Thread(target=self._service.follow, args=(self._rules.reload,), name="reload").start()
         self._tally.tick()
         if self._wall.now() >= self._next_status:
             self._rules.trim()

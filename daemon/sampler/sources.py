@@ -84,13 +84,12 @@ class Head(Powered, Protocol):
     @property
     def pose(self) -> tuple[float, FloatArray] | None:
         """Time [s] and angles of all joints [rad] (d,) of the newest reading; None while it has no torque."""
-        ...
 
     def aim(self, t: float, angles: FloatArray) -> None:
         """Request that its joints are at `angles` (g,) [rad] at `t` [s]."""
-        ...
 
 
+@runtime_checkable
 class TellsHealth(Protocol):
     """A device that reports its health."""
 
@@ -148,7 +147,6 @@ class StampedJoints(JointSource, Protocol):
     @property
     def stamp_ns(self) -> int | None:
         """Time of the newest reading on that clock [ns]; None before any."""
-        ...
 
 
 class MarkerTopic(Source, Protocol):
@@ -166,7 +164,6 @@ class MarkerTopic(Source, Protocol):
 
     def publish(self, stamp_ns: int, x: FloatArray, sigma: FloatArray) -> None:
         """Publish a position [m] and its 1-sigma per axis [m], shapes (3,), at a time on the encoders' clock [ns]."""
-        ...
 
 
 class ToolRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -203,8 +200,7 @@ class TruthReply(msgspec.Struct, frozen=True):
 def answer_simulation(world: GroundTruth, clock: Clock, request: Request) -> bytes:
     """Answer an empty request with the ground truth; change the tool on a `ToolRequest`.
 
-    Raises:
-        RequestError: the tool is not three finite numbers, or is longer than `LONGEST_TOOL_M`.
+    Raise RequestError if the tool is not three finite numbers, or is longer than `LONGEST_TOOL_M`.
     """
     if not request.payload:
         chain = world.true_chain()

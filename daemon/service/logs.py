@@ -55,7 +55,6 @@ class UnrepeatedHandler(logging.StreamHandler[TextIO]):
     """
 
     def __init__(self, stream: TextIO, formatter: logging.Formatter, now: Callable[[], float] = time.monotonic) -> None:
-        """Start without earlier messages."""
         super().__init__(stream)
         self.setFormatter(formatter)
         self._now = now

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 import threading
 from collections.abc import Callable, Collection, Sequence
 
+from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.protocols import Clock
 
 from .notify import Notifier
+
+log = logging.getLogger(__name__)
 
 # systemd's timeout as a multiple of the interval between two signs of life.
 SIGNS_PER_WATCHDOG = 4
@@ -84,13 +88,15 @@ class Service:
         self._forbidden_since = math.inf if found is None else min(self._forbidden_since, now)
         return found if now - self._forbidden_since >= SETTLED_S else None
 
-    def reloading(self) -> None:
-        """Report that the configuration is being read again, until `reloaded`."""
+    def follow(self, reload: Callable[[], str]) -> None:
+        """Report that robot.toml is read again by `reload`. Log its result, as the request came by a signal."""
         self._notifier.reloading()
-
-    def reloaded(self) -> None:
-        """Report that the configuration was read again."""
-        self._notifier.ready()
+        try:
+            log.info("robot.toml was read again: %s", reload())
+        except BodyschemaError as error:
+            log.error("robot.toml was read again and is not followed: %s", error)
+        finally:
+            self._notifier.ready()
 
     def tell(self, line: str) -> None:
         """Report the state of the process in one line."""

@@ -39,8 +39,7 @@ class Child:
     def tend(self) -> None:
         """Start the process if it is not running and its waiting time is over.
 
-        Raises:
-            BodyschemaError: it refused to start.
+        Raise BodyschemaError if it refused to start.
         """
         now = time.monotonic()
         if self._process is None:
@@ -97,8 +96,7 @@ class Supervisor:
     def run(self) -> None:
         """Keep the children running until `stop`.
 
-        Raises:
-            BodyschemaError: one of them refused to start; the others were ended.
+        Raise BodyschemaError if one of them refused to start; the others were ended.
         """
         try:
             while not self._stopping:

@@ -116,13 +116,7 @@ def access_control(names_of_robot: Mapping[str, Names], subjects: Subjects) -> d
             rules += of_role
             owners.append({"id": identity, **subjects.of(who)})
             policies.append({"rules": [rule["id"] for rule in of_role], "subjects": [identity]})
-    return {
-        "enabled": True,
-        "default_permission": "deny",
-        "rules": rules,
-        "subjects": owners,
-        "policies": policies,
-    }
+    return {"enabled": True, "default_permission": "deny", "rules": rules, "subjects": owners, "policies": policies}
 
 
 def _rules(identity: str, allowed: Mapping[Deed, tuple[str, ...]]) -> Iterator[dict[str, Any]]:

@@ -111,11 +111,7 @@ class ZenohSession:
             plain = self._open.declare_publisher(key, encoding=zenoh.Encoding(JSON))
             return plain.put
         advanced = zenoh.ext.declare_advanced_publisher(
-            self._open,
-            key,
-            encoding=zenoh.Encoding(JSON),
-            cache=zenoh.ext.CacheConfig(cache),
-            publisher_detection=True,
+            self._open, key, encoding=zenoh.Encoding(JSON), cache=zenoh.ext.CacheConfig(cache), publisher_detection=True
         )
         return advanced.put
 
@@ -149,7 +145,10 @@ class ZenohSession:
             try:
                 reception.admit(_source(query), 0 if query.payload is None else len(query.payload), query)
             except RequestError as error:
-                self._refuse_soon(query, str(error))
+                try:
+                    self._refusals.put_nowait((query, str(error)))
+                except queue.Full:
+                    query.drop()
 
         if not self._threads:
             self._start(self._refuse)
@@ -189,9 +188,8 @@ class ZenohSession:
     def ask_one(self, key: str, payload: bytes = b"", *, encoding: str = JSON, timeout_s: float = 5.0) -> bytes:
         """Return the one reply to a query.
 
-        Raises:
-            BusError: there is no answer under this key, or not in time.
-            RequestError: the request was refused.
+        Raise BusError if there is no answer under this key, or not in time. Raise RequestError if the request was
+        refused.
         """
         replies = self.ask(key, payload, encoding=encoding, timeout_s=timeout_s)
         if not replies:
@@ -216,8 +214,10 @@ class ZenohSession:
 
     def _config(self) -> zenoh.Config:
         config = zenoh.Config()
+        # A peer linked to a process and to the router would receive everything twice.
+        is_linked_twice = self._route is not None and len(self._route.endpoints) > 1
         settings: dict[str, Any] = {
-            "mode": "client" if self._client else self._lasting_mode,
+            "mode": "client" if self._client else "router" if is_linked_twice else "peer",
             "scouting/multicast/enabled": False,
             "scouting/gossip/enabled": False,
             "listen/endpoints": [self._listen] if self._listen else [],
@@ -234,11 +234,6 @@ class ZenohSession:
         for key, value in (settings | self._settings).items():
             config.insert_json5(key, json.dumps(value))
         return config
-
-    @property
-    def _lasting_mode(self) -> str:
-        """Mode of a long-lived session; a peer linked to a process and to the router would receive everything twice."""
-        return "router" if self._route is not None and len(self._route.endpoints) > 1 else "peer"
 
     def _explain(self, message: str) -> str:
         if self._client and self._route is not None:
@@ -267,12 +262,6 @@ class ZenohSession:
         self._receptions.clear()
         self._threads.clear()
 
-    def _refuse_soon(self, query: zenoh.Query, why: str) -> None:
-        try:
-            self._refusals.put_nowait((query, why))
-        except queue.Full:
-            query.drop()
-
     def _refuse(self) -> None:
         """Refuse queries beyond the limits, in a separate thread: a client that does not listen blocks it."""
         while (refused := self._refusals.get()) is not None:
@@ -281,11 +270,7 @@ class ZenohSession:
             del refused  # a query that is referenced is not yet answered
 
     def _answer(
-        self,
-        key: str,
-        reception: QueryLimiter[zenoh.Query],
-        handler: Callable[[Request], bytes],
-        encoding: str | None,
+        self, key: str, reception: QueryLimiter[zenoh.Query], handler: Callable[[Request], bytes], encoding: str | None
     ) -> None:
         while (taken := reception.take()) is not None:
             query, refused = taken
@@ -304,7 +289,8 @@ class ZenohSession:
             _reply_error(query, f"the encoding {asked} is unknown; known are {JSON} and {MSGPACK}")
             return
         payload = query.payload.to_bytes() if query.payload is not None else b""
-        parameters = dict(_parameters(str(query.parameters)))
+        parts = (part.partition("=") for part in str(query.parameters).split(";"))
+        parameters = {name: value for name, _, value in parts if name}
         try:
             answer = handler(Request(parameters, payload, encoding))
         except BodyschemaError as error:
@@ -347,13 +333,6 @@ def is_alive(endpoint: str | Route, token: str, *, open_timeout_s: float = OPEN_
             return bool(bus.alive(token))
     except BusError:
         return False
-
-
-def _parameters(text: str) -> Iterator[tuple[str, str]]:
-    for part in text.split(";"):
-        name, _, value = part.partition("=")
-        if name:
-            yield name, value
 
 
 def _taken_apart(reply: zenoh.Reply) -> Reply:

@@ -61,8 +61,7 @@ class Identity:
     def of(cls, tls: TlsConfig, login: LoginConfig | None, users_file: str | None, folder: Path) -> Identity:
         """Read the tables of a file in `folder`.
 
-        Raises:
-            ConfigError: a certificate lacks its key, a file is missing, or a secret is readable by other users.
+        Raise ConfigError if a certificate lacks its key, a file is missing, or a secret is readable by other users.
         """
         if (tls.certificate is None) != (tls.key is None):
             raise ConfigError("tls names a certificate or a key", remedy="Name both: each is useless alone")
@@ -70,13 +69,17 @@ class Identity:
         for name in (tls.ca, tls.certificate, *secret):
             if name is not None:
                 _check_file(folder / name, secret=name in secret)
+
+        def found(name: str | None) -> Path | None:
+            return None if name is None else (folder / name).absolute()
+
         return cls(
             ca=(folder / tls.ca).absolute(),
-            certificate=None if tls.certificate is None else (folder / tls.certificate).absolute(),
-            key=None if tls.key is None else (folder / tls.key).absolute(),
+            certificate=found(tls.certificate),
+            key=found(tls.key),
             user=None if login is None else login.user,
-            password_file=None if login is None else (folder / login.password_file).absolute(),
-            users_file=None if users_file is None else (folder / users_file).absolute(),
+            password_file=None if login is None else found(login.password_file),
+            users_file=found(users_file),
         )
 
     @property
@@ -91,11 +94,7 @@ class Identity:
         return self.users_file is not None
 
     def settings(self) -> dict[str, Any]:
-        """Return zenoh's configuration of links and users.
-
-        Raises:
-            ConfigError: the password cannot be read.
-        """
+        """Return zenoh's configuration of links and users. Raise ConfigError if the password cannot be read."""
         tls: dict[str, Any] = {
             "root_ca_certificate": str(self.ca),
             "enable_mtls": self.certificate is not None and not self.by_user,
@@ -136,16 +135,11 @@ class Route:
         return " or ".join(self.endpoints)
 
 
-def host_of(endpoint: str) -> str:
-    """Return the host in a zenoh endpoint, without the brackets of IPv6."""
-    return endpoint.partition("/")[2].partition("?")[0].partition("#")[0].rpartition(":")[0].strip("[]")
-
-
 def is_local(endpoint: str) -> bool:
     """Return True if only this machine can reach the endpoint."""
     if endpoint.startswith("unixsock-stream/"):
         return True
-    host = host_of(endpoint)
+    host = endpoint.partition("/")[2].partition("?")[0].partition("#")[0].rpartition(":")[0].strip("[]")  # of IPv6
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:

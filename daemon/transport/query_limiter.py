@@ -70,11 +70,10 @@ class QueryLimiter(Generic[T]):
     def admit(self, source: str, size: int, query: T) -> None:
         """Queue a query.
 
+        Raise RequestError if it is too large, or its source asks too much; the message says how much is allowed.
+
         Args:
             size: size of its payload [bytes].
-
-        Raises:
-            RequestError: it is too large, or its source asks too much; the message says how much is allowed.
         """
         limits = self._limits
         if size > limits.request_bytes:
@@ -119,7 +118,10 @@ class QueryLimiter(Generic[T]):
             asking.size -= size
             self._size -= size
             self._sources.move_to_end(name)
-        return query, self._too_late(came)
+        waited, most = self._now() - came, self._limits.wait_s
+        if waited <= most:
+            return query, None
+        return query, RequestError(f"the query waited {waited:.0f} s for its turn; at most {most:g} s")
 
     def close(self) -> None:
         """Stop taking queries."""
@@ -127,12 +129,6 @@ class QueryLimiter(Generic[T]):
             for asking in self._sources.values():
                 asking.waiting.clear()
         self._turns.put(None)
-
-    def _too_late(self, came: float) -> RequestError | None:
-        waited = self._now() - came
-        if waited <= self._limits.wait_s:
-            return None
-        return RequestError(f"the query waited {waited:.0f} s for its turn; at most {self._limits.wait_s:g} s")
 
     def _asking(self, source: str) -> _Source[T]:
         now, limits = self._now(), self._limits

@@ -225,11 +225,7 @@ def encode(message: object, encoding: str = JSON) -> bytes:
 
 
 def decode(payload: bytes, kind: type[M], encoding: str = JSON) -> M:
-    """Return the message in `payload`.
-
-    Raises:
-        RequestError: it is not of this type; the message says where.
-    """
+    """Return the message in `payload`. Raise RequestError if it is not of this type; the message says where."""
     try:
         decoder: Any = msgspec.msgpack if encoding == MSGPACK else msgspec.json
         return decoder.decode(payload, type=kind)
@@ -284,8 +280,7 @@ def _as_message(pair: Pair, pose: MarkerPose) -> PairMessage:
 def pair_from_wire(message: PairMessage, joints: int) -> Pair:
     """Return a message as a pair.
 
-    Raises:
-        RequestError: it has another number of joints, a non-finite number, or an invalid quaternion.
+    Raise RequestError if it has another number of joints, a non-finite number, or an invalid quaternion.
     """
     import numpy as np
 
@@ -323,8 +318,7 @@ def _four(turn: FloatArray) -> tuple[float, float, float, float]:
 def position(name: str, values: Sequence[float]) -> FloatArray:
     """Return a requested position, shape (3,) [m].
 
-    Raises:
-        RequestError: a number is not finite, or too large to be in metres.
+    Raise RequestError if a number is not finite, or too large to be in metres.
     """
     import numpy as np
 
@@ -344,8 +338,7 @@ def position(name: str, values: Sequence[float]) -> FloatArray:
 def joint_vector(name: str, values: Sequence[float], joints: tuple[str, ...]) -> FloatArray:
     """Return one number for each joint, shape (d,) [rad].
 
-    Raises:
-        RequestError: the count is wrong, or a value is impossible for its joint.
+    Raise RequestError if the count is wrong, or a value is impossible for its joint.
     """
     import numpy as np
 
@@ -361,8 +354,7 @@ def joint_vector(name: str, values: Sequence[float], joints: tuple[str, ...]) ->
 def joint_angles(request: JointsRequest, joints: tuple[str, ...]) -> FloatArray:
     """Return the request's joint angles, shape (n, d) [rad].
 
-    Raises:
-        RequestError: as `joint_rows`, or a value is impossible for a joint.
+    Raise RequestError as `joint_rows` does, or if a value is impossible for a joint.
     """
     import numpy as np
 
@@ -374,8 +366,7 @@ def joint_angles(request: JointsRequest, joints: tuple[str, ...]) -> FloatArray:
 def joint_rows(request: JointsRequest, joints: tuple[str, ...]) -> list[list[float]]:
     """Return the rows of the request.
 
-    Raises:
-        RequestError: a row has the wrong length, or the batch is empty or too large.
+    Raise RequestError if a row has the wrong length, or the batch is empty or too large.
     """
     if not request.q:
         raise RequestError("q is empty; send one vector of joint angles or a list of them")

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.robot.toml_file import line_of
+from bodyschema.robot.toml_file import ENDPOINT, line_of
 
 from .access import Names, Subjects, access_control
 from .identity import SECURE, Identity, LoginConfig, Route, TlsConfig, is_local
 
-# Up to 65535. Sockets in the file system have no port.
-_PORT = "([1-9][0-9]{0,3}|[1-5][0-9]{4}|6[0-4][0-9]{3}|65[0-4][0-9]{2}|655[0-2][0-9]|6553[0-5])"
-ENDPOINT = re.compile(rf"(tcp|udp|tls|quic|ws)/.+:{_PORT}|unixsock-stream/.+")
 PROCESSES = ("sampler", "learner")
 HOW_TO = "docs/security.md shows how"
 
@@ -76,7 +72,9 @@ class ZenohConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             if is_local(endpoint):
                 continue
             if not endpoint.startswith(SECURE):
-                refuse(name, f": {_naked(endpoint)}", f"{_instead(name, endpoint)}; {HOW_TO}")
+                protocol = endpoint.partition("/")[0]
+                what = f": {endpoint} is open to the network, and {protocol} neither authenticates nor encrypts"
+                refuse(name, what, f"{_instead(name, endpoint)}; {HOW_TO}")
             if self.tls is None:
                 refuse(name, f": {endpoint} needs certificates", f"Name them in [zenoh.tls]; {HOW_TO}")
         if self.sampler == self.learner:
@@ -129,11 +127,6 @@ class ZenohConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 names = self.access or Names()
                 settings["access_control"] = access_control({robot: names}, Subjects(identity.by_user))
         return settings
-
-
-def _naked(endpoint: str) -> str:
-    protocol = endpoint.partition("/")[0]
-    return f"{endpoint} is open to the network, and {protocol} neither authenticates nor encrypts"
 
 
 def _instead(name: str, endpoint: str) -> str:

@@ -7,6 +7,7 @@ import socket
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,7 +17,7 @@ from typing import Any
 import msgspec
 
 from bodyschema.daemon.config import Config
-from bodyschema.drivers.bench.asked_faults import AskedFault, FaultKinds
+from bodyschema.drivers.bench.asked_faults import AskedFault
 from bodyschema.drivers.bench.dry_run import Angle, BenchArm, DryRun
 from bodyschema.drivers.bench.servo_arm import played, swinging
 from bodyschema.drivers.bench.through_driver import LATENCY_MS, READ_S, Behind, ThroughDriver
@@ -65,11 +66,6 @@ def require_on_ports(config: Config) -> OnPorts:
     )
 
 
-def limits_of(config: Config) -> list[tuple[float, float]]:
-    """Return the lower and upper limit of each joint [rad]."""
-    return list(zip(config.robot.lower.tolist(), config.robot.upper.tolist(), strict=True))
-
-
 def bench_motion(config: Config, tell: Callable[[float], None]) -> Motion:
     """Return a motion guided by the simulated hand; without the simulation, a slow swing of each joint.
 
@@ -79,7 +75,7 @@ def bench_motion(config: Config, tell: Callable[[float], None]) -> Motion:
     joints = config.robot.joints
     why = _no_simulation(config)
     if why:
-        angles = swinging(limits_of(config), monotonic())
+        angles = swinging(config.robot.limits, monotonic())
         return Motion(dict(zip(joints, angles, strict=True)), f"each joint swings slowly by itself ({why})")
     from bodyschema.sim_backend.world import guided_path
 
@@ -103,12 +99,14 @@ def open_bench(
 ) -> DryRun:
     """Return the arm of robot.toml behind `port` (several buses: each at `port`-NAME), not opened yet.
 
-    Raises:
-        ConfigError: no servos or encoders are configured, a fault is invalid, or a port's path is occupied.
+    Raise ConfigError if no servos or encoders are configured, a fault is invalid, or a port's path is occupied.
     """
     hardware = require_on_ports(config)
-    asked = [AskedFault.parsed(text, config.robot.joints, _kinds(hardware)) for text in faults]
-    arm = _arm(hardware, motion.angles, faults=asked, return_delay_s=return_delay_s, seed=seed)
+    make = _arm_of(hardware)
+    asked = [AskedFault.parsed(text, config.robot.joints, make.kinds) for text in faults]
+    if not isinstance(hardware, SerialLinesConfig):
+        make = partial(make, return_delay_s=return_delay_s)
+    arm = make(hardware, motion.angles, faults=asked, seed=seed)
     names = list(arm.devices)
     links = {name: port if len(names) == 1 else port.with_name(f"{port.name}-{name}") for name in names}
     for link in links.values():
@@ -116,31 +114,16 @@ def open_bench(
     return DryRun(arm, links, faults=asked)
 
 
-def _kinds(hardware: OnPorts) -> FaultKinds:
+def _arm_of(hardware: OnPorts) -> Any:
+    """Return the class of the emulated arm, a `BenchArm`."""
     match hardware:
         case DynamixelConfig():
-            from bodyschema.drivers.dynamixel.bench.arm import KINDS
+            from bodyschema.drivers.dynamixel.bench.arm import DynamixelArm as Arm
         case FeetechConfig():
-            from bodyschema.drivers.feetech.bench.arm import KINDS
+            from bodyschema.drivers.feetech.bench.arm import FeetechArm as Arm
         case SerialLinesConfig():
-            from bodyschema.drivers.serial_lines.bench.arm import KINDS
-    return KINDS
-
-
-def _arm(hardware: OnPorts, angles: Mapping[str, Angle], *, return_delay_s: float = 0.0, **settings: Any) -> BenchArm:
-    match hardware:
-        case DynamixelConfig():
-            from bodyschema.drivers.dynamixel.bench.arm import DynamixelArm
-
-            return DynamixelArm(hardware, angles, return_delay_s=return_delay_s, **settings)
-        case FeetechConfig():
-            from bodyschema.drivers.feetech.bench.arm import FeetechArm
-
-            return FeetechArm(hardware, angles, return_delay_s=return_delay_s, **settings)
-        case SerialLinesConfig():
-            from bodyschema.drivers.serial_lines.bench.arm import EncoderArm
-
-            return EncoderArm(hardware, angles, **settings)
+            from bodyschema.drivers.serial_lines.bench.arm import EncoderArm as Arm
+    return Arm
 
 
 def bench_ports(bench: DryRun) -> list[str]:
@@ -158,11 +141,8 @@ def bench_ports(bench: DryRun) -> list[str]:
 
 def bench_commands(bench: DryRun) -> tuple[str, ...]:
     """Return the names of the commands that can talk to the devices on the ports."""
-    return (
-        ("doctor", "watch joints")
-        if isinstance(bench.config, SerialLinesConfig)
-        else ("scan", "doctor", "watch joints")
-    )
+    common = ("doctor", "watch joints")
+    return common if isinstance(bench.config, SerialLinesConfig) else ("scan", *common)
 
 
 def _counted(count: int, what: str) -> str:
@@ -184,8 +164,7 @@ def _require_free(link: Path) -> None:
 def bench_robot_file(config: Config, bench: DryRun, port: Path) -> Path:
     """Write a copy of robot.toml beside `port`, with the bench's ports and its own state.
 
-    Raises:
-        ConfigError: another file is there, or it cannot be written.
+    Raise ConfigError if another file is there, or it cannot be written.
     """
     file = port.with_name(f"{port.name}.toml")
     tables, _ = read_toml(config.file)
@@ -239,7 +218,7 @@ def _looking_at_servos(
 ) -> Iterator[Behind]:
     buses = {name: msgspec.structs.replace(bus, latency_ms=LATENCY_MS) for name, bus in hardware.buses.items()}
     patient = msgspec.structs.replace(hardware, buses=buses)
-    with _on_a_bench(_arm(patient, angles)) as bench, open_driver(bench.config) as servos:
+    with _on_a_bench(_arm_of(patient)(patient, angles)) as bench, open_driver(bench.config) as servos:
         yield Behind(servos, lambda: servos.read(READ_S))
 
 
@@ -252,7 +231,7 @@ def _looking_at_lines(
 
     clock = SystemClock()
     quick = msgspec.structs.replace(hardware, baud=BOARD_BAUD, delay_ms=0.0, native_usb=False)
-    arm = _arm(quick, angles, rate_hz=BOARD_RATE_HZ)
+    arm = _arm_of(quick)(quick, angles, rate_hz=BOARD_RATE_HZ)
     with _on_a_bench(arm) as bench, open_driver(bench.config) as encoders, Listener(encoders) as listener:
         yield Behind(encoders, lambda: listener.after(clock.now() + SETTLED_S, READ_S))
 

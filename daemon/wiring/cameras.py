@@ -58,8 +58,7 @@ def require_cameras(config: Config) -> CamerasConfig:
 def open_eyes(config: Config, clock: Clock) -> Eyes:
     """Return the cameras of robot.toml with unprocessed images, not opened yet.
 
-    Raises:
-        ConfigError: no cameras are configured.
+    Raise ConfigError if no cameras are configured.
     """
     return eyes_of(require_cameras(config), config.file.parent, clock)
 
@@ -83,8 +82,7 @@ def names_calibration(config: Config) -> bool:
 def camera_of(config: Config, eyes: Eyes) -> StereoCamera:
     """Return `eyes` with rectified images, not opened yet: by the calibration file, else by [camera].
 
-    Raises:
-        ConfigError: there is no calibration, or the file cannot be read.
+    Raise ConfigError if there is no calibration, or the file cannot be read.
     """
     cameras = require_cameras(config)
     if cameras.calibration is not None:
@@ -115,8 +113,7 @@ def _of_files(rig: Rig, cameras: CamerasConfig) -> Rig:
 def tracked_video(config: Config, file: Path) -> TrackedCamera:
     """Return a video of one camera with its tracker, not opened yet; lens and marker are those of robot.toml.
 
-    Raises:
-        ConfigError: there is no calibration of the camera, or the marker cannot be.
+    Raise ConfigError if there is no calibration of the camera, or the marker cannot be.
     """
     return _tracked(config, videos=VideosConfig(left=str(file.absolute()), speed=0.0))
 
@@ -130,10 +127,15 @@ def tracked_images(config: Config, folder: Path) -> TrackedCamera:
 def _tracked(config: Config, **layout: VideosConfig | ImagesConfig) -> TrackedCamera:
     given = cameras_of(config)
     cameras = CamerasConfig(calibration=None if given is None else given.calibration, **layout)  # pyright: ignore[reportArgumentType]
-    vision = msgspec.structs.replace(config.tables.vision, cameras=cameras, further_cameras=())
-    seen = config.with_tables(msgspec.structs.replace(config.tables, vision=vision))
+    seen = seen_through(config, cameras)
     camera = camera_of(seen, open_eyes(seen, SystemClock()))
-    return TrackedCamera(camera, tracker_of(camera.calibration, vision))
+    return TrackedCamera(camera, tracker_of(camera.calibration, seen.tables.vision))
+
+
+def seen_through(config: Config, cameras: CamerasConfig) -> Config:
+    """Return the configuration with `cameras` as the only ones."""
+    vision = msgspec.structs.replace(config.tables.vision, cameras=cameras, further_cameras=())
+    return config.with_tables(msgspec.structs.replace(config.tables, vision=vision))
 
 
 def require_usable(config: Config) -> None:

@@ -13,18 +13,13 @@ from bodyschema.drivers.dynamixel.bus import PROTOCOL1, Protocol2Scanner
 from bodyschema.drivers.dynamixel.config import Baud as DynamixelBaud
 from bodyschema.drivers.dynamixel.config import DynamixelConfig
 from bodyschema.drivers.dynamixel.joints import DYNAMIXEL
-from bodyschema.drivers.dynamixel.joints import open_serial as open_dynamixel
-from bodyschema.drivers.dynamixel.models import BY_NAME as DYNAMIXEL_MODELS
 from bodyschema.drivers.feetech.config import Baud as FeetechBaud
 from bodyschema.drivers.feetech.config import FeetechConfig
 from bodyschema.drivers.feetech.joints import FEETECH, FEETECH_SERVOS
-from bodyschema.drivers.feetech.joints import open_serial as open_feetech
-from bodyschema.drivers.feetech.models import BY_NAME as FEETECH_MODELS
-from bodyschema.drivers.scan import ScannedBus, Tell, scan_port, serial_ports
-from bodyschema.drivers.serial_line import adapter_latency_s
+from bodyschema.drivers.serial_line import adapter_latency_s, serial_ports
 from bodyschema.drivers.serial_lines.joints import encoder_checks as checks_of_encoders
 from bodyschema.drivers.servos.checks import servo_checks as checks_of_servos
-from bodyschema.drivers.servos.scan import PingScanner
+from bodyschema.drivers.servos.scan import PingScanner, ScannedBus, Tell, scan_port
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError
 
@@ -74,9 +69,9 @@ def require_servos(config: Config) -> Servos:
 def known_models() -> dict[str, KnownModel]:
     """Return the servo models that have a driver, by name."""
     return {
-        name: KnownModel(make.table, get_args(baud), model.zero_ticks)
-        for make, models, baud in ((DYNAMIXEL, DYNAMIXEL_MODELS, DynamixelBaud), (FEETECH, FEETECH_MODELS, FeetechBaud))
-        for name, model in models.items()
+        model.name: KnownModel(make.table, get_args(baud), model.zero_ticks)
+        for make, baud in ((DYNAMIXEL, DynamixelBaud), (FEETECH, FeetechBaud))
+        for model in make.models.values()
     }
 
 
@@ -88,8 +83,7 @@ def scanned_bauds() -> list[int]:
 def ports_to_scan(given: Sequence[str], config: Config | None) -> list[str]:
     """Return the given ports; else those of robot.toml and all USB serial ports, each once.
 
-    Raises:
-        ConfigError: there are none.
+    Raise ConfigError if there are none.
     """
     if given:
         return list(given)
@@ -136,12 +130,9 @@ def other_holders(config: Config) -> list[Holder]:
 
 def servo_checks(config: Config) -> Iterator[Check]:
     """Check the servos of robot.toml: presence, health, reading rate. Writes nothing."""
-    clock = SystemClock()
-    match require_servos(config):
-        case DynamixelConfig() as servos:
-            yield from checks_of_servos(DYNAMIXEL, servos, clock, open_dynamixel)
-        case FeetechConfig() as servos:
-            yield from checks_of_servos(FEETECH, servos, clock, open_feetech)
+    servos = require_servos(config)
+    make = DYNAMIXEL if isinstance(servos, DynamixelConfig) else FEETECH
+    yield from checks_of_servos(make, servos, SystemClock())
 
 
 def encoder_checks(config: Config) -> Iterator[Check]:

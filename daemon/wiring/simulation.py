@@ -27,8 +27,7 @@ _APART_S = 60.0  # a tracker has forgotten what it saw then
 def simulation_settings(config: Config) -> SimConfig:
     """Return the table [sim], with the marker that [vision] looks for in the hand unless [sim.camera] has another.
 
-    Raises:
-        ConfigError: the tracker does not find what the simulation would show.
+    Raise ConfigError if the tracker does not find what the simulation would show.
     """
     from bodyschema.sim_backend.config import CameraConfig
 

@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import msgspec
 import numpy as np
 
 from bodyschema.daemon.config import Config
@@ -58,7 +57,6 @@ if TYPE_CHECKING:
     from bodyschema.drivers.dynamixel.zero_force import ZeroForce
     from bodyschema.drivers.ros2.joints import Ros2Joints
     from bodyschema.interfaces.protocols import StereoCamera
-    from bodyschema.vision.cameras.config import CamerasConfig
     from bodyschema.vision.tracked_camera import TrackedCamera
 
 log = logging.getLogger(__name__)
@@ -70,19 +68,16 @@ Hardware = DynamixelConfig | FeetechConfig | SerialLinesConfig | Ros2Config | Pl
 def open_sources(config: Config, *, sim: bool) -> Iterator[Sources]:
     """Yield the sources configured in robot.toml; with `sim`, the simulation instead.
 
-    Raises:
-        ConfigError: no driver or no cameras are configured, or the simulation cannot be made of this description.
-        RecordingError: the configured recording cannot be read.
+    Raise ConfigError if no driver or no cameras are configured, or the simulation cannot be made of this description.
+    Raise RecordingError if the configured recording cannot be read.
     """
     _require_source(config, sim=sim)
-    recording = None if sim else _recording(config)
-    if recording is not None:
-        yield _recorded(config, recording)
-    elif not sim:
-        yield _real(config)
-    else:
+    recording = config.tables.drivers.recording
+    if sim:
         with _simulated(config) as sources:
             yield sources
+    else:
+        yield _real(config) if recording is None else _recorded(config, config.file.parent / recording)
 
 
 def check_sources(config: Config, *, sim: bool) -> None:
@@ -96,8 +91,7 @@ def check_sources(config: Config, *, sim: bool) -> None:
 def open_joints(config: Config, clock: Clock) -> EncoderJoints:
     """Return only the encoders of the arm described in robot.toml, not opened yet.
 
-    Raises:
-        ConfigError: no servos and no ROS 2 robot are configured, or zero-force or gaze do not fit the robot.
+    Raise ConfigError if no servos and no ROS 2 robot are configured, or zero-force or gaze do not fit the robot.
     """
     hardware = config.tables.drivers.hardware
     if hardware is None:
@@ -116,8 +110,7 @@ def driver_of(hardware: Hardware, config: Config, clock: Clock, *, last_pose: li
     Args:
         last_pose: joint angles of the newest pair [rad]; None if unknown.
     """
-    joints = config.robot.joints
-    limits = list(zip(config.robot.lower.tolist(), config.robot.upper.tolist(), strict=True))
+    joints, limits = config.robot.joints, config.robot.limits
     match hardware:
         case DynamixelConfig():
             from bodyschema.drivers.dynamixel.joints import DynamixelJoints
@@ -201,11 +194,6 @@ def connected_cameras() -> list[str]:
     return connected()
 
 
-def _recording(config: Config) -> Path | None:
-    recording = config.tables.drivers.recording
-    return None if recording is None else config.file.parent / recording
-
-
 def require_simulation() -> None:
     """Raise ConfigError with the command to type when the simulation's packages are not installed."""
     require_extra("sim", "the simulation")
@@ -249,6 +237,8 @@ def _open_marker(
     calibration = picture = None
     healths: list[TellsHealth] = [*streams]
     if config.tables.vision.cameras is not None:
+        from .cameras import seen_through
+
         cameras, eyes, calibration, picture = _tracked_cameras(config, clock)
         further = config.tables.vision.further_cameras
         if not tables and not further:
@@ -256,7 +246,7 @@ def _open_marker(
         members.insert(0, Member("cameras", cameras, np.eye(4)))
         healths.insert(0, eyes)
         for place, table in enumerate(further, 1):
-            others, health, _, _ = _tracked_cameras(_seen_through(config, table), clock)
+            others, health, _, _ = _tracked_cameras(seen_through(config, table), clock)
             members.insert(place, Member(table.name, others, table.pose))
             healths.insert(place, health)
     for place, member in enumerate(members):
@@ -264,12 +254,6 @@ def _open_marker(
         healths[place] = JoinedHealth([reopening, healths[place]])
     fused = FusedMarkers(members, clock)
     return fused, JoinedHealth([fused, *healths]), calibration, picture
-
-
-def _seen_through(config: Config, cameras: CamerasConfig) -> Config:
-    """Return the configuration with `cameras` as the only ones."""
-    vision = msgspec.structs.replace(config.tables.vision, cameras=cameras, further_cameras=())
-    return config.with_tables(msgspec.structs.replace(config.tables, vision=vision))
 
 
 def _seen_by(config: Config) -> str:
@@ -350,21 +334,19 @@ def _simulated(config: Config) -> Iterator[Sources]:
     settings = exact_encoders(settings) if on_bench else settings
     with SimWorld(config.robot, settings, config.simulation) as world:
         marker = _tracked(world.camera, config)
-        joints = _through_bench(config, world.joints) if on_bench else world.joints
+        joints: JointSource = world.joints
+        if on_bench:
+            joints = through_bench(
+                config, joints, lambda hardware: driver_of(hardware, config, SystemClock(), last_pose=None)
+            )
         yield Sources(joints, marker, world.clock, world, picture=marker.picture)
-
-
-def _through_bench(config: Config, joints: JointSource) -> JointSource:
-    """Return the simulation's joints, read by the driver configured in robot.toml."""
-    return through_bench(config, joints, lambda hardware: driver_of(hardware, config, SystemClock(), last_pose=None))
 
 
 @contextmanager
 def open_postures(config: Config, count: int) -> Iterator[Sources]:
     """Yield the simulation's sources with the robot at rest in `count` independently sampled postures.
 
-    Raises:
-        ConfigError: the simulation cannot be made of this description.
+    Raise ConfigError if the simulation cannot be made of this description.
     """
     require_simulation()
     from bodyschema.sim_backend.posed import PosedWorld, visible_postures
@@ -413,8 +395,7 @@ def stream_of(table: AnySource, clock: Clock) -> MarkerStream:
 def holding_torques(robot: RobotDescription) -> Callable[[FloatArray], FloatArray]:
     """Return a function from joint angles [rad] (d,) to gravity torques [N·m] (d,), by the URDF's masses.
 
-    Raises:
-        ConfigError: the URDF states no masses that a joint bears.
+    Raise ConfigError if the URDF states no masses that a joint bears.
     """
     load = GravityLoad(robot)
     if not load.known:
@@ -429,8 +410,7 @@ def holding_torques(robot: RobotDescription) -> Callable[[FloatArray], FloatArra
 def open_drives(config: Config, servos: DynamixelConfig, clock: Clock) -> tuple[ZeroForce | Gaze, ...]:
     """Return the drives that may move the joints: those that robot.toml names, inactive until a person asks.
 
-    Raises:
-        ConfigError: the URDF states no masses, or robot.toml says that the arm is held in another way.
+    Raise ConfigError if the URDF states no masses, or robot.toml says that the arm is held in another way.
     """
     joints, drives = config.robot.joints, []
     _check_hold(config, servos)
@@ -442,8 +422,7 @@ def open_drives(config: Config, servos: DynamixelConfig, clock: Clock) -> tuple[
     if servos.gaze is not None:
         from bodyschema.drivers.dynamixel.gaze import Gaze
 
-        limits = list(zip(config.robot.lower.tolist(), config.robot.upper.tolist(), strict=True))
-        drives.append(Gaze(servos.gaze, joints, limits, clock))
+        drives.append(Gaze(servos.gaze, joints, config.robot.limits, clock))
     return tuple(drives)
 
 

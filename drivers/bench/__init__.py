@@ -3,5 +3,3 @@
 Behind the port is a `device.Device`: a chain of servos (`drivers/dynamixel/bench`, `drivers/feetech/bench`) or encoders
 that send on their own (`drivers/serial_lines/bench`).
 """
-
-from __future__ import annotations

@@ -60,12 +60,9 @@ class AskedFault:
 
     @classmethod
     def parsed(cls, text: str, joints: Collection[str], kinds: FaultKinds) -> AskedFault:
-        """Parse `KIND[@JOINT][=SHARE]`.
+        """Parse `KIND[@JOINT][=SHARE]`. Raise ConfigError for an unknown kind or joint, or a share.
 
         A wire fault with a joint affects every answer of its servo; without a joint it affects 2 % of all answers.
-
-        Raises:
-            ConfigError: unknown kind or joint, or the share is not a probability.
         """
         named, _, share = text.partition("=")
         kind, _, joint = named.partition("@")
@@ -108,7 +105,6 @@ class WireFaults:
         return cls(strike, Random(rng.random()))
 
     def __call__(self, reply: Reply) -> Reply:
-        """Return the answer as it arrives."""
         for id, share, fault in self._faults:
             if reply.data and id in (None, reply.id) and self._rng.random() < share:
                 reply = fault(reply, self._rng)

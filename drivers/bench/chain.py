@@ -15,7 +15,9 @@ BAUD_TOLERANCE = 0.03
 
 
 class AnyServo(Protocol):
-    """Interface of a servo on a chain."""
+    """Interface of an emulated servo, which can be tampered with."""
+
+    glitch_ticks: int
 
     @property
     def id(self) -> int:
@@ -38,7 +40,12 @@ class AnyServo(Protocol):
 
     def reboot(self, t: float) -> None:
         """Restart as after a power cycle."""
-        ...
+
+    def __setitem__(self, name: str, value: int) -> None:
+        """Write a register as the servo itself does, bypassing all locks."""
+
+    def fail(self, bits: int) -> None:
+        """Report a hardware error until the servo is rebooted."""
 
 
 ServoT = TypeVar("ServoT", bound=AnyServo)
@@ -62,7 +69,6 @@ class ServoChain(OnlyAnswers, ABC, Generic[ServoT]):
     """Bytes of a status packet apart from its data."""
 
     def __init__(self, servos: Iterable[ServoT], faults: Faults = no_faults) -> None:
-        """Create a chain with its power on."""
         self.servos = list(servos)
         self.faults = faults
         self.samplings: dict[int, Sampling] = {}
@@ -146,11 +152,8 @@ class ServoChain(OnlyAnswers, ABC, Generic[ServoT]):
             there = [s for s in servos if s.id == id]
             reply = self._together(there, t, lambda s, now, a=address, n=size: self._read(s, a, n, now), code)
             replies += reply
-            t = (
-                reply[0].start + len(reply[0].data) * self._byte_s
-                if reply
-                else t + (size + self.overhead) * self._byte_s
-            )
+            begin, count = (reply[0].start, len(reply[0].data)) if reply else (t, size + self.overhead)
+            t = begin + count * self._byte_s
         return replies
 
 

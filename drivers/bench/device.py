@@ -29,10 +29,8 @@ class Reply:
 Fault = Callable[[Reply, Random], Reply]
 
 
-class Faults(Protocol):
-    """Function that applies faults to each answer."""
-
-    def __call__(self, reply: Reply) -> Reply: ...
+Faults = Callable[[Reply], Reply]
+"""Applies faults to each answer."""
 
 
 def no_faults(reply: Reply) -> Reply:
@@ -60,10 +58,7 @@ class Device(Protocol):
 class OnlyAnswers:
     """A device that never sends on its own."""
 
-    @property
-    def speaks_at(self) -> float:
-        """Infinity: never."""
-        return math.inf
+    speaks_at = math.inf
 
     def speak(self, until: float, baud: int) -> list[Reply]:
         """Return an empty list."""

@@ -15,7 +15,7 @@ from .pty_shell import PtyShell
 
 EVERY_S = 10.0  # period of recurring faults
 UNPLUGGED_S = 3.0
-GLITCH_S = 0.1
+GLITCH_S, GLITCH_TICKS = 0.1, 700
 
 Angle = Callable[[float], float]
 Event = tuple[float, str, Callable[[], None]]
@@ -62,24 +62,16 @@ class DryRun:
         shells: pseudo-terminals, by name of the bus.
     """
 
-    def __init__(
-        self,
-        arm: BenchArm,
-        links: Mapping[str, Path],
-        *,
-        faults: Sequence[AskedFault] = (),
-        now: Callable[[], float] = time.monotonic,
-    ) -> None:
+    def __init__(self, arm: BenchArm, links: Mapping[str, Path], *, faults: Sequence[AskedFault] = ()) -> None:
         """Prepare the ports without opening them.
 
         Args:
             links: by bus, the path of its port.
             faults: the recurring ones are played here; all others belong to the arm.
-            now: the clock [s].
         """
-        self.arm, self._faults, self._now = arm, tuple(faults), now
+        self.arm, self._faults = arm, tuple(faults)
         self._opened = ExitStack()
-        self.shells = {name: PtyShell(device, links[name], now) for name, device in arm.devices.items()}
+        self.shells = {name: PtyShell(device, links[name]) for name, device in arm.devices.items()}
         self.config = arm.at_ports({name: str(link) for name, link in links.items()})
 
     def __enter__(self) -> Self:
@@ -105,7 +97,7 @@ class DryRun:
             yield EVERY_S, "unplugged", lambda: self._each(PtyShell.unplug)
             yield UNPLUGGED_S, "plugged in again", lambda: self._each(PtyShell.plug_in)
         elif fault.kind == "power-cycle":
-            yield EVERY_S, "the power is lost and comes back", lambda: self.arm.power_cycle(self._now())
+            yield EVERY_S, "the power is lost and comes back", lambda: self.arm.power_cycle(time.monotonic())
         else:
             yield EVERY_S, f"the encoder of {joint} is wrong for a moment", lambda: self.arm.glitch(joint, True)
             yield GLITCH_S, f"the encoder of {joint} is right again", lambda: self.arm.glitch(joint, False)

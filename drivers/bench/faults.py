@@ -56,7 +56,6 @@ class Planned:
     """Faults of chosen servos, each for a given number of answers."""
 
     def __init__(self, rng: Random | None = None) -> None:
-        """Start without faults."""
         self._rng = Random(0) if rng is None else rng
         self._plan: dict[int, tuple[Fault, int | None]] = {}
 
@@ -69,7 +68,6 @@ class Planned:
         self._plan.clear()
 
     def __call__(self, reply: Reply) -> Reply:
-        """Return the answer as it arrives."""
         if reply.id not in self._plan:
             return reply
         fault, times = self._plan[reply.id]
@@ -93,14 +91,12 @@ class Storm:
 
         Args:
             shares: by name, the probability that an answer is affected, and the fault.
-            rng: source of randomness.
         """
         self._shares, self._rng = dict(shares), rng
         self._total = sum(share for share, _ in self._shares.values())
         self.struck = dict.fromkeys(self._shares, 0)
 
     def __call__(self, reply: Reply) -> Reply:
-        """Return the answer as it arrives."""
         drawn = self._rng.random()
         if drawn >= self._total:
             return reply

@@ -36,7 +36,6 @@ class PtyShell:
         """Prepare the port without opening it.
 
         Args:
-            device: the device to serve.
             link: path of the port, a symbolic link.
             now: the clock of the device; it has to run at the rate of the machine's clock.
         """

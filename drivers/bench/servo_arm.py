@@ -8,17 +8,17 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from random import Random
-from typing import Any, ClassVar, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import msgspec
 import numpy as np
 
-from bodyschema.drivers.bench.dry_run import Angle
+from bodyschema.drivers.bench.dry_run import GLITCH_TICKS, Angle
 from bodyschema.drivers.servos.config import ServoConfig, ServosConfig
 from bodyschema.interfaces.records import FloatArray, frozen_array
 
 from .asked_faults import AskedFault, FaultKinds, WireFaults
-from .chain import AnyServo, ServoChain
+from .chain import ServoChain, ServoT
 from .device import Faults
 from .dry_run import BenchArm
 
@@ -33,7 +33,6 @@ class _Settings:
     phase_rad: float = 2.4
     widest_rad: float = 1.0
     share_of_range: float = 0.35
-    glitch_ticks: int = 700
     # shaft angle of a second servo with the same ID
     twin_rad: float = 0.1
 
@@ -65,9 +64,7 @@ def swinging(limits: Sequence[tuple[float, float]], begin_s: float) -> list[Angl
     def joint(place: int, lower: float, upper: float) -> Angle:
         bounded = math.isfinite(lower) and math.isfinite(upper)
         middle = (lower + upper) / 2 if bounded else 0.0
-        width = (
-            min(_SETTINGS.share_of_range * (upper - lower), _SETTINGS.widest_rad) if bounded else _SETTINGS.widest_rad
-        )
+        width = min(_SETTINGS.share_of_range * (upper - lower), _SETTINGS.widest_rad)  # infinite where not bounded
         pace = 2 * math.pi / (_SETTINGS.slowest_s * (0.6 + 0.4 / (place + 1)))
         return lambda t: middle + width * math.sin(pace * (t - begin_s) + _SETTINGS.phase_rad * place)
 
@@ -77,21 +74,6 @@ def swinging(limits: Sequence[tuple[float, float]], begin_s: float) -> list[Angl
 AT_THE_START = ("baud", "double", "torque")
 
 
-class BenchServo(AnyServo, Protocol):
-    """An emulated servo that can be tampered with."""
-
-    glitch_ticks: int
-
-    def __setitem__(self, name: str, value: int) -> None:
-        """Write a register as the servo itself does, bypassing all locks."""
-        ...
-
-    def fail(self, bits: int) -> None:
-        """Report a hardware error until the servo is rebooted."""
-        ...
-
-
-ServoT = TypeVar("ServoT", bound=BenchServo)
 ConfigT = TypeVar("ConfigT", bound=ServosConfig[Any])
 
 
@@ -122,10 +104,8 @@ class ServoArm(BenchArm, Generic[ServoT, ConfigT]):
         Args:
             config: checked configuration.
             angles: by joint, its angle as a function of time [rad].
-            faults: those to apply.
             return_delay_s: return delay of all servos.
             seed: of the faults on the wire.
-            now: the clock [s].
         """
         self._config, self._return_delay_s, self._rng, self._now = config, return_delay_s, Random(seed), now
         self._servos: dict[str, ServoT] = {}
@@ -155,12 +135,10 @@ class ServoArm(BenchArm, Generic[ServoT, ConfigT]):
 
     @property
     def devices(self) -> Mapping[str, ServoChain[ServoT]]:
-        """Device behind each port, by name of the bus."""
         return self.chains
 
     @property
     def count(self) -> int:
-        """Number of packets the servos understood."""
         return sum(chain.instructions for chain in self.chains.values())
 
     def servo(self, joint: str) -> ServoT:
@@ -168,16 +146,13 @@ class ServoArm(BenchArm, Generic[ServoT, ConfigT]):
         return self._servos[joint]
 
     def at_ports(self, ports: Mapping[str, str]) -> ConfigT:
-        """Return the configuration with other ports, given by name of the bus."""
         buses = {name: msgspec.structs.replace(bus, port=ports[name]) for name, bus in self._config.buses.items()}
         return msgspec.structs.replace(self._config, buses=buses)
 
     def glitch(self, joint: str, is_wrong: bool) -> None:
-        """Start or end an encoder error of one joint."""
-        self._servos[joint].glitch_ticks = _SETTINGS.glitch_ticks if is_wrong else 0
+        self._servos[joint].glitch_ticks = GLITCH_TICKS if is_wrong else 0
 
     def power_cycle(self, t: float) -> None:
-        """Cut the power of all servos and restore it at `t`."""
         for chain in self.chains.values():
             chain.power_cycle(t)
 

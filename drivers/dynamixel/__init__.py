@@ -1,3 +1,1 @@
 """Driver for Dynamixel servos, with an emulator in `bench`."""
-
-from __future__ import annotations

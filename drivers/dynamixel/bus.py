@@ -6,15 +6,15 @@ from collections.abc import Mapping, Sequence
 
 from bodyschema.drivers.dynamixel.models import BY_NUMBER, HARDWARE_ERRORS, UNSUPPORTED
 from bodyschema.drivers.dynamixel.packets import BROADCAST, PACKETS2, Version
-from bodyschema.drivers.scan import ScannedPort
+from bodyschema.drivers.echo import HOST_S, Port
 from bodyschema.drivers.servos.bus import BITS_PER_BYTE, Answer, Exchange, Request, Trouble, spare_after
 from bodyschema.drivers.servos.bus import Bus as ServoBus
 from bodyschema.drivers.servos.model import Layout, Register
 from bodyschema.drivers.servos.packets import Packets
-from bodyschema.drivers.servos.scan import HOST_S, IDS, Kind, PingScanner, heard
+from bodyschema.drivers.servos.scan import IDS, Kind, PingScanner, heard
 from bodyschema.interfaces.protocols import Clock
 
-from .models import FAST_HEADER, FASTEST1, PING2
+from .models import FAST_HEADER, FASTEST1, PING_SLOT_S
 from .packets import packets_of
 
 __all__ = ["Answer", "Bus", "Exchange", "Request", "Trouble", "sync_request"]
@@ -66,7 +66,6 @@ class Bus(ServoBus):
 
 
 LIKELY_FIRST = (1_000_000, 57_600, 2_000_000, 115_200, 3_000_000, 4_000_000, 9_600)
-SLOT_S = 3e-3  # a servo of Protocol 2.0 waits this long for each ID below its own
 
 
 def _kind(version: Version) -> Kind:
@@ -93,14 +92,14 @@ class Protocol2Scanner(PingScanner):
     """
 
     def __init__(self) -> None:
-        super().__init__(PROTOCOL2, question=PING2)
+        super().__init__(PROTOCOL2)
 
-    def _ids(self, port: ScannedPort, clock: Clock, latency_s: float) -> list[int]:
-        if self._spacing_s(port.baud) < SLOT_S:
+    def _ids(self, port: Port, clock: Clock, latency_s: float) -> list[int]:
+        if self._spacing_s(port.baud) < PING_SLOT_S:
             return super()._ids(port, clock, latency_s)
         port.flush()
         port.write(PACKETS2.ping(BROADCAST))
         wire_s = sum(self._ping_sizes) * BITS_PER_BYTE / port.baud
-        received = heard(port, clock, clock.now() + len(IDS) * SLOT_S + 2 * latency_s + HOST_S + wire_s)
+        received = heard(port, clock, clock.now() + len(IDS) * PING_SLOT_S + 2 * latency_s + HOST_S + wire_s)
         statuses, is_clean = self._statuses(received)
         return sorted({status.id for status in statuses}) if is_clean else super()._ids(port, clock, latency_s)

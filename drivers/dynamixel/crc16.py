@@ -19,8 +19,7 @@ _TABLE = tuple(_remainder(byte) for byte in range(256))
 
 
 @cache
-def _table_of_words() -> tuple[int, ...]:
-    """Return the checksum of every two bytes: this halves the number of steps."""
+def _table_of_words() -> tuple[int, ...]:  # half as many steps
     return tuple((rest << 8 & 0xFF00) ^ _TABLE[rest >> 8 ^ low] for rest in _TABLE for low in range(256))
 
 

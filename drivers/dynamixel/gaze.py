@@ -38,10 +38,8 @@ class Gaze(PoweredJoints):
         """Start with torque off.
 
         Args:
-            gaze: its table.
             joints: all, in the order of q.
             limits: of all joints [rad]; the narrower of these and the table's apply.
-            clock: the clock.
         """
         self._head = [joint for joint in joints if joint in gaze.joints]
         count, speed = len(self._head), math.radians(gaze.max_speed_deg_s)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -88,7 +89,6 @@ class Guard:
     """
 
     def __init__(self, limits: GuardLimits) -> None:
-        """Start in the state that rejects everything."""
         self._limits = limits
         self._why: str | None = "it was not begun"
         self._checked_s = -math.inf
@@ -104,23 +104,26 @@ class Guard:
 
     def check(self, now: float, motion: Motion | None) -> None:
         """Check one cycle at `now` [s]; `motion` is None when the reading was rejected. Raise Drop on a violation."""
-        try:
+        with self._lasting():
             self._check(now, motion)
-        except Drop as drop:
-            self._why = str(drop)
-            raise
 
     def check_servo(self, joint: str, state: ServoState) -> None:
         """Check the reported state of one servo, at intervals. Raise Drop on a violation."""
-        try:
+        with self._lasting():
             self._check_servo(joint, state)
+
+    @contextmanager
+    def _lasting(self) -> Iterator[None]:
+        """Raise Drop after any violation, and make one that is found permanent."""
+        if self._why is not None:
+            raise Drop(self._why)
+        try:
+            yield
         except Drop as drop:
             self._why = str(drop)
             raise
 
     def _check(self, now: float, motion: Motion | None) -> None:
-        if self._why is not None:
-            raise Drop(self._why)
         late_s, self._checked_s = now - self._checked_s, now
         if not 0 <= late_s <= self._limits.heartbeat_s:
             raise Drop(
@@ -177,8 +180,6 @@ class Guard:
                 )
 
     def _check_servo(self, joint: str, state: ServoState) -> None:
-        if self._why is not None:
-            raise Drop(self._why)
         if state.trouble:
             raise Drop(f"joint {joint!r}: {state.trouble}")
         if state.watchdog < 0:
@@ -225,8 +226,7 @@ class Currents:
     def at(self, now: float, torques: FloatArray) -> FloatArray:
         """Return the currents [A] (n,) for the torques that hold the arm [N·m] (n,).
 
-        Raises:
-            Drop: the torques are not finite.
+        Raise Drop if the torques are not finite.
         """
         if torques.shape != self._limit.shape or not np.isfinite(torques).all():
             raise Drop("the model gives no torque for where the arm is. Look at the URDF's masses and joint limits")

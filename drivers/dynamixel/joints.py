@@ -5,35 +5,35 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Iterator, Sequence
+from typing import get_args
 
 from bodyschema.drivers.device_clock import DeviceClock
 from bodyschema.drivers.dynamixel.bus import Bus, sync_request
-from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig
+from bodyschema.drivers.dynamixel.config import Baud, BusConfig, DynamixelConfig
 from bodyschema.drivers.dynamixel.models import BY_NUMBER, HARDWARE_ERRORS, LAYOUT_MX1, TICK_S, TICKS, baud_value
 from bodyschema.drivers.dynamixel.packets import ALERT
-from bodyschema.drivers.dynamixel.port import SafePort
-from bodyschema.drivers.serial_line import adapter_latency_s
 from bodyschema.drivers.servos.bus import Answer
 from bodyschema.drivers.servos.bus import Bus as ServoBus
 from bodyschema.drivers.servos.channel import Channel as ServoChannel
-from bodyschema.drivers.servos.channel import Drive, Sample
+from bodyschema.drivers.servos.channel import Sample
 from bodyschema.drivers.servos.handshake import IdentifiedServo
-from bodyschema.drivers.servos.joints import OpenPort, ServoJoints
-from bodyschema.drivers.servos.model import Layout, Model, Register
-from bodyschema.drivers.servos.port import Port
-from bodyschema.drivers.servos.settings import BAUD, HOMING_OFFSET, ID, Setting
-from bodyschema.drivers.servos.vendor import ServoVendor, Way
-from bodyschema.interfaces.protocols import Clock
+from bodyschema.drivers.servos.joints import ServoJoints
+from bodyschema.drivers.servos.model import Model, Register
+from bodyschema.drivers.servos.settings import (
+    BAUD,
+    HOMING_OFFSET,
+    ID,
+    LARGEST_ID,
+    OTHER_RATE,
+    OTHER_ZERO,
+    RENAMED,
+    Setting,
+)
+from bodyschema.drivers.servos.vendor import ServoVendor, Way, one_by_one
 
 from .models import BAUDS1, CURRENT_MODES, MODES, NEAR_OFFSET, NUMBER1, SIGN1
 
-BAUDS2 = (9600, 57_600, 115_200, 1_000_000, 2_000_000, 3_000_000, 4_000_000)
 FARTHEST_OFFSET = 1_044_479  # 255 turns
-LARGEST_ID = 252
-
-RENAMED = "set id in robot.toml"
-OTHER_RATE = "set baud in robot.toml; all servos of a bus need the same"
-OTHER_ZERO = "the joint's zero moves: pairs measured before do not fit those after"
 
 
 def settings_of(model: Model) -> Sequence[Setting]:
@@ -44,7 +44,7 @@ def settings_of(model: Model) -> Sequence[Setting]:
 
 def _common(model: Model) -> Iterator[Setting]:
     layout = model.layout
-    bauds = BAUDS1 if model.protocol == 1 else BAUDS2
+    bauds = BAUDS1 if model.protocol == 1 else get_args(Baud)
     yield Setting(ID, layout["id"], 0, LARGEST_ID, follows=RENAMED)
     yield Setting(
         BAUD, layout["baud"], 0, 254, {str(baud): baud_value(layout, baud) for baud in bauds}, follows=OTHER_RATE
@@ -57,7 +57,13 @@ def _of_protocol2(model: Model) -> Iterator[Setting]:
     layout, degrees = model.layout, math.degrees(model.rad_per_tick)
     yield from _common(model)
     yield Setting("drive_mode", layout["drive_mode"], 0, 0x0D, follows=f"bit 0: it counts the other way; {OTHER_ZERO}")
-    yield Setting("operating_mode", layout["operating_mode"], 0, 16, _modes(model), follows=_turns(model))
+    modes = MODES | (dict(CURRENT_MODES) if model.current_unit is not None else {})
+    turns = "its turn count may be lost"
+    if model.series == "P":
+        modes.pop("current_position", None)
+    else:
+        turns += f"; in position mode a homing_offset beyond ±{NEAR_OFFSET} is ignored"
+    yield Setting("operating_mode", layout["operating_mode"], 0, 16, modes, follows=turns)
     yield Setting("secondary_id", Register(12, 1), 0, 255, follows="above 252: none")
     farthest = FARTHEST_OFFSET if model.series != "P" else 2**31 - 1
     homing = (layout["homing_offset"], -farthest, farthest)
@@ -73,18 +79,6 @@ def _of_protocol2(model: Model) -> Iterator[Setting]:
     bounds = (0, 4095) if model.series != "P" else (-(2**31), 2**31 - 1)
     yield Setting("max_position_limit", Register(48, 4, signed=True), *bounds)
     yield Setting("min_position_limit", Register(52, 4, signed=True), *bounds)
-
-
-def _modes(model: Model) -> dict[str, int]:
-    with_current = dict(CURRENT_MODES) if model.current_unit is not None else {}
-    if model.series == "P":
-        with_current.pop("current_position", None)
-    return with_current | MODES
-
-
-def _turns(model: Model) -> str:
-    near = "" if model.series == "P" else f"; in position mode a homing_offset beyond ±{NEAR_OFFSET} is ignored"
-    return f"its turn count may be lost{near}"
 
 
 def _of_protocol1(model: Model) -> Iterator[Setting]:
@@ -116,7 +110,6 @@ class Channel(ServoChannel):
     """The answers of one servo since the bus was opened."""
 
     def __init__(self, servo: IdentifiedServo) -> None:
-        """Start without answers."""
         super().__init__(servo)
         self._clock = DeviceClock(TICK_S, TICKS)
 
@@ -158,59 +151,22 @@ def ways_of(bus: ServoBus, servos: Sequence[IdentifiedServo], config: BusConfig)
     for servo in servos:
         if servo.model.protocol == 2:
             series.setdefault(servo.model.layout.block.address, []).append(servo)
-    groups = [
-        _ways_of_series(group[0].model.layout, [servo.id for servo in group], try_fast=config.fast_sync_read == "auto")
-        for group in series.values()
-    ]
-    if alone:
-        requests = (bus.read_request(servo.model, servo.id, servo.model.layout.block) for servo in alone)
-        groups.insert(0, [Way("one by one", tuple(requests))])
+    groups = [[one_by_one(bus, alone)]] if alone else []
+    for group in series.values():
+        layout, ids = group[0].model.layout, [servo.id for servo in group]
+        ways = [Way("Sync Read", (sync_request(layout, ids, fast=False),))]
+        if len(ids) > 1 and config.fast_sync_read == "auto":
+            ways.insert(0, Way("Fast Sync Read", (sync_request(layout, ids, fast=True),)))
+        groups.append(ways)
     return groups
 
 
-def _ways_of_series(layout: Layout, ids: Sequence[int], *, try_fast: bool) -> list[Way]:
-    sync = Way("Sync Read", (sync_request(layout, ids, fast=False),))
-    if len(ids) < 2 or not try_fast:
-        return [sync]
-    return [Way("Fast Sync Read", (sync_request(layout, ids, fast=True),)), sync]
-
-
-def open_serial(config: BusConfig, clock: Clock) -> tuple[Port, float]:
-    """Open the port of a bus; return it and the latency of its adapter [s]."""
-    latency_s = adapter_latency_s(config.port) if config.latency_ms is None else config.latency_ms * 1e-3
-    port = SafePort(config.port, config.baud, latency_s=latency_s, now=clock.now)
-    port.openPort()
-    return port, latency_s
-
-
 DYNAMIXEL = ServoVendor(
-    DynamixelConfig.table,
-    BY_NUMBER,
-    HARDWARE_ERRORS,
-    Bus,
-    Channel,
-    ways_of,
-    settings_of,
-    1,
-    TICK_S,
+    DynamixelConfig.table, BY_NUMBER, HARDWARE_ERRORS, Bus, Channel, ways_of, settings_of, tick_s=TICK_S
 )
 
 
 class DynamixelJoints(ServoJoints):
     """An arm of Dynamixel servos as a `JointSource`; see `ServoJoints`."""
 
-    def __init__(
-        self,
-        config: DynamixelConfig,
-        joints: Sequence[str],
-        clock: Clock,
-        *,
-        limits: Sequence[tuple[float, float]] | None = None,
-        last_pose: Sequence[float] | None = None,
-        open_port: OpenPort = open_serial,
-        drives: Sequence[Drive] = (),
-    ) -> None:
-        """Prepare without opening anything; arguments as in `ServoJoints`."""
-        super().__init__(
-            DYNAMIXEL, config, joints, clock, open_port=open_port, limits=limits, last_pose=last_pose, drives=drives
-        )
+    make = DYNAMIXEL

@@ -190,7 +190,7 @@ NEAR_OFFSET = 1024  # a larger one is ignored in position mode
 SIGN1, NUMBER1 = 0x400, 0x3FF  # sign and magnitude of Protocol 1.0
 FAST_HEADER = 8  # bytes before the first servo's part
 FASTEST1 = 3_000_000  # of Protocol 1.0
-PING2 = 10  # bytes
+PING_SLOT_S = 3e-3  # a servo of Protocol 2.0 waits this long for each ID below its own to answer a broadcast PING
 # By model: torque [N·m] and the corresponding current [A].
 TORQUE_AT_CURRENT: Mapping[str, tuple[float, float]] = MappingProxyType(
     {

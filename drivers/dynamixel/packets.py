@@ -6,7 +6,7 @@ partial answers, and reads past garbage.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from typing import Any, Literal
 
@@ -31,16 +31,19 @@ class _Caught:
     is_using = False
     packet = b""
 
-    def clearPort(self) -> None:
-        """Do nothing."""
+    def clearPort(self) -> None: ...
+
+    def setPacketTimeout(self, length: int) -> None: ...
 
     def writePort(self, packet: list[int]) -> int:
-        """Store the packet."""
         self.packet = bytes(packet)
         return len(packet)
 
-    def setPacketTimeout(self, length: int) -> None:
-        """Do nothing."""
+
+def _built(send: Callable[[_Caught], object]) -> bytes:
+    port = _Caught()
+    send(port)
+    return port.packet
 
 
 class Packets2:
@@ -55,20 +58,17 @@ class Packets2:
     _sdk: Any = sdk.PacketHandler(2.0)
 
     def ping(self, id: int) -> bytes:
-        """Build PING."""
-        return self._of(lambda port: self._sdk.txPacket(port, [0, 0, 0, 0, id, 3, 0, PING, 0, 0]))
+        return _built(lambda port: self._sdk.txPacket(port, [0, 0, 0, 0, id, 3, 0, PING, 0, 0]))
 
     def reboot(self, id: int) -> bytes:
         """Build REBOOT."""
-        return self._of(lambda port: self._sdk.txPacket(port, [0, 0, 0, 0, id, 3, 0, REBOOT, 0, 0]))
+        return _built(lambda port: self._sdk.txPacket(port, [0, 0, 0, 0, id, 3, 0, REBOOT, 0, 0]))
 
     def read(self, id: int, address: int, size: int) -> bytes:
-        """Build READ."""
-        return self._of(lambda port: self._sdk.readTx(port, id, address, size))
+        return _built(lambda port: self._sdk.readTx(port, id, address, size))
 
     def write(self, id: int, address: int, data: bytes) -> bytes:
-        """Build WRITE."""
-        packet = self._of(lambda port: self._sdk.writeTxOnly(port, id, address, len(data), list(data)))
+        packet = _built(lambda port: self._sdk.writeTxOnly(port, id, address, len(data), list(data)))
         return _stuffed(packet) if len(packet) == len(data) + 12 else packet
 
     def sync_read(self, ids: Sequence[int], address: int, size: int, *, fast: bool) -> bytes:
@@ -78,16 +78,10 @@ class Packets2:
     def sync_write(self, address: int, size: int, data: Mapping[int, bytes]) -> bytes:
         """Build SYNC_WRITE of `size` bytes to each ID. It is not acknowledged."""
         params = [byte for id, bytes_ in data.items() for byte in (id, *bytes_)]
-        packet = self._of(lambda port: self._sdk.syncWriteTxOnly(port, address, size, params, len(params)))
+        packet = _built(lambda port: self._sdk.syncWriteTxOnly(port, address, size, params, len(params)))
         return _stuffed(packet) if len(packet) == len(params) + 14 else packet
 
-    def _of(self, send: Any) -> bytes:
-        port = _Caught()
-        send(port)
-        return port.packet
-
     def take(self, received: bytes | bytearray, at: int) -> Status | None:
-        """Return the status packet that begins at `at`; see `Packets.take`."""
         packet = self._complete(received, at)
         if packet is None:
             return None
@@ -143,24 +137,15 @@ class Packets1:
     _sdk: Any = sdk.PacketHandler(1.0)
 
     def ping(self, id: int) -> bytes:
-        """Build PING."""
-        return self._of(lambda port: self._sdk.txPacket(port, [0, 0, id, 2, PING, 0]))
+        return _built(lambda port: self._sdk.txPacket(port, [0, 0, id, 2, PING, 0]))
 
     def read(self, id: int, address: int, size: int) -> bytes:
-        """Build READ."""
-        return self._of(lambda port: self._sdk.readTx(port, id, address, size))
+        return _built(lambda port: self._sdk.readTx(port, id, address, size))
 
     def write(self, id: int, address: int, data: bytes) -> bytes:
-        """Build WRITE."""
-        return self._of(lambda port: self._sdk.writeTxOnly(port, id, address, len(data), list(data)))
-
-    def _of(self, send: Any) -> bytes:
-        port = _Caught()
-        send(port)
-        return port.packet
+        return _built(lambda port: self._sdk.writeTxOnly(port, id, address, len(data), list(data)))
 
     def take(self, received: bytes | bytearray, at: int) -> Status | None:
-        """Return the status packet that begins at `at`; see `Packets.take`."""
         return take_summed(received, at)
 
 
@@ -170,7 +155,7 @@ PACKETS2, PACKETS1 = Packets2(), Packets1()
 @cache
 def _sync_read(ids: tuple[int, ...], address: int, size: int, fast: bool) -> bytes:
     """Build the packet once: every reading sends the same."""
-    return PACKETS2._of(lambda port: PACKETS2._sdk.syncReadTx(port, address, size, list(ids), len(ids), fast))
+    return _built(lambda port: PACKETS2._sdk.syncReadTx(port, address, size, list(ids), len(ids), fast))
 
 
 def packets_of(protocol: int) -> Packets:

@@ -5,17 +5,17 @@ from __future__ import annotations
 import logging
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
-from queue import Empty, SimpleQueue
+from queue import SimpleQueue
 from typing import Literal
 
 import numpy as np
 
 from bodyschema.drivers.servos.bus import Bus as ServoBus
 from bodyschema.drivers.servos.channel import Sample
-from bodyschema.drivers.servos.handshake import IdentifiedServo, switch_torque_off
+from bodyschema.drivers.servos.handshake import ATTEMPTS, IdentifiedServo, switch_torque_off
 from bodyschema.drivers.servos.model import Register
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.protocols import Clock
@@ -29,8 +29,6 @@ from .powered_config import PoweredConfig
 log = logging.getLogger(__name__)
 
 LOOK_EVERY_S = 0.05  # period of reading one servo's torque, health, watchdog and goal
-MISSED_LOOKS = 5
-ATTEMPTS = 3
 
 State = Literal["off", "on", "dropped"]
 
@@ -51,7 +49,6 @@ class PoweredJoints(ABC):
     """The register that it writes."""
 
     def __init__(self, config: PoweredConfig, joints: Sequence[str], guard: Guard, clock: Clock) -> None:
-        """Start with torque off and no request."""
         self._config, self._guard, self._clock = config, guard, clock
         self._joints = tuple(joints)
         self._requests: SimpleQueue[tuple[bool, Future[str]]] = SimpleQueue()
@@ -76,12 +73,10 @@ class PoweredJoints(ABC):
 
     @property
     def holding(self) -> frozenset[str]:
-        """Joints whose torque may be on now."""
         return frozenset(self._joints) if self.state == "on" else frozenset()
 
     @property
     def complaints(self) -> tuple[str, ...]:
-        """Current problems, and what to do."""
         said = []
         if self._unsure:
             said.append(f"the torque of {', '.join(self._unsure)} could not be verified off: switch the supply off")
@@ -94,7 +89,6 @@ class PoweredJoints(ABC):
     # --- `Drive`, by the thread that reads
 
     def open(self, buses: Mapping[str, ServoBus], servos: Sequence[IdentifiedServo]) -> None:
-        """Implement `Drive.open`."""
         self._buses = {name: bus for name, bus in buses.items() if isinstance(bus, Bus)}
         by_joint = {servo.joint: place for place, servo in enumerate(servos)}
         self._places = [by_joint[joint] for joint in self._joints]
@@ -105,7 +99,6 @@ class PoweredJoints(ABC):
                 log.warning("%s is not possible as yet: %s", self.name, self._wrong_mode(servo, servo.operating_mode))
 
     def step(self, reading: JointReading | None, samples: Mapping[str, Sample | None]) -> str | None:
-        """Implement `Drive.step`."""
         self._has_just_begun = False
         self._answer_requests()
         if self.state != "on" or self._has_just_begun:
@@ -115,7 +108,8 @@ class PoweredJoints(ABC):
             motion = self._motion(reading, samples)
             self._guard.check(now, motion)
             if motion is not None and reading is not None:
-                self._send(self._goals(now, reading.q, samples))
+                self._sent = dict(zip(self._joints, self._goals(now, reading.q, samples), strict=True))
+                self._write_all(self.goal, self._sent)
             if now >= self._next_look:
                 self._look_at_one(now)
         except Drop as drop:
@@ -127,19 +121,11 @@ class PoweredJoints(ABC):
         return None
 
     def release(self, why: str | None) -> None:
-        """Implement `Drive.release`."""
-        while True:
-            try:
-                _, answer = self._requests.get_nowait()
-            except Empty:
-                break
-            if answer.set_running_or_notify_cancel():
-                answer.set_exception(RequestError(f"{self.name}: {why or 'the servos were closed'}"))
-        if self.state != "on":
-            return
-        if why is not None:
+        for _, answer in self._pending():
+            answer.set_exception(RequestError(f"{self.name}: {why or 'the servos were closed'}"))
+        if self.state == "on" and why is not None:
             self._drop(why)
-        elif self._end():
+        elif self.state == "on" and self._end():
             log.error("%s", "; ".join(self.complaints))
 
     # --- differs by kind of drive
@@ -148,8 +134,7 @@ class PoweredJoints(ABC):
     def _prepare(self, servo: IdentifiedServo) -> int:
         """Check the servo's own limits and return a goal with which its torque is safe to switch on.
 
-        Raises:
-            RequestError: the limits do not allow it.
+        Raise RequestError if the limits do not allow it.
         """
 
     @abstractmethod
@@ -166,14 +151,15 @@ class PoweredJoints(ABC):
 
     # --- torque on
 
+    def _pending(self) -> Iterator[tuple[bool, Future[str]]]:
+        """Yield the requests that no caller has given up."""
+        while not self._requests.empty():
+            on, answer = self._requests.get_nowait()
+            if answer.set_running_or_notify_cancel():
+                yield on, answer
+
     def _answer_requests(self) -> None:
-        while True:
-            try:
-                on, answer = self._requests.get_nowait()
-            except Empty:
-                return
-            if not answer.set_running_or_notify_cancel():
-                continue
+        for on, answer in self._pending():
             try:
                 answer.set_result(self._switch_on() if on else self._switch_off())
             except RequestError as error:
@@ -183,8 +169,7 @@ class PoweredJoints(ABC):
                 raise
 
     def _switch_off(self) -> str:
-        unsure = self._end()
-        if unsure:
+        if self._end():
             raise RequestError("; ".join(self.complaints))
         return f"{self.name} is off, the torque of {', '.join(self._joints)} verified off"
 
@@ -278,10 +263,6 @@ class PoweredJoints(ABC):
             [sample.alert for sample in believed],
         )
 
-    def _send(self, goals: Sequence[int]) -> None:
-        self._sent = dict(zip(self._joints, goals, strict=True))
-        self._write_all(self.goal, self._sent)
-
     def _look_at_one(self, now: float) -> None:
         servo = self._servos[self._looked % len(self._servos)]
         self._looked, self._next_look = self._looked + 1, now + LOOK_EVERY_S
@@ -292,7 +273,7 @@ class PoweredJoints(ABC):
         exchange = bus.ask(bus.read_request(servo.model, servo.id, span))
         if exchange.trouble is not None:
             self._missed[servo.joint] = self._missed.get(servo.joint, 0) + 1
-            if self._missed[servo.joint] >= MISSED_LOOKS:
+            if self._missed[servo.joint] >= ATTEMPTS:
                 raise Drop(f"joint {servo.joint!r}: its servo does not report its state: {exchange.trouble}")
             return
         self._missed[servo.joint] = 0

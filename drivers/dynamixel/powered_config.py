@@ -16,15 +16,6 @@ from bodyschema.robot.toml_file import Positive
 
 from .models import TORQUE_AT_CURRENT
 
-
-def torque_constant(model: str) -> float | None:
-    """Return the torque per current of a model [N·m/A]; None if its manual's figures are not listed."""
-    if model not in TORQUE_AT_CURRENT:
-        return None
-    torque, current = TORQUE_AT_CURRENT[model]
-    return torque / current
-
-
 WATCHDOG_UNIT_S, LARGEST_WATCHDOG = 0.02, 127  # e-Manual, Bus Watchdog
 Heartbeat = Annotated[float, Meta(ge=20, le=1e3 * WATCHDOG_UNIT_S * LARGEST_WATCHDOG)]
 
@@ -90,8 +81,8 @@ class ZeroForceConfig(PoweredConfig, frozen=True, forbid_unknown_fields=True, kw
 
     def torque_constant_of(self, servo: ServoConfig) -> float:
         """Return the torque constant of a joint's servo [N·m/A]; checked to be known."""
-        given = self.joints[servo.joint].torque_constant
-        return given or torque_constant(servo.model) or math.nan
+        torque, current = TORQUE_AT_CURRENT.get(servo.model, (math.nan, 1.0))
+        return self.joints[servo.joint].torque_constant or torque / current
 
     def mistakes(self, servos: Sequence[ServoConfig], models: Mapping[str, Model]) -> Iterator[Mistake]:
         """Yield what is wrong with the table for these servos, whose models are known."""
@@ -108,7 +99,7 @@ class ZeroForceConfig(PoweredConfig, frozen=True, forbid_unknown_fields=True, kw
                     f"joint {joint!r}: a {model.name} has no current control, so it cannot bear the arm",
                     "Leave the joint out (its torque stays off), or fit one with current control (docs/zero_force.md)",
                 )
-            elif table.torque_constant is None and torque_constant(model.name) is None:
+            elif table.torque_constant is None and model.name not in TORQUE_AT_CURRENT:
                 yield (
                     keys,
                     f"joint {joint!r}: the torque constant of a {model.name} is not known here",
@@ -148,10 +139,6 @@ class GazeConfig(PoweredConfig, frozen=True, forbid_unknown_fields=True, kw_only
                 )
         for joint, (lower, upper) in self.limits_deg.items():
             if joint not in self.joints:
-                yield (
-                    ("limits_deg",),
-                    f"{joint!r} is not one of its joints",
-                    did_you_mean(joint, self.joints),
-                )
+                yield (("limits_deg",), f"{joint!r} is not one of its joints", did_you_mean(joint, self.joints))
             elif lower >= upper:
                 yield ("limits_deg",), f"joint {joint!r}: the lower limit is not below the upper one", "Swap them"

@@ -43,10 +43,8 @@ class ZeroForce(PoweredJoints):
 
         Args:
             config: the servos; checked.
-            zero_force: its table.
             joints: all, in the order of q.
             torques: returns the holding torques.
-            clock: the clock.
         """
         floating = [joint for joint in joints if joint in zero_force.joints]
         servos = {servo.joint: servo for servo in config.servos}
@@ -70,7 +68,6 @@ class ZeroForce(PoweredJoints):
 
     @property
     def complaints(self) -> tuple[str, ...]:
-        """Current problems, and what to do."""
         said = super().complaints
         if self.state == "on" and self._sinking:
             names = ", ".join(self._sinking)
@@ -95,17 +92,15 @@ class ZeroForce(PoweredJoints):
 
     def _goals(self, now: float, q: FloatArray, samples: Mapping[str, Sample | None]) -> list[int]:
         del samples
-        currents = self._currents.at(now, self._torques_at(q))
+        try:
+            torques = np.asarray(self._torques(q), dtype=np.float64)[self._places]
+        except Exception as error:  # without a torque model the arm cannot be carried safely
+            raise Drop(f"the model of the arm's weight failed: {error!r}") from error
+        currents = self._currents.at(now, torques)
         saturated = self._currents.saturated
         self._saturated_s = min(self._saturated_s, now) if saturated else math.inf
         self._sinking = saturated if now - self._saturated_s > SATURATED_S else ()
         return [self._ticks(servo, current) for servo, current in zip(self._servos, currents, strict=True)]
-
-    def _torques_at(self, q: FloatArray) -> FloatArray:
-        try:
-            return np.asarray(self._torques(q), dtype=np.float64)[self._places]
-        except Exception as error:  # without a torque model the arm cannot be carried safely
-            raise Drop(f"the model of the arm's weight failed: {error!r}") from error
 
     def _said_on(self) -> str:
         return (

@@ -7,20 +7,26 @@ from collections.abc import Iterator, Sequence
 
 from bodyschema.drivers.feetech.config import BusConfig, FeetechConfig
 from bodyschema.drivers.feetech.models import BAUDS, BY_NUMBER, HARDWARE_ERRORS, STS
-from bodyschema.drivers.serial_line import SerialLine, adapter_latency_s
 from bodyschema.drivers.servos.bus import Answer, Request, spare_after
 from bodyschema.drivers.servos.bus import Bus as ServoBus
 from bodyschema.drivers.servos.channel import Channel as ServoChannel
 from bodyschema.drivers.servos.channel import Sample
 from bodyschema.drivers.servos.handshake import IdentifiedServo
-from bodyschema.drivers.servos.joints import OpenPort, ServoJoints
+from bodyschema.drivers.servos.joints import ServoJoints
 from bodyschema.drivers.servos.model import Model, Register
-from bodyschema.drivers.servos.packets import HEADER, Packets, Status, take_summed
-from bodyschema.drivers.servos.port import Port
+from bodyschema.drivers.servos.packets import Packets, Status, summed, take_summed
 from bodyschema.drivers.servos.scan import Kind
-from bodyschema.drivers.servos.settings import BAUD, HOMING_OFFSET, ID, Setting
-from bodyschema.drivers.servos.vendor import ServoVendor, Way
-from bodyschema.interfaces.protocols import Clock
+from bodyschema.drivers.servos.settings import (
+    BAUD,
+    HOMING_OFFSET,
+    ID,
+    LARGEST_ID,
+    OTHER_RATE,
+    OTHER_ZERO,
+    RENAMED,
+    Setting,
+)
+from bodyschema.drivers.servos.vendor import ServoVendor, Way, one_by_one
 
 from .models import MODES, PING, READ, SYNC_READ, WRITE
 
@@ -36,29 +42,20 @@ class FeetechPackets:
     pinged_only = "answers PING but no READ: look at its cable and supply"
 
     def ping(self, id: int) -> bytes:
-        """Build PING."""
-        return _packet(id, PING)
+        return summed(id, PING)
 
     def read(self, id: int, address: int, size: int) -> bytes:
-        """Build READ."""
-        return _packet(id, READ, bytes((address, size)))
+        return summed(id, READ, bytes((address, size)))
 
     def write(self, id: int, address: int, data: bytes) -> bytes:
-        """Build WRITE."""
-        return _packet(id, WRITE, bytes((address,)) + data)
+        return summed(id, WRITE, bytes((address,)) + data)
 
     def sync_read(self, ids: Sequence[int], address: int, size: int) -> bytes:
         """Build SYNC_READ: all of `ids` answer, in this order."""
-        return _packet(BROADCAST, SYNC_READ, bytes((address, size, *ids)))
+        return summed(BROADCAST, SYNC_READ, bytes((address, size, *ids)))
 
     def take(self, received: bytes | bytearray, at: int) -> Status | None:
-        """Return the status packet that begins at `at`; see `Packets.take`."""
         return take_summed(received, at)
-
-
-def _packet(id: int, code: int, params: bytes = b"") -> bytes:
-    body = bytes((id, len(params) + 2, code)) + params
-    return HEADER + body + bytes((~sum(body) & 0xFF,))
 
 
 LARGEST_POSITION = 30_719  # 7.5 turns
@@ -81,17 +78,9 @@ class Channel(ServoChannel):
         if not self._is_steady(told("voltage"), told("temperature")):
             return None
         amperes = None if model.current_unit is None else told("current") * model.current_unit
-        return Sample(
-            question=self.question(answer),
-            expected=answer.earliest,
-            earliest=answer.earliest,
-            latest=answer.latest,
-            ticks=position,
-            velocity=told("velocity") * model.velocity_unit,
-            current=amperes,
-            moving=bool(moving),
-            alert=answer.status.error != 0,
-        )
+        alert = answer.status.error != 0
+        way = (self.question(answer), answer.earliest, answer.earliest, answer.latest)
+        return Sample(*way, position, told("velocity") * model.velocity_unit, amperes, bool(moving), alert)
 
     def _is_possible(self, position: int) -> bool:
         if self.servo.model.ticks_per_turn is None:
@@ -99,12 +88,7 @@ class Channel(ServoChannel):
         return abs(position) <= LARGEST_POSITION
 
 
-LARGEST_ID = 252  # 253 is legal, but no robot.toml can name it
 FARTHEST_OFFSET = 2047
-
-RENAMED = "set id in robot.toml"
-OTHER_RATE = "set baud in robot.toml; all servos of a bus need the same"
-OTHER_ZERO = "the joint's zero moves: pairs measured before do not fit those after"
 
 
 def settings_of(model: Model) -> Sequence[Setting]:
@@ -127,13 +111,8 @@ def _common(model: Model) -> Iterator[Setting]:
     yield Setting("max_voltage_limit", Register(14, 1), 0, 254, per_unit=0.1, unit="V")
     yield Setting("min_voltage_limit", Register(15, 1), 0, 254, per_unit=0.1, unit="V")
     yield Setting("max_torque", Register(16, 2, order=order), 0, 1000, per_unit=0.1, unit="%")
-    yield Setting(
-        "drive_mode",
-        layout["drive_mode"],
-        0,
-        254,
-        follows=f"its maker calls it Phase: not without their manual. {OTHER_ZERO}",
-    )
+    phase = f"its maker calls it Phase: not without their manual. {OTHER_ZERO}"
+    yield Setting("drive_mode", layout["drive_mode"], 0, 254, follows=phase)
     yield Setting("unloading", layout["unloading"], 0, 254, follows="which troubles switch its torque off")
     yield Setting("alarm_led", Register(20, 1), 0, 254)
 
@@ -166,36 +145,21 @@ class Bus(ServoBus):
         return PACKETS
 
 
-def open_serial(config: BusConfig, clock: Clock) -> tuple[Port, float]:
-    """Open the port of a bus; return it and the latency of its adapter [s]."""
-    latency_s = adapter_latency_s(config.port) if config.latency_ms is None else config.latency_ms * 1e-3
-    return SerialLine.open(config.port, config.baud, clock.now), latency_s
-
-
 def ways_of(bus: ServoBus, servos: Sequence[IdentifiedServo], config: BusConfig) -> list[list[Way]]:
     """Return the read methods of each group: the STS and SMS series, which support Sync Read, and the others."""
     together = [servo for servo in servos if servo.model.protocol == STS]
     if len(together) < 2 or config.sync_read != "auto":
-        return [[_one_by_one(bus, servos)]]
+        return [[one_by_one(bus, servos)]]
     alone = [servo for servo in servos if servo.model.protocol != STS]
-    groups = [[_sync_read(together), _one_by_one(bus, together)]]
-    return [*groups, [_one_by_one(bus, alone)]] if alone else groups
-
-
-def _sync_read(servos: Sequence[IdentifiedServo]) -> Way:
-    layout, ids = servos[0].model.layout, tuple(servo.id for servo in servos)
+    layout, ids = together[0].model.layout, tuple(servo.id for servo in together)
     block = layout.block
 
     def packet(size: int) -> bytes:
         return PACKETS.sync_read(ids, block.address, size)
 
     request = Request(packet, ids, block.size, STS, spare_after(layout, block))
-    return Way("Sync Read", (request,), SYNC_READ_FAILED)
-
-
-def _one_by_one(bus: ServoBus, servos: Sequence[IdentifiedServo]) -> Way:
-    requests = (bus.read_request(servo.model, servo.id, servo.model.layout.block) for servo in servos)
-    return Way("one by one", tuple(requests))
+    groups = [[Way("Sync Read", (request,), SYNC_READ_FAILED), one_by_one(bus, together)]]
+    return [*groups, [one_by_one(bus, alone)]] if alone else groups
 
 
 FEETECH = ServoVendor(FeetechConfig.table, BY_NUMBER, HARDWARE_ERRORS, Bus, Channel, ways_of, settings_of, -1)
@@ -204,25 +168,7 @@ FEETECH = ServoVendor(FeetechConfig.table, BY_NUMBER, HARDWARE_ERRORS, Bus, Chan
 class FeetechJoints(ServoJoints):
     """An arm of Feetech servos with torque off as a `JointSource`; see `ServoJoints`."""
 
-    def __init__(
-        self,
-        config: FeetechConfig,
-        joints: Sequence[str],
-        clock: Clock,
-        *,
-        limits: Sequence[tuple[float, float]] | None = None,
-        last_pose: Sequence[float] | None = None,
-        open_port: OpenPort = open_serial,
-    ) -> None:
-        """Prepare without opening anything; arguments as in `ServoJoints`."""
-        super().__init__(FEETECH, config, joints, clock, open_port=open_port, limits=limits, last_pose=last_pose)
+    make = FEETECH
 
 
-FEETECH_SERVOS = Kind(
-    name="Feetech",
-    bauds=BAUDS,
-    version=STS,
-    models=BY_NUMBER,
-    errors=HARDWARE_ERRORS,
-    bus=Bus,
-)
+FEETECH_SERVOS = Kind(name="Feetech", bauds=BAUDS, version=STS, models=BY_NUMBER, errors=HARDWARE_ERRORS, bus=Bus)

@@ -1,3 +1,1 @@
 """Marker positions that other programs send: UDP datagrams, OptiTrack, zenoh keys and ROS 2 topics."""
-
-from __future__ import annotations

@@ -12,12 +12,12 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from bodyschema.drivers.ros2.config import ENDPOINT, TOPIC
+from bodyschema.drivers.ros2.config import TOPIC
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.robot.rpy import rotation_of
+from bodyschema.robot.rpy import pose_of
 from bodyschema.robot.suggest import did_you_mean
-from bodyschema.robot.toml_file import convert, line_in_entry, line_of
+from bodyschema.robot.toml_file import ENDPOINT, NonNegative, Positive, convert, line_in_entry, line_of
 
 TABLE = "marker_source"
 PAGE = "docs/marker_sources.md"
@@ -25,8 +25,6 @@ PORT = 5005
 # A sender's own stamp is taken when its computation ends, or when its frame arrives: milliseconds from the exposure.
 UNKNOWN_LATENCY_SIGMA_S = 0.005
 
-Positive = Annotated[float, Meta(gt=0)]
-NonNegative = Annotated[float, Meta(ge=0)]
 Port = Annotated[int, Meta(ge=1, le=65535)]
 Vector3 = tuple[float, float, float]
 Mistake = tuple[str, str, str]
@@ -81,10 +79,7 @@ class SourceTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     @property
     def pose(self) -> FloatArray:
         """Pose of the source's frame in the measurement frame, shape (4, 4)."""
-        T = np.eye(4)
-        T[:3, :3] = rotation_of(np.array(self.rpy))
-        T[:3, 3] = self.xyz
-        return T
+        return pose_of(np.array(self.xyz), np.array(self.rpy))
 
     @property
     def endpoint(self) -> str:
@@ -111,11 +106,9 @@ class UdpTable(SourceTable, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
     @property
     def endpoint(self) -> str:
-        """Where it listens."""
         return f"udp/{self.host}:{self.port}"
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Yield key, fault and remedy of each value that cannot be used."""
         yield from _addresses(self, "host", "sender")
 
 
@@ -139,11 +132,9 @@ class NatnetTable(SourceTable, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def endpoint(self) -> str:
-        """Where the server answers."""
         return f"udp/{self.server}:{self.command_port}"
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Yield key, fault and remedy of each value that cannot be used."""
         yield from _addresses(self, "server", "local")
 
 
@@ -160,11 +151,9 @@ class ZenohTable(SourceTable, frozen=True, forbid_unknown_fields=True, kw_only=T
 
     @property
     def endpoint(self) -> str:
-        """Where the router listens."""
         return self.router
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Yield key, fault and remedy of each value that cannot be used."""
         yield from _endpoints(self)
         if not re.fullmatch(r"[^/*$?#\s]+(/[^/*$?#\s]+)*", self.key):
             yield "key", f"{self.key!r} is no zenoh key without wild cards", "Write one such as lab/marker"
@@ -193,11 +182,9 @@ class Ros2Table(SourceTable, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
     @property
     def endpoint(self) -> str:
-        """Where the router listens."""
         return self.router
 
     def mistakes(self) -> Iterator[Mistake]:
-        """Yield key, fault and remedy of each value that cannot be used."""
         yield from _endpoints(self)
         if not TOPIC.fullmatch(self.topic):
             yield "topic", f"{self.topic!r} is no name of a topic", "Write one as `ros2 topic list` does"
@@ -207,20 +194,16 @@ class Ros2Table(SourceTable, frozen=True, forbid_unknown_fields=True, kw_only=Tr
             yield "body", "a topic has no bodies", "For TF name the marker's frame as child"
 
 
-KINDS: Mapping[str, type[UdpTable | NatnetTable | ZenohTable | Ros2Table]] = {
-    "udp": UdpTable,
-    "natnet": NatnetTable,
-    "zenoh": ZenohTable,
-    "ros2": Ros2Table,
-}
 AnySource = UdpTable | NatnetTable | ZenohTable | Ros2Table
+KINDS: Mapping[str, type[AnySource]] = {
+    str(table.__struct_config__.tag): table for table in (UdpTable, NatnetTable, ZenohTable, Ros2Table)
+}
 
 
 def source_tables(raw: object, file: Path, text: str) -> tuple[AnySource, ...]:
     """Return the sources of the value `raw` of marker_source.
 
-    Raises:
-        ConfigError: a kind is unknown, a key unknown or wrong, or two sources have the same name.
+    Raise ConfigError if a kind is unknown, a key unknown or wrong, or two sources have the same name.
     """
     entries = raw if isinstance(raw, list) else [raw]
     found: list[AnySource] = []

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 
 import msgspec
 
+from bodyschema.drivers.ros2.messages import NANO
+
 from .report import Fault, Report, Unusable
 
 SCHEMA = "bodyschema.marker/1"
-NANO = 1_000_000_000
 LARGEST_BYTES = 8192
-SIZES = (9, 36)
 
 Row = tuple[float, ...]
 
@@ -44,11 +44,7 @@ _decode = msgspec.json.Decoder(Datagram).decode
 
 
 def decode_datagram(payload: bytes, _: bytes = b"") -> Iterator[Report]:
-    """Yield the position in a datagram.
-
-    Raises:
-        Unusable: it is no such JSON, or has numbers that are not finite.
-    """
+    """Yield the position in a datagram. Raise Unusable if it is no such JSON, or has numbers that are not finite."""
     if len(payload) > LARGEST_BYTES:
         raise Unusable(Fault.MALFORMED, f"{len(payload)} bytes are more than a position has")
     try:
@@ -61,9 +57,11 @@ def decode_datagram(payload: bytes, _: bytes = b"") -> Iterator[Report]:
         raise Unusable(Fault.MALFORMED, f"the schema is {found.schema[:40]!r}, not {SCHEMA!r}")
     if found.position is None and found.tracked:
         raise Unusable(Fault.MALFORMED, "there is no position")
+    if found.stamp is not None and not -9e9 < found.stamp < 9e9:
+        raise Unusable(Fault.DELAYED, f"the stamp {found.stamp:g} is no number of seconds")
     yield Report(
         x=found.position if found.tracked else None,
-        stamp_ns=None if found.stamp is None else _nanoseconds(found.stamp),
+        stamp_ns=None if found.stamp is None else round(found.stamp * NANO),
         seq=found.seq,
         turn=found.quaternion,
         cov=_flat(found.covariance),
@@ -71,17 +69,11 @@ def decode_datagram(payload: bytes, _: bytes = b"") -> Iterator[Report]:
     )
 
 
-def _nanoseconds(stamp: float) -> int:
-    if not -9e9 < stamp < 9e9:
-        raise Unusable(Fault.DELAYED, f"the stamp {stamp:g} is no number of seconds")
-    return round(stamp * NANO)
-
-
 def _flat(rows: list[float | Row] | None) -> tuple[float, ...] | None:
     """Return a matrix by rows, which may be nested."""
     if rows is None:
         return None
     flat = [value for row in rows for value in (row if isinstance(row, tuple) else (row,))]
-    if len(flat) not in SIZES:
+    if len(flat) not in (9, 36):
         raise Unusable(Fault.COVARIANCE, f"{len(flat)} numbers, neither 3 × 3 nor 6 × 6")
     return tuple(flat)

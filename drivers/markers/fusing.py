@@ -81,7 +81,6 @@ class Member:
     """
 
     def __init__(self, name: str, source: MarkerSource, pose: FloatArray) -> None:
-        """Store the settings."""
         self.name, self.source, self.pose = name, source, pose
         self.common: deque[Common] = deque(maxlen=_SETTINGS.judged)
         self.forget()
@@ -302,20 +301,6 @@ def _moved(fix: MarkerFix, pose: FloatArray) -> MarkerFix:
 
 def _turned(R: FloatArray, q: FloatArray) -> FloatArray:
     """Return the quaternion (x, y, z, w) of R (3, 3) after that of `q`."""
-    a = _quaternion(R)
-    vector = a[3] * q[:3] + q[3] * a[:3] + np.cross(a[:3], q[:3])
-    return np.append(vector, a[3] * q[3] - a[:3] @ q[:3])
+    from scipy.spatial.transform import Rotation  # only few sources measure orientations, and it takes a while
 
-
-def _quaternion(R: FloatArray) -> FloatArray:
-    """Return the unit quaternion (x, y, z, w) of a rotation: the eigenvector of its symmetric form."""
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = R
-    K = np.array(
-        [
-            [xx - yy - zz, yx + xy, zx + xz, zy - yz],
-            [yx + xy, yy - xx - zz, zy + yz, xz - zx],
-            [zx + xz, zy + yz, zz - xx - yy, yx - xy],
-            [zy - yz, xz - zx, yx - xy, xx + yy + zz],
-        ]
-    )
-    return np.linalg.eigh(K)[1][:, -1]
+    return (Rotation.from_matrix(R) * Rotation.from_quat(q)).as_quat()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack
 
 from bodyschema.drivers.markers.config import Ros2Table, ZenohTable
 from bodyschema.drivers.markers.report import Fault, Packet, Report, Unusable
@@ -72,11 +73,7 @@ def _transform(reader: CdrReader, seq: int | None) -> tuple[str, Report]:
 
 
 def _report(
-    header: Header,
-    x: tuple[float, ...],
-    turn: tuple[float, ...] | None,
-    cov: tuple[float, ...] | None,
-    seq: int | None,
+    header: Header, x: tuple[float, ...], turn: tuple[float, ...] | None, cov: tuple[float, ...] | None, seq: int | None
 ) -> Report:
     return Report(x, stamp_ns=header.stamp_ns, seq=seq, turn=turn, cov=cov, frame=header.frame.lstrip("/"))
 
@@ -100,24 +97,17 @@ class KeyReceiver:
                 "[marker_source]",
                 retry_s=RETRY_S,
             ) from error
-        try:
+        with ExitStack() as stack:
+            stack.callback(session.close)
             self._link = ZenohLink(session, self._key, self._clock)
-        except BaseException:
-            session.close()
-            raise
+            stack.pop_all()
 
     def close(self) -> None:
-        """End the subscription."""
         if self._link is not None:
             self._link.close()
             self._link = None
 
     def receive(self, until: float) -> Packet | None:
-        """Return the next message; None when none arrives by `until` [s].
-
-        Raises:
-            SourceLost: the router is gone.
-        """
         if self._link is None:
             return None
         sample = self._link.receive(until)
@@ -129,7 +119,6 @@ class KeyReceiver:
         return Packet(sample.payload, gid.hex(), sample.arrived, sample.attached)
 
     def silence(self) -> str:
-        """Return why nothing may be coming, and what to do."""
         if isinstance(self._table, ZenohTable):
             return f"let a program publish on the key {self._key} at {self._table.router}"
         topics = [] if self._link is None else list(rmw.topics_in(list(self._link.tokens())))

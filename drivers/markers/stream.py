@@ -12,7 +12,7 @@ from typing import Protocol, Self
 
 import numpy as np
 
-from bodyschema.drivers.checks import Check
+from bodyschema.drivers.checks import Check, warned
 from bodyschema.drivers.markers.config import SourceTable
 from bodyschema.drivers.markers.report import ADVICE, Fault, Packet, Report, Unusable
 from bodyschema.drivers.ros2.cdr import Malformed
@@ -108,13 +108,6 @@ class Ledger:
 log = logging.getLogger(__name__)
 
 FARTHEST_M = 50.0  # no arm is measured over a larger distance: such a number is in millimetres
-STAMPS = {
-    Refusal.NO_STAMP: Fault.NO_STAMP,
-    Refusal.DUPLICATE: Fault.DUPLICATE,
-    Refusal.OUT_OF_ORDER: Fault.OUT_OF_ORDER,
-    Refusal.DELAYED: Fault.DELAYED,
-}
-
 SENDERS = 64
 
 Decode = Callable[[bytes, bytes], Iterable[Report]]
@@ -125,19 +118,12 @@ class Receiver(Protocol):
 
     def open(self) -> None:
         """Open it. Raise SourceError if that is not possible."""
-        ...
 
     def close(self) -> None:
         """Close it; again does no harm."""
-        ...
 
     def receive(self, until: float) -> Packet | None:
-        """Return the next message; None when none arrives by `until` [s].
-
-        Raises:
-            SourceLost: the other end is gone.
-        """
-        ...
+        """Return the next message; None when none arrives by `until` [s]. Raise SourceLost if the other end is gone."""
 
     def silence(self) -> str:
         """Return why nothing may be coming, and what to do."""
@@ -151,21 +137,18 @@ class MarkerStream:
     names them with the remedy.
 
     Attributes:
+        name: in messages.
         ledger: what came of the messages.
     """
 
     def __init__(self, table: SourceTable, receiver: Receiver, decode: Decode, clock: Clock) -> None:
         """Prepare without opening anything."""
         self._table, self._receiver, self._decode, self._clock = table, receiver, decode, clock
+        self.name = table.label
         self._is_open = False
         self._last_t = -math.inf
         self.ledger = Ledger()
         self._forget()
-
-    @property
-    def name(self) -> str:
-        """Name in messages."""
-        return self._table.label
 
     @property
     def health(self) -> tuple[str, ...]:
@@ -194,7 +177,9 @@ class MarkerStream:
         while not self._waiting:
             packet = self._receiver.receive(deadline)
             if packet is None:
-                self._note_silence()
+                # Find out once why nothing arrives; this may take a second.
+                if self._silence is None and self._clock.now() - self._heard > SILENT_AFTER_S:
+                    self._silence = self._receiver.silence()
                 return None
             self._take(packet)
             if not self._waiting and self._clock.now() >= deadline:
@@ -214,11 +199,6 @@ class MarkerStream:
         self._frame: str | None = None
         self._first_turn: tuple[float, ...] | None = None
         self._turns = False
-
-    def _note_silence(self) -> None:
-        """Find out once why nothing arrives; this may take a second."""
-        if self._silence is None and self._clock.now() - self._heard > SILENT_AFTER_S:
-            self._silence = self._receiver.silence()
 
     def _take(self, packet: Packet) -> None:
         self._heard, self._silence = packet.arrived, None
@@ -308,7 +288,7 @@ class MarkerStream:
         if self._clock_of.times_set != times_set:
             log.warning("%s: the clock of its stamps was set; its time is learnt again", self.name)
         if isinstance(t, Refusal):
-            raise Unusable(STAMPS[t])
+            raise Unusable(Fault(t.value))
         return t - report.age_s - self._table.latency_s, math.hypot(self._clock_of.sigma_s, self._table.sigma_s)
 
     def _count_lost(self, seq: int | None, packet: Packet) -> Fault | None:
@@ -396,7 +376,6 @@ def stream_checks(stream: MarkerStream, clock: Clock, read_s: float = READ_S) ->
 
     Args:
         stream: not open; it is closed again afterwards.
-        clock: the clock.
         read_s: duration of the look [s].
     """
     subject = f"marker source {stream.name}"
@@ -428,7 +407,5 @@ def _of_fixes(subject: str, fixes: list[MarkerFix]) -> Iterator[Check]:
     place = ", ".join(f"{1e3 * value:.1f}" for value in last.x)
     sigma = 1e3 * float(np.sqrt(np.linalg.eigvalsh(last.cov)[-1]))
     said = f"{rate:.0f} positions/s, last at ({place}) mm ± {sigma:.2g} mm, time known to {1e3 * last.t_sigma:.1f} ms"
-    if rate < _SETTINGS.few_per_s:
-        yield Check(subject, "warning", said, "let the source send more often: 30 to 100 a second")
-    else:
-        yield Check(subject, "ok", said)
+    fix = "let the source send more often: 30 to 100 a second"
+    yield warned(subject, said, fix, when=rate < _SETTINGS.few_per_s)

@@ -81,13 +81,11 @@ class UdpReceiver:
             ) from error
 
     def close(self) -> None:
-        """Close the port."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
 
     def receive(self, until: float) -> Packet | None:
-        """Return the next datagram of the sender; None when none arrives by `until` [s]."""
         while self._socket is not None:
             found = received(self._socket, self._clock)
             if found is not None:
@@ -102,7 +100,6 @@ class UdpReceiver:
         return None
 
     def silence(self) -> str:
-        """Return why nothing may be coming, and what to do."""
         if self._strangers:
             return f"{self._strangers} datagrams came from other addresses than sender: correct sender"
         said = f"start the program that sends to port {self._table.port} of {self._table.host}"

@@ -20,8 +20,7 @@ class CdrReader:
     def __init__(self, data: bytes) -> None:
         """Start behind the encapsulation header.
 
-        Raises:
-            Malformed: the header is invalid, the representation unsupported, or the message absurdly long.
+        Raise Malformed if the header is invalid, the representation unsupported, or the message absurdly long.
         """
         if len(data) > LARGEST_MESSAGE:
             raise Malformed(f"{len(data)} bytes are more than a message of joints has")
@@ -97,7 +96,6 @@ class CdrWriter:
     """Writer of one message, with zero padding."""
 
     def __init__(self, *, big_endian: bool = False) -> None:
-        """Start with the encapsulation header."""
         self._order = ">" if big_endian else "<"
         self._data = bytearray(b"\x00\x00\x00\x00" if big_endian else b"\x00\x01\x00\x00")
 

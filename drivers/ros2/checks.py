@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 
-from bodyschema.drivers.checks import MANY_TROUBLES, READ_S, Check
+from bodyschema.drivers.checks import MANY_TROUBLES, READ_S, Check, warned
 from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.waits import POLL_S
@@ -25,15 +25,11 @@ def joint_state_checks(
     *,
     prismatic: Sequence[bool] | None = None,
     open_link: OpenLink = open_zenoh,
-    read_s: float = READ_S,
 ) -> Iterator[Check]:
     """Yield checks of the router, of the joints and of their rate. Open a session for that.
 
     Args:
-        config: checked.
         joints, prismatic, open_link: as for `Ros2Joints`.
-        clock: the clock.
-        read_s: duration of the rate measurement [s].
     """
     try:
         with Ros2Joints(config, joints, clock, prismatic=prismatic, open_link=open_link) as robot:
@@ -43,12 +39,16 @@ def joint_state_checks(
                 return
             yield Check("joint states", "ok", f"all {len(joints)} joints of robot.toml are in {config.topic}")
             lost, heard = _counted(robot)
-            end, readings = clock.now() + read_s, 0
+            end, readings = clock.now() + READ_S, 0
             while clock.now() < end:
                 readings += robot.read(end - clock.now()) is not None
             lost_since, heard_since = _counted(robot)
-            yield _rate(readings / read_s)
-            yield _troubles(lost_since - lost, heard_since - heard)
+            rate_hz, lost, messages = readings / READ_S, lost_since - lost, heard_since - heard
+            fix = "let the robot's nodes publish more often"
+            yield warned("rate", f"{rate_hz:.0f} readings/s come", fix, when=rate_hz < FEW_PER_S)
+            fix = "bodyschema watch joints    # its log says why, once for each reason"
+            said = f"{lost} of {messages} messages were lost or not used"
+            yield warned("errors", said, fix, when=lost > MANY_TROUBLES * messages)
     except SourceError as error:
         yield Check("router", "wrong", *_parted((str(error),)))
 
@@ -70,20 +70,6 @@ def _parted(complaints: Sequence[str]) -> tuple[str, str]:
     return "".join(said), fix
 
 
-def _rate(rate_hz: float) -> Check:
-    said = f"{rate_hz:.0f} readings/s come"
-    if rate_hz < FEW_PER_S:
-        return Check("rate", "warning", said, "let the robot's nodes publish more often")
-    return Check("rate", "ok", said)
-
-
 def _counted(robot: Ros2Joints) -> tuple[int, int]:
     """Return the number of unusable messages, and of all messages sent, so far."""
     return robot.lost + robot.refused.total(), robot.lost + robot.received
-
-
-def _troubles(lost: int, messages: int) -> Check:
-    said = f"{lost} of {messages} messages were lost or not used"
-    if lost > MANY_TROUBLES * messages:
-        return Check("errors", "warning", said, "bodyschema watch joints    # its log says why, once for each reason")
-    return Check("errors", "ok", said)

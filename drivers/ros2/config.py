@@ -12,11 +12,10 @@ from msgspec import Meta
 
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.suggest import did_you_mean
-from bodyschema.robot.toml_file import Positive, line_of
+from bodyschema.robot.toml_file import ENDPOINT, Positive, line_of
 
 TABLE = ("drivers", "ros2")
 TOPIC = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
-ENDPOINT = re.compile(r"(tcp|udp|tls|quic|ws)/.+:[0-9]+|unixsock-stream/.+")
 
 
 class MarkerTopic(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -131,7 +131,6 @@ def silence(
     """Explain in one sentence why there are no readings.
 
     Args:
-        config: of the robot.
         missing: joints, by their names in ROS, without any message.
         names: all joint names received.
         refused: number of unused messages, by reason.
@@ -193,6 +192,7 @@ class Ros2Joints:
     silent robot is waited for.
 
     Attributes:
+        joints: names of the joints in the order of q.
         received: number of messages since creation.
         refused: messages and readings that were not used, by reason.
         lost: messages that never arrived, by the senders' own count.
@@ -213,11 +213,10 @@ class Ros2Joints:
         Args:
             config: checked; see `Ros2Config.check`.
             joints: in the order of q.
-            clock: the clock.
             prismatic: True for each prismatic joint; none by default.
             open_link: opens the link to the router.
         """
-        self._config, self._joints, self._clock, self._open_link = config, tuple(joints), clock, open_link
+        self._config, self.joints, self._clock, self._open_link = config, tuple(joints), clock, open_link
         self._wanted = config.ros_names(joints)
         slides = [False] * len(joints) if prismatic is None else list(prismatic)
         turning = math.radians(config.max_speed_deg_s)
@@ -229,11 +228,6 @@ class Ros2Joints:
         self.received = self.lost = 0
         self.refused: Counter[Refusal] = Counter()
         self.stamp_ns: int | None = None
-
-    @property
-    def joints(self) -> tuple[str, ...]:
-        """Names of the joints in the order of q."""
-        return self._joints
 
     @property
     def health(self) -> tuple[str, ...]:
@@ -253,8 +247,7 @@ class Ros2Joints:
     def read(self, timeout_s: float) -> JointReading | None:
         """Return the next reading; see `JointSource.read`.
 
-        Raises:
-            SourceLost: the router is gone, or a joint jumped.
+        Raise SourceLost if the router is gone, or a joint jumped.
         """
         if self._link is None:
             raise SourceError("the robot's joint states are not open; use them in a with statement")
@@ -276,9 +269,9 @@ class Ros2Joints:
         """Reset everything that was learnt from earlier messages."""
         self._senders: dict[Who, Sender] = {}
         self._gates = Gates(self._fastest, self._slack)
-        self._owners: list[tuple[Who, float] | None] = [None] * len(self._joints)
+        self._owners: list[tuple[Who, float] | None] = [None] * len(self.joints)
         self._sequences: dict[bytes, int] = {}
-        self._merging = Merging(len(self._joints))
+        self._merging = Merging(len(self.joints))
         self._names: set[str] = set()
         self._said: set[Refusal] = set()
         self._lately: Counter[Refusal] = Counter()
@@ -332,7 +325,8 @@ class Ros2Joints:
 
     def _told(self, who: Who, message: JointState, places: Sequence[int], arrived: float) -> float | Refusal:
         """Return the time of the message's positions [s], or why it cannot be used."""
-        if any(self._belongs_to_another(place, who, arrived) for place in places):
+        owners = [owner for place in places if (owner := self._owners[place]) is not None]
+        if any(owner != who and arrived - heard < RIVAL_AFTER_S for owner, heard in owners):
             return Refusal.RIVAL
         if len(set(message.names)) < len(message.names):
             return Refusal.TWICE
@@ -352,10 +346,6 @@ class Ros2Joints:
                 del self._senders[min(self._senders, key=lambda known: self._senders[known].heard)]
             self._senders[who] = sender = Sender(self._config.max_delay_s)
         return sender
-
-    def _belongs_to_another(self, place: int, who: Who, arrived: float) -> bool:
-        owner = self._owners[place]
-        return owner is not None and owner[0] != who and arrived - owner[1] < RIVAL_AFTER_S
 
     def _count_lost(self, gid: bytes, sequence: int | None) -> None:
         if sequence is None:

@@ -42,18 +42,12 @@ class Link(Protocol):
     """A subscription to joint states."""
 
     @property
-    def overflowed(self) -> int:
-        """Number of messages discarded because the queue was full."""
-        ...
-
-    @property
     def is_connected(self) -> bool:
         """True while the router is reachable."""
         ...
 
     def receive(self, until: float) -> Sample | None:
         """Return the next message; None when none arrives by `until` [s], or the router is gone."""
-        ...
 
     def tokens(self) -> Sequence[str]:
         """Return the liveliness tokens of all known publishers."""
@@ -61,35 +55,37 @@ class Link(Protocol):
 
     def close(self) -> None:
         """Close the link."""
-        ...
 
 
 OpenLink = Callable[[Ros2Config, Clock], Link]
 
 
-def open_session(router: str, start: str = "ros2 run rmw_zenoh_cpp rmw_zenohd") -> zenoh.Session:
-    """Open a session with this router only: it neither listens nor scouts. `start` is the command that starts it.
-
-    Raises:
-        SourceLost: the router is not there.
-    """
+def session_config(mode: str, *, listen: Sequence[str] = (), connect: Sequence[str] = ()) -> zenoh.Config:
+    """Return the configuration of a session that does not scout."""
     config = zenoh.Config()
     settings: dict[str, Any] = {
-        "mode": "client",
+        "mode": mode,
         "scouting/multicast/enabled": False,
         "scouting/gossip/enabled": False,
-        "listen/endpoints": [],
-        "connect/endpoints": [router],
+        "listen/endpoints": list(listen),
+        "connect/endpoints": list(connect),
         "timestamping/enabled": True,
     }
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def open_session(router: str, start: str = "ros2 run rmw_zenoh_cpp rmw_zenohd") -> zenoh.Session:
+    """Open a session with this router only: it neither listens nor scouts. `start` is the command that starts it.
+
+    Raise SourceLost if the router is not there.
+    """
     try:
-        return zenoh.open(config)
+        return zenoh.open(session_config("client", connect=[router]))
     except zenoh.ZError as error:
         raise SourceLost(
-            f"no zenoh router answers on {router}. Start it on the robot: {start}",
-            retry_s=RETRY_S,
+            f"no zenoh router answers on {router}. Start it on the robot: {start}", retry_s=RETRY_S
         ) from error
 
 
@@ -112,11 +108,9 @@ class ZenohLink:
 
     @property
     def is_connected(self) -> bool:
-        """True while the router is reachable."""
         return is_connected(self._session)
 
     def receive(self, until: float) -> Sample | None:
-        """Return the next message; None when none arrives by `until` [s], or the router is gone."""
         while True:
             left = until - self._clock.now()
             try:
@@ -126,12 +120,10 @@ class ZenohLink:
                     return None
 
     def tokens(self) -> Sequence[str]:
-        """Return the liveliness tokens of all known publishers."""
         replies = self._session.liveliness().get(rmw.publishers_key(), timeout=GRAPH_LIMIT_S)
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 
     def close(self) -> None:
-        """Close the session."""
         self._session.close()
 
     def _take(self, sample: zenoh.Sample) -> None:
@@ -145,8 +137,7 @@ class ZenohLink:
 def open_zenoh(config: Ros2Config, clock: Clock) -> Link:
     """Subscribe to the joint states of the configured robot. The type's hash is a wildcard, so any ROS 2 version works.
 
-    Raises:
-        SourceLost: the router is not there.
+    Raise SourceLost if the router is not there.
     """
     key = rmw.topic_key(config.domain, config.topic, JOINT_STATE, rmw.ANY)
     if config.via == "ros2dds":

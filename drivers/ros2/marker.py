@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Callable
 from typing import Self
 
 import zenoh
@@ -26,15 +25,9 @@ NO_TURN = (0.0, 0.0, 0.0, 1.0)
 class MarkerPublisher:
     """Publisher like a node of rmw_zenoh, visible in `ros2 topic list`. It resumes when the router comes back."""
 
-    def __init__(self, config: Ros2Config, marker: MarkerTopic, *, wall_ns: Callable[[], int] = time.time_ns) -> None:
-        """Prepare without opening anything.
-
-        Args:
-            config: the table [drivers.ros2].
-            marker: its table `marker`.
-            wall_ns: time since 1970 [ns], sent with each message.
-        """
-        self._config, self._marker, self._wall_ns = config, marker, wall_ns
+    def __init__(self, config: Ros2Config, marker: MarkerTopic) -> None:
+        """Prepare without opening anything."""
+        self._config, self._marker = config, marker
         self._kind = POINT_STAMPED if marker.message == "point" else POSE_WITH_COVARIANCE_STAMPED
         self._session: zenoh.Session | None = None
         self._tokens: list[zenoh.LivelinessToken] = []
@@ -54,10 +47,7 @@ class MarkerPublisher:
         """Open the topic. Raise SourceLost when the router is not there."""
         self._session = session = open_session(self._config.router)
         domain, topic, name = self._config.domain, self._marker.topic, str(session.info.zid())
-        tokens = (
-            rmw.node_token(domain, name, NODE),
-            rmw.publisher_token(domain, name, NODE, topic, self._kind),
-        )
+        tokens = (rmw.node_token(domain, name, NODE), rmw.publisher_token(domain, name, NODE, topic, self._kind))
         self._tokens = [session.liveliness().declare_token(token) for token in tokens]
         self._gid = hashlib.blake2b(tokens[1].encode(), digest_size=rmw.GID_BYTES).digest()
         self._publisher = session.declare_publisher(rmw.topic_key(domain, topic, self._kind))
@@ -86,7 +76,7 @@ class MarkerPublisher:
             payload = encode_point(header, at)
         else:
             payload = encode_pose(header, at, NO_TURN, _covariance(sigma))
-        self._publisher.put(payload, attachment=rmw.attachment(self._sequence, self._wall_ns(), self._gid))
+        self._publisher.put(payload, attachment=rmw.attachment(self._sequence, time.time_ns(), self._gid))
 
 
 def _covariance(sigma: FloatArray) -> tuple[float, ...]:

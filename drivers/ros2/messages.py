@@ -23,20 +23,17 @@ class MessageType:
 
 
 JOINT_STATE = MessageType(
-    "sensor_msgs::msg::dds_::JointState_",
-    "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
+    "sensor_msgs::msg::dds_::JointState_", "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e"
 )
 POINT_STAMPED = MessageType(
-    "geometry_msgs::msg::dds_::PointStamped_",
-    "RIHS01_4c0296af86e01e562e9e0405d138a01537247580076c58ea38d7923ac1045897",
+    "geometry_msgs::msg::dds_::PointStamped_", "RIHS01_4c0296af86e01e562e9e0405d138a01537247580076c58ea38d7923ac1045897"
 )
 POSE_WITH_COVARIANCE_STAMPED = MessageType(
     "geometry_msgs::msg::dds_::PoseWithCovarianceStamped_",
     "RIHS01_26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e",
 )
 TF_MESSAGE = MessageType(
-    "tf2_msgs::msg::dds_::TFMessage_",
-    "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087",
+    "tf2_msgs::msg::dds_::TFMessage_", "RIHS01_e369d0f05a23ae52508854b66f6aa0437f3449d652e8cbf22d5abe85d020f087"
 )
 
 
@@ -110,7 +107,6 @@ def encode_pose(
     """Encode geometry_msgs/PoseWithCovarianceStamped.
 
     Args:
-        header: of the message.
         x: position [m], 3 numbers.
         quaternion: orientation (x, y, z, w).
         covariance: of position [m²] and rotations about the fixed axes [rad²], 6 × 6 by rows.

@@ -54,11 +54,7 @@ class StampClock:
     """
 
     def __init__(self, max_delay_s: float) -> None:
-        """Start without data.
-
-        Args:
-            max_delay_s: a message that took this much longer than the fastest is rejected.
-        """
+        """Start without data. A message that took `max_delay_s` longer than the fastest is rejected."""
         self._max_delay_s = max_delay_s
         self._last: tuple[int, float] | None = None  # stamp and time
         self._early: list[float] = []
@@ -75,7 +71,9 @@ class StampClock:
             stamp_ns: later than all before.
             arrived: arrival of the message [s].
         """
-        if self._is_early(stamp_ns, arrived) or self._is_late(stamp_ns, arrived):
+        if self._is_early(stamp_ns, arrived):
+            return None
+        if self._last is not None and self.lateness_s(stamp_ns, arrived) > self._max_delay_s:
             return None
         # Relative to the first stamp, because a float of nanoseconds since 1970 is too coarse. Twice the delay:
         # a message in time must agree with all before it, or the clock would restart with it.
@@ -135,9 +133,6 @@ class StampClock:
             return True
         self._begin(stamp_ns)
         return False
-
-    def _is_late(self, stamp_ns: int, arrived: float) -> bool:
-        return self._last is not None and self.lateness_s(stamp_ns, arrived) > self._max_delay_s
 
     def _begin(self, stamp_ns: int) -> None:
         self._device, self._first_ns, self._last = DeviceClock(TICK_S, _SETTINGS.ticks), stamp_ns, None

@@ -1,3 +1,1 @@
 """Driver for custom encoders on a microcontroller that sends lines of text, with an emulator in `bench`."""
-
-from __future__ import annotations

@@ -9,9 +9,10 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from bodyschema.drivers.servos.config import require_each
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.suggest import did_you_mean
-from bodyschema.robot.toml_file import NonNegative, Positive, line_in_entry, line_of
+from bodyschema.robot.toml_file import NonNegative, Positive, line_in_entry
 
 TABLE = "drivers.serial_lines"
 
@@ -65,14 +66,7 @@ class SerialLinesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
         """Raise ConfigError unless each of `joints` has exactly one encoder."""
         for place, what, key, remedy in self._mistakes(joints):
             raise ConfigError(what, file=file, line=line_in_entry(text, f"{TABLE}.encoders", place, key), remedy=remedy)
-        missing = [joint for joint in joints if joint not in {encoder.joint for encoder in self.encoders}]
-        if missing:
-            raise ConfigError(
-                f"no encoder in [[{TABLE}.encoders]] for {', '.join(missing)}",
-                file=file,
-                line=line_of(text, (*TABLE.split("."), "encoders")),
-                remedy="Every joint of [robot] joints needs one",
-            )
+        require_each(joints, [encoder.joint for encoder in self.encoders], "encoder", f"{TABLE}.encoders", file, text)
 
     def _mistakes(self, joints: Sequence[str]) -> Iterator[tuple[int, str, str, str]]:
         seen_joints, seen_names = set[str](), set[str]()

@@ -5,15 +5,14 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from typing import Self
 
-from bodyschema.drivers.checks import MANY_TROUBLES, READ_S, Check
-from bodyschema.drivers.echo import BITS_PER_BYTE
+from bodyschema.drivers.checks import MANY_TROUBLES, READ_S, Check, aligned, warned
+from bodyschema.drivers.echo import BITS_PER_BYTE, Port
 from bodyschema.drivers.serial_line import RETRY_S, SerialLine
 from bodyschema.drivers.serial_lines.config import SerialLinesConfig
-from bodyschema.drivers.servos.port import Port
 from bodyschema.drivers.turn_count import LOST_AFTER_S, TurnCount
 from bodyschema.drivers.turns import SpeedGate
 from bodyschema.interfaces.errors import SourceError, SourceLost
@@ -99,6 +98,7 @@ class SerialLineJoints:
     it is opened again, all positions are compared with the last ones.
 
     Attributes:
+        joints: names of the joints in the order of q.
         encoders: as found at the last opening, in the order of the joints.
         epoch: how often it was opened.
         dropped: readings that were dropped although their lines were intact.
@@ -119,12 +119,10 @@ class SerialLineJoints:
         Args:
             config: checked; see `SerialLinesConfig.check`.
             joints: in the order of q.
-            clock: the clock.
             limits: of each joint [rad]; a range below one turn determines the turn.
             last_pose: last joint angles [rad], shape (d,), from which turns are counted.
-            open_port: opens the port.
         """
-        self._config, self._names, self._clock, self._open_port = config, tuple(joints), clock, open_port
+        self._config, self.joints, self._clock, self._open_port = config, tuple(joints), clock, open_port
         by_joint = {encoder.joint: encoder for encoder in config.encoders}
         self._wanted = [by_joint[joint] for joint in joints]
         unlimited = [(-math.inf, math.inf)] * len(joints)
@@ -136,11 +134,6 @@ class SerialLineJoints:
         self._why, self._failing = "", set[str]()
         self.encoders: list[Encoder] = []
         self.epoch = self.dropped = 0
-
-    @property
-    def joints(self) -> tuple[str, ...]:
-        """Names of the joints in the order of q."""
-        return self._names
 
     @property
     def counts(self) -> Counts:
@@ -178,11 +171,10 @@ class SerialLineJoints:
 
     def __enter__(self) -> Self:
         port = self._open_port(self._config, self._clock)
-        try:
+        with ExitStack() as stack:
+            stack.callback(_close, port)
             self._begin(port)
-        except BaseException:
-            _close(port)
-            raise
+            stack.pop_all()
         self._port = port
         self.epoch += 1
         log.info("%d encoders are read", len(self.encoders))
@@ -196,8 +188,7 @@ class SerialLineJoints:
     def read(self, timeout_s: float) -> JointReading | None:
         """Return the next reading; see `JointSource.read`.
 
-        Raises:
-            SourceLost: the port is gone, no intact lines arrive, or the board was restarted.
+        Raise SourceLost if the port is gone, no intact lines arrive, or the board was restarted.
         """
         if self._port is None:
             raise SourceError("the encoders are not open; use them in a with statement")
@@ -255,12 +246,8 @@ class SerialLineJoints:
                 encoders.append(Encoder(config, places.index(config.name), announced))
         if len(encoders) == len(self._wanted):
             return encoders
-        widths = [max(len(row[column]) for row in rows) for column in range(4)]
-        lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-        raise SourceError(
-            "\n  ".join([f"the encoders on {self._config.port} are not those of robot.toml:", *lines])
-            + f"\n  announced are: {', '.join(places)}"
-        )
+        what = f"the encoders on {self._config.port} are not those of robot.toml:"
+        raise SourceError("\n  ".join([what, *aligned(rows), f"announced are: {', '.join(places)}"]))
 
     def _anchor(self, port: Port) -> None:
         """Find the turn of each joint from two consistent readings; wait until the times are accurate."""
@@ -320,7 +307,7 @@ class SerialLineJoints:
         counts = self._turns.continued(raw)
         refused = self._gate.offer(timed.t, counts)
         if refused is not None:
-            self._why = f"joint {self._names[refused]!r}: a position where it cannot have come to"
+            self._why = f"joint {self.joints[refused]!r}: a position where it cannot have come to"
             if self._gate.jumped:
                 raise SourceLost(self._why, retry_s=RETRY_S)
             return None
@@ -369,25 +356,15 @@ def encoder_checks(
             end, readings = clock.now() + read_s, 0
             while clock.now() < end:
                 readings += encoders.read(end - clock.now()) is not None
-            yield _rate(readings / read_s)
-            counts = encoders.counts
-            yield _troubles(counts.lines, counts.garbled + counts.missing)
+            rate_hz, counts = readings / read_s, encoders.counts
+            fix = "a higher rate of the UART, fewer other things that the board does"
+            yield warned("rate", f"{rate_hz:.0f} readings/s come", fix, when=rate_hz < _SETTINGS.few_per_s)
+            lost = counts.garbled + counts.missing
+            said = f"{lost} of {counts.lines + lost} lines were garbled or missing"
+            fix = "look at the cable, and whether the board keeps the rate exactly"
+            yield warned("errors", said, fix, when=lost > MANY_TROUBLES * (counts.lines + lost))
             for complaint in encoders.health:
                 said, _, fix = complaint.rpartition(": ")
                 yield Check("encoders", "wrong", said, fix)
     except SourceError as error:
         yield Check("encoders", "wrong", str(error))
-
-
-def _rate(rate_hz: float) -> Check:
-    said = f"{rate_hz:.0f} readings/s come"
-    if rate_hz < _SETTINGS.few_per_s:
-        return Check("rate", "warning", said, "a higher rate of the UART, fewer other things that the board does")
-    return Check("rate", "ok", said)
-
-
-def _troubles(lines: int, lost: int) -> Check:
-    said = f"{lost} of {lines + lost} lines were garbled or missing"
-    if lost > MANY_TROUBLES * (lines + lost):
-        return Check("errors", "warning", said, "look at the cable, and whether the board keeps the rate exactly")
-    return Check("errors", "ok", said)

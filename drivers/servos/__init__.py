@@ -1,3 +1,1 @@
 """Code common to all vendors of bus servos: request and answer, handshake, and the joints as a source."""
-
-from __future__ import annotations

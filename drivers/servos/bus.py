@@ -11,15 +11,14 @@ from enum import StrEnum
 from itertools import chain
 from typing import TypeVar
 
-from bodyschema.drivers.echo import BITS_PER_BYTE
+from bodyschema.drivers.echo import BITS_PER_BYTE, HOST_S, Port
 from bodyschema.interfaces.protocols import Clock
 
 from .model import Layout, Model, Register
 from .packets import Garbled, Packets, Status
-from .port import Port
 
-SLOWEST_DELAY_S = 510e-6  # largest Return Delay Time
-HOST_MARGIN_S = 3e-3  # the operating system's share of an answer's delay
+RETURN_DELAY_UNIT_S = 2e-6
+LARGEST_RETURN_DELAY_S = 0xFF * RETURN_DELAY_UNIT_S
 
 
 @dataclass(frozen=True)
@@ -119,7 +118,6 @@ class Owed:
     """
 
     def __init__(self) -> None:
-        """Start without overdue answers."""
         self._until: dict[tuple[int, int, int], float] = {}
 
     @property
@@ -170,14 +168,7 @@ class Bus(ABC):
     """
 
     def __init__(self, name: str, port: Port, clock: Clock, latency_s: float) -> None:
-        """Use an open port.
-
-        Args:
-            name: of the bus.
-            port: open.
-            clock: the clock.
-            latency_s: longest time that the adapter holds bytes back.
-        """
+        """Use an open port, whose adapter holds bytes back for `latency_s` at most."""
         self.name, self.return_delay_s, self.counts = name, dict[int, float](), Counts()
         self._port, self._clock, self._latency_s = port, clock, latency_s
         self._byte_s = BITS_PER_BYTE / port.baud
@@ -224,7 +215,9 @@ class Bus(ABC):
         lately = self._asked_lately.setdefault(request.ids, deque(maxlen=_SETTINGS.asked_lately)) if is_weak else ()
         size = self._owed.size_for(request, self._clock.now(), lately)
         if size is None and is_weak:
-            self._wait_out(self._owed.until(request))
+            until = self._owed.until(request)
+            while self._port.receive(until) and self._clock.now() < until:
+                pass
         self._asked_size = request.size if size is None else size
         if is_weak:
             self._asked_lately[request.ids].append(self._asked_size)
@@ -272,10 +265,6 @@ class Bus(ABC):
         while self._clock.now() < end and self._port.receive(self._clock.now() + quiet_s):
             pass
 
-    def _wait_out(self, until: float) -> None:
-        while self._port.receive(until) and self._clock.now() < until:
-            pass
-
     def _owed_size(self, received: bytearray, at: int) -> int:
         """Return how many bytes from `at` on are overdue answers, and forget these."""
         begun, found = at, True
@@ -292,8 +281,8 @@ class Bus(ABC):
         """Return the deadline of all answers: their time on the wire, and the delays of adapter and system."""
         overhead = self.packets_of(request.protocol).overhead
         wire = self._question_size + len(request.ids) * (overhead + self._asked_size)
-        delays = sum(self.return_delay_s.get(id, SLOWEST_DELAY_S) for id in request.ids)
-        return self._sent + wire * self._byte_s + delays + 2 * self._latency_s + HOST_MARGIN_S
+        delays = sum(self.return_delay_s.get(id, LARGEST_RETURN_DELAY_S) for id in request.ids)
+        return self._sent + wire * self._byte_s + delays + 2 * self._latency_s + HOST_S
 
     def _collect(self, request: Request) -> Exchange:
         """Receive the answers of all servos, even if one is missing. Only answers before the missing one count."""

@@ -80,7 +80,6 @@ class Channel(ABC):
     """
 
     def __init__(self, servo: IdentifiedServo) -> None:
-        """Start without answers."""
         self.servo = servo
         self.newest: Sample | None = None
         self.doubts = 0
@@ -169,7 +168,6 @@ class Punctuality:
     """Detector of readings that were delayed so much that their time is less certain than usual."""
 
     def __init__(self) -> None:
-        """Start without readings."""
         self._unsure: deque[float] = deque(maxlen=_SETTINGS.lately)
 
     def is_usual(self, unsure: float) -> bool:
@@ -197,15 +195,12 @@ class Drive(Protocol):
 
     def open(self, buses: Mapping[str, Bus], servos: Sequence[IdentifiedServo]) -> None:
         """Accept the servos that were found, with torque verified off, in the order of the joints."""
-        ...
 
     def step(self, reading: JointReading | None, samples: Mapping[str, Sample | None]) -> str | None:
         """Run once each cycle, after the request, with the reading (None when it was rejected) and the newest samples.
 
         Return why the joints had to be released in this cycle, so that the other drives release theirs too; else None.
         """
-        ...
 
     def release(self, why: str | None) -> None:
         """Switch torque off and verify it on every joint as far as the bus allows. `why` is None at the regular end."""
-        ...

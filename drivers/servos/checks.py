@@ -8,16 +8,16 @@ from itertools import pairwise, zip_longest
 from statistics import median, quantiles
 from typing import Any
 
-from bodyschema.drivers.checks import MANY_TROUBLES, READ_S, Check
+from bodyschema.drivers.checks import MANY_TROUBLES, READ_S, Check, warned
 from bodyschema.drivers.echo import without_echo
-from bodyschema.drivers.servos.vendor import Plan
+from bodyschema.drivers.servos.vendor import plans_of
 from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.protocols import Clock
 
 from .bus import Bus, Request
 from .config import ServosConfig
 from .handshake import Finding, IdentifiedServo, ask_again, identify
-from .joints import OpenPort
+from .joints import OpenPort, open_serial
 from .vendor import ServoVendor
 
 IDENTIFY_S = 1.0  # servos not yet asked by then are not asked any more
@@ -28,7 +28,12 @@ FAST_BAUD = 1_000_000
 
 
 def servo_checks(
-    make: ServoVendor, config: ServosConfig[Any], clock: Clock, open_port: OpenPort, *, read_s: float = READ_S
+    make: ServoVendor,
+    config: ServosConfig[Any],
+    clock: Clock,
+    open_port: OpenPort = open_serial,
+    *,
+    read_s: float = READ_S,
 ) -> Iterator[Check]:
     """Yield checks of presence, health and reading rate of the servos. Open the ports for that."""
     with ExitStack() as stack:
@@ -78,10 +83,7 @@ def _health(make: ServoVendor, bus: Bus, servo: IdentifiedServo) -> Iterator[Che
         said = f"joint {servo.joint} (ID {servo.id}) does not report its state: {exchange.trouble}"
         yield Check(TYPE, "wrong", said, "look at cable and connectors, then bodyschema doctor once more")
         return
-    status = exchange.answers[0].status
-    has_torque = layout.value("torque", status.data, layout.state.address)
-    has_register = "hardware_error" in layout
-    bits = layout.value("hardware_error", status.data, layout.state.address) if has_register else status.error
+    has_torque, bits = layout.torque_and_errors(exchange.answers[0].status)
     for bit, text in make.errors.items():
         if bits & bit:
             said, _, fix = text.partition(": ")
@@ -109,10 +111,7 @@ def _pace(
     read_s: float,
 ) -> Iterator[Check]:
     """Read at the highest rate for a while."""
-    plans = {
-        name: Plan(bus, make.ways(bus, [s for s in servos if s.bus == name], config.buses[name]))
-        for name, bus in buses.items()
-    }
+    plans = plans_of(make, buses, servos, config)
     requests = {name: plan.requests for name, plan in plans.items()}
     before = {name: (bus.counts.exchanges, dict(bus.counts.troubles)) for name, bus in buses.items()}
     end, times = clock.now() + read_s, [clock.now()]
@@ -146,19 +145,15 @@ def _rate(times: Sequence[float], read_s: float, config: ServosConfig[Any]) -> C
     intervals = [b - a for a, b in pairwise(times)]
     jitter_ms = 1e3 * (quantiles(intervals, n=20)[-1] - median(intervals))
     said = f"{rate:.0f} readings/s are possible ({wanted_hz:.0f} wanted), jitter {jitter_ms:.1f} ms (95 %)"
-    if rate < min(FEW_PER_S, wanted_hz):
-        slow = next((name for name, bus in config.buses.items() if bus.baud < FAST_BAUD), None)
-        faster = "bodyschema install udev    # an adapter's latency timer; then plug it in again"
-        return Check(
-            "rate", "warning", said, faster if slow is None else f"bodyschema servos baud={FAST_BAUD} --bus {slow}"
-        )
-    return Check("rate", "ok", said)
+    slow = next((name for name, bus in config.buses.items() if bus.baud < FAST_BAUD), None)
+    faster = "bodyschema install udev    # an adapter's latency timer; then plug it in again"
+    fix = faster if slow is None else f"bodyschema servos baud={FAST_BAUD} --bus {slow}"
+    return warned("rate", said, fix, when=rate < min(FEW_PER_S, wanted_hz))
 
 
 def _troubles(name: str, exchanges: int, troubles: dict[str, int]) -> Check:
     count = sum(troubles.values())
     words = ", ".join(f"{n}× {what}" for what, n in sorted(troubles.items(), key=lambda item: -item[1]))
     said = f"{count} of {exchanges} questions on {name} went wrong{f': {words}' if words else ''}"
-    if count > MANY_TROUBLES * exchanges:
-        return Check("errors", "warning", said, "look at cable and connectors, the supply's voltage under load, noise")
-    return Check("errors", "ok", said)
+    fix = "look at cable and connectors, the supply's voltage under load, noise"
+    return warned("errors", said, fix, when=count > MANY_TROUBLES * exchanges)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, ClassVar, Generic, Literal, Protocol, TypeVar
+from typing import Annotated, ClassVar, Generic, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta
@@ -15,27 +15,19 @@ from bodyschema.robot.toml_file import Positive, line_in_entry, line_of
 
 from .model import Model, no_driver
 
-
-class AnyBus(Protocol):
-    """Settings that every table of a bus has."""
-
-    @property
-    def port(self) -> str:
-        """The serial port."""
-        ...
-
-    @property
-    def baud(self) -> int:
-        """Bits per second."""
-        ...
-
-    @property
-    def latency_ms(self) -> float | None:
-        """Latency of the adapter [ms]; None: read from the system."""
-        ...
+BusT = TypeVar("BusT")
 
 
-BusT = TypeVar("BusT", bound=AnyBus)
+def require_each(joints: Sequence[str], given: Sequence[str], what: str, table: str, file: Path, text: str) -> None:
+    """Raise ConfigError if one of `joints` is not among those of the array of tables."""
+    missing = [joint for joint in joints if joint not in given]
+    if missing:
+        raise ConfigError(
+            f"no {what} in [[{table}]] for {', '.join(missing)}",
+            file=file,
+            line=line_of(text, tuple(table.split("."))),
+            remedy="Every joint of [robot] joints needs one",
+        )
 
 
 class ServoConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -90,17 +82,10 @@ class ServosConfig(msgspec.Struct, Generic[BusT], frozen=True, forbid_unknown_fi
 
     def check(self, joints: Sequence[str], file: Path, text: str) -> None:
         """ConfigError when the servos are not one for each of `joints`, each with a bus and an ID of its own."""
+        table = f"{self.table}.servos"
         for place, what, key, remedy in self._mistakes(joints):
-            line = line_in_entry(text, f"{self.table}.servos", place, key)
-            raise ConfigError(what, file=file, line=line, remedy=remedy)
-        missing = [joint for joint in joints if joint not in {servo.joint for servo in self.servos}]
-        if missing:
-            raise ConfigError(
-                f"no servo in [[{self.table}.servos]] for {', '.join(missing)}",
-                file=file,
-                line=line_of(text, (*self.table.split("."), "servos")),
-                remedy="Every joint of [robot] joints needs one",
-            )
+            raise ConfigError(what, file=file, line=line_in_entry(text, table, place, key), remedy=remedy)
+        require_each(joints, [servo.joint for servo in self.servos], "servo", table, file, text)
 
     def _mistakes(self, joints: Sequence[str]) -> Iterator[tuple[int, str, str, str]]:
         seen_joints, seen_ids = set[str](), set[tuple[str, int]]()

@@ -6,22 +6,21 @@ import logging
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
+from bodyschema.drivers.checks import aligned
 from bodyschema.interfaces.errors import SourceError, SourceLost
 
-from .bus import Bus, Exchange, Request, Trouble
+from .bus import RETURN_DELAY_UNIT_S, Bus, Exchange, Request, Trouble
 from .config import ServoConfig
 from .model import Model, Register
 
 log = logging.getLogger(__name__)
 
-RETURN_DELAY_UNIT_S = 2e-6
 SETTINGS = ("return_delay", "drive_mode", "operating_mode", "homing_offset")
 
 ATTEMPTS = 5  # if one of six servos loses every twentieth answer, all five fail in one of 700 openings
 # What a busy machine or a loose cable does too; not a wrong ID, rate or setting.
 PASSING = (Trouble.TIMEOUT, Trouble.FOREIGN, Trouble.WRONG_LENGTH, Trouble.EARLY)
 RETRY_S = 0.2
-LOOKS = 5  # at what a servo measures
 GARBLED = "garbled answers: two servos with this ID, or a bad cable"
 SCAN = "`bodyschema scan --robot robot.toml` looks for them at all rates and IDs, and says what to do"
 
@@ -145,9 +144,7 @@ def require_all(findings: Iterable[Finding], ports: str) -> list[IdentifiedServo
         return [finding.servo for finding in findings if finding.servo is not None]
     rows = [("joint", "ID", "expected", "found")]
     rows += [(f.config.joint, str(f.config.id), f.config.model, f.found) for f in findings]
-    widths = [max(len(row[column]) for row in rows) for column in range(4)]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    message = "\n  ".join([f"the servos on {ports} are not those of robot.toml:", *lines, SCAN])
+    message = "\n  ".join([f"the servos on {ports} are not those of robot.toml:", *aligned(rows), SCAN])
     if all(finding.may_come_back for finding in wrong):
         brief = "; ".join(f"joint {f.config.joint!r} (ID {f.config.id}): {f.found}" for f in wrong)
         raise SourceLost(message, retry_s=RETRY_S, brief=brief)
@@ -157,9 +154,7 @@ def require_all(findings: Iterable[Finding], ports: str) -> list[IdentifiedServo
 def switch_torque_off(bus: Bus, servo: IdentifiedServo) -> IdentifiedServo:
     """Switch its torque off where it is on, and make sure; the servo with what it was like.
 
-    Raises:
-        SourceLost: it does not answer.
-        SourceError: the torque stays on.
+    Raise SourceLost if it does not answer. Raise SourceError if the torque stays on.
     """
     had_torque = torque_is_on(bus, servo)
     if had_torque:
@@ -238,5 +233,5 @@ def _absence(bus: Bus, model: Model, id: int, trouble: Trouble | None) -> str:
 def _is_garbled(bus: Bus, model: Model, id: int) -> bool:
     """Return True if most measurements are garbled, as when two servos of one model, set up alike, share an ID."""
     request = bus.read_request(model, id, model.layout.block)
-    garbled = sum(bus.ask(request).trouble is Trouble.GARBLED for _ in range(LOOKS))
-    return garbled > LOOKS // 2
+    garbled = sum(bus.ask(request).trouble is Trouble.GARBLED for _ in range(ATTEMPTS))
+    return garbled > ATTEMPTS // 2

@@ -15,7 +15,7 @@ from bodyschema.interfaces.servos import ServoHealth
 
 from .channel import Sample
 from .handshake import Finding
-from .model import Model, Register
+from .model import Register
 
 log = logging.getLogger(__name__)
 
@@ -24,29 +24,23 @@ class Health:
     """State of the servos of an arm.
 
     Attributes:
+        supplies: voltage [V] and temperature [°C] of the servos, where they are known, by joint.
+        absent: why a servo was not found, by joint.
         away: names of the buses whose ports cannot be opened.
     """
 
     def __init__(self, errors: Mapping[int, str]) -> None:
-        """Start without reports.
-
-        Args:
-            errors: meaning and remedy of each bit of the hardware error.
-        """
+        """Start without reports; `errors` are the meaning and remedy of each bit of the hardware error."""
         self._errors = errors
         self._alerts: dict[str, int] = {}
-        self._supplies: dict[str, tuple[float, float]] = {}
-        self._absent: dict[str, str] = {}
+        self.supplies: dict[str, tuple[float, float]] = {}
+        self.absent: dict[str, str] = {}
         self.away: set[str] = set()
 
     @property
     def complaints(self) -> tuple[str, ...]:
         """Current problems of servos, and what to do."""
         return tuple(f"joint {joint!r}: {'; '.join(self._reasons(bits))}" for joint, bits in list(self._alerts.items()))
-
-    def knows_supply(self, joint: str) -> bool:
-        """Return True if the voltage and temperature of the joint's servo are known."""
-        return joint in self._supplies
 
     def note_alert(self, joint: str, bits: int) -> None:
         """Update the hardware error bits of a servo, and log changes."""
@@ -59,29 +53,19 @@ class Health:
             del self._alerts[joint]
             log.info("joint %r is well again", joint)
 
-    def note_supply(self, joint: str, model: Model, data: bytes) -> None:
-        """Update voltage and temperature from the registers of `supply_of`."""
-        first = supply_of(model).address
-        voltage = VOLT_PER_UNIT * model.layout.value("voltage", data, first)
-        self._supplies[joint] = (voltage, float(model.layout.value("temperature", data, first)))
-
     def note_found(self, findings: Iterable[Finding]) -> None:
         """Note which servos were found at an opening, and which were not."""
-        self._absent = {finding.config.joint: finding.found for finding in findings if finding.servo is None}
-
-    def note_silent(self, joint: str, trouble: str) -> None:
-        """Note that a servo does not answer when it is asked alone."""
-        self._absent[joint] = trouble
+        self.absent = {finding.config.joint: finding.found for finding in findings if finding.servo is None}
 
     def of(self, servo: IdentifiedServo, sample: Sample | None, lost: str | None) -> ServoHealth:
         """Return the state of a servo; `lost` is the joint that lost its turn count."""
         joint = servo.joint
-        voltage, temperature = self._supplies.get(joint, (None, None))
+        voltage, temperature = self.supplies.get(joint, (None, None))
         troubles = self._reasons(self._alerts.get(joint, 0))
         if joint == lost:
             troubles.append("its turn count is lost: turn it back, or say that it is right")
-        if joint in self._absent:
-            troubles = [f"{self._absent[joint]}: look at its supply and cable, and those of the one before it"]
+        if joint in self.absent:
+            troubles = [f"{self.absent[joint]}: look at its supply and cable, and those of the one before it"]
         if servo.bus in self.away:
             troubles = ["its bus is away: look at the adapter's cable"]
         current = None if sample is None else sample.current
@@ -91,12 +75,6 @@ class Health:
     def _reasons(self, bits: int) -> list[str]:
         known = [text for bit, text in self._errors.items() if bits & bit]
         return known or ([f"hardware error {bits:#04x}"] if bits else [])
-
-
-def supply_of(model: Model) -> Register:
-    """Return the register range with voltage and temperature of a model."""
-    voltage, temperature = model.layout["voltage"], model.layout["temperature"]
-    return Register(voltage.address, temperature.end - voltage.address)
 
 
 EVERY_S = 0.1  # one servo in turn
@@ -122,8 +100,7 @@ class Inspection:
     def go_on(self) -> None:
         """Inspect the next servo, if it is time.
 
-        Raises:
-            SourceLost: its torque is on, and none of our drives switched it on.
+        Raise SourceLost if its torque is on, and none of our drives switched it on.
         """
         if self._clock.now() < self._next_s:
             return
@@ -135,7 +112,7 @@ class Inspection:
         if self._looked >= len(self._servos):  # the first round is made at once
             self._next_s = self._clock.now() + EVERY_S
         self._judge(servo, exchange)
-        if self._looked % SUPPLY_EVERY == 0 or not self._health.knows_supply(servo.joint):
+        if self._looked % SUPPLY_EVERY == 0 or servo.joint not in self._health.supplies:
             self._ask_supply(servo)
 
     def first_silent(self) -> str | None:
@@ -143,7 +120,7 @@ class Inspection:
         for servo in self._servos:
             trouble = self._ask_state(servo).trouble
             if trouble is not None:
-                self._health.note_silent(servo.joint, trouble)
+                self._health.absent[servo.joint] = trouble
                 return f"joint {servo.joint!r} (ID {servo.id}): {trouble}"
         return None
 
@@ -162,10 +139,14 @@ class Inspection:
         self._health.note_alert(servo.joint, bits)
 
     def _ask_supply(self, servo: IdentifiedServo) -> None:
-        bus = self._buses[servo.bus]
-        exchange = bus.ask(bus.read_request(servo.model, servo.id, supply_of(servo.model)))
+        bus, layout = self._buses[servo.bus], servo.model.layout
+        first = layout["voltage"].address
+        supply = Register(first, layout["temperature"].end - first)
+        exchange = bus.ask(bus.read_request(servo.model, servo.id, supply))
         if exchange.trouble is None:
-            self._health.note_supply(servo.joint, servo.model, exchange.answers[0].status.data)
+            data = exchange.answers[0].status.data
+            volts = VOLT_PER_UNIT * layout.value("voltage", data, first)
+            self._health.supplies[servo.joint] = (volts, float(layout.value("temperature", data, first)))
 
     def _ask_state(self, servo: IdentifiedServo) -> Exchange:
         return self._buses[servo.bus].ask(self._state_request(servo))
@@ -175,8 +156,4 @@ class Inspection:
 
 
 def _state_in(servo: IdentifiedServo, exchange: Exchange) -> tuple[int, int]:
-    """Return the torque flag and the hardware error bits."""
-    status, layout = exchange.answers[0].status, servo.model.layout
-    has_register = "hardware_error" in layout
-    bits = layout.value("hardware_error", status.data, layout.state.address) if has_register else status.error
-    return layout.value("torque", status.data, layout.state.address), bits
+    return servo.model.layout.torque_and_errors(exchange.answers[0].status)

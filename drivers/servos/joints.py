@@ -10,10 +10,11 @@ from dataclasses import dataclass
 from itertools import zip_longest
 from typing import Any, Self
 
-from bodyschema.drivers.echo import without_echo
+from bodyschema.drivers.echo import Port, without_echo
+from bodyschema.drivers.serial_line import SerialLine, adapter_latency_s
 from bodyschema.drivers.servos.channel import Drive
 from bodyschema.drivers.servos.health import Inspection
-from bodyschema.drivers.servos.vendor import Plan
+from bodyschema.drivers.servos.vendor import Plan, plans_of
 from bodyschema.drivers.turn_count import LOST_AFTER_S, TurnCount
 from bodyschema.drivers.turns import SpeedGate
 from bodyschema.interfaces.errors import SourceError, SourceLost
@@ -23,10 +24,9 @@ from bodyschema.interfaces.servos import BusHealth, ServoHealth
 
 from .bus import Bus, Counts, Request
 from .channel import Channel, Punctuality, Sample, middle
-from .config import ServoConfig, ServosConfig
-from .handshake import RETRY_S, Finding, IdentifiedServo, identify, require_all, restore_torque, switch_torque_off
+from .config import ServosConfig
+from .handshake import RETRY_S, IdentifiedServo, identify, require_all, restore_torque, switch_torque_off
 from .health import Health
-from .port import Port
 from .vendor import ServoVendor
 
 log = logging.getLogger(__name__)
@@ -53,6 +53,12 @@ OpenPort = Callable[[Any, Clock], tuple[Port, float]]
 """Opens the port of a bus; with the latency of its adapter [s]."""
 
 
+def open_serial(config: Any, clock: Clock) -> tuple[Port, float]:
+    """Open the port of a bus; return it and the latency of its adapter [s]."""
+    latency_s = adapter_latency_s(config.port) if config.latency_ms is None else config.latency_ms * 1e-3
+    return SerialLine.open(config.port, config.baud, clock.now), latency_s
+
+
 class ServoJoints:
     """Reader of the positions of an arm with torque off, except for joints held by `drives`.
 
@@ -62,19 +68,23 @@ class ServoJoints:
     again, everything is verified again, and the positions are compared with the last ones.
 
     Attributes:
+        joints: names of the joints in the order of q.
+        drives: may move the joints on request.
         servos: as found at the last opening, in the order of the joints.
         epoch: how often it was opened. Only this comparison connects positions of different epochs.
         dropped: number of dropped readings.
+        make: the vendor.
     """
+
+    make: ServoVendor
 
     def __init__(
         self,
-        make: ServoVendor,
         config: ServosConfig[Any],
         joints: Sequence[str],
         clock: Clock,
         *,
-        open_port: OpenPort,
+        open_port: OpenPort = open_serial,
         limits: Sequence[tuple[float, float]] | None = None,
         last_pose: Sequence[float] | None = None,
         drives: Sequence[Drive] = (),
@@ -82,18 +92,15 @@ class ServoJoints:
         """Prepare without opening anything.
 
         Args:
-            make: the vendor.
             config: checked; see `ServosConfig.check`.
             joints: in the order of q.
-            clock: the clock.
             open_port: opens the port of a bus.
             limits: of each joint [rad]; a range below one turn determines the turn.
             last_pose: last joint angles [rad], shape (d,), from which turns are counted.
             drives: may move joints on request; without any, torque stays off.
         """
-        self._drives = tuple(drives)
-        self._make, self._config, self._names, self._clock = make, config, tuple(joints), clock
-        self._open_port = open_port
+        self._config, self.joints, self._clock = config, tuple(joints), clock
+        self._open_port, self.drives = open_port, tuple(drives)
         by_joint = {servo.joint: servo for servo in config.servos}
         self._wanted = [by_joint[joint] for joint in joints]
         unlimited = [(-math.inf, math.inf)] * len(joints)
@@ -106,39 +113,29 @@ class ServoJoints:
         self._channels: list[Channel] = []
         self._at: dict[tuple[str, int], int] = {}
         self._last_t = -math.inf
-        self._health = Health(make.errors)
+        self._health = Health(self.make.errors)
         self._counts = {name: Counts() for name in config.buses}
         self.servos: list[IdentifiedServo] = []
         self.epoch = self.dropped = 0
 
     @property
-    def joints(self) -> tuple[str, ...]:
-        """Names of the joints in the order of q."""
-        return self._names
-
-    @property
-    def drives(self) -> tuple[Drive, ...]:
-        """Drives that may move its joints."""
-        return self._drives
-
-    @property
     def health(self) -> tuple[str, ...]:
         """Current problems of servos, and what to do."""
-        of_drives = (text for drive in self._drives for text in drive.complaints)
+        of_drives = (text for drive in self.drives for text in drive.complaints)
         return (*self._health.complaints, *self._slow, *of_drives)
 
     @property
     def servo_health(self) -> tuple[ServoHealth, ...]:
         """State of each servo; empty before the first opening. From any thread."""
-        samples = self.samples
-        lost = self._turns.lost
+        samples, lost = self.samples, self._turns.lost
         return tuple(self._health.of(servo, samples.get(servo.joint), lost) for servo in list(self.servos))
 
     @property
     def bus_health(self) -> Mapping[str, BusHealth]:
         """Statistics of each bus since the start, by name. From any thread."""
+        ways = {name: plan.name for name, plan in self._plans.items()}
         return {
-            name: BusHealth(counts.exchanges, {str(t): n for t, n in list(counts.troubles.items())}, self._way(name))
+            name: BusHealth(counts.exchanges, {str(t): n for t, n in list(counts.troubles.items())}, ways.get(name, ""))
             for name, counts in self._counts.items()
         }
 
@@ -164,15 +161,18 @@ class ServoJoints:
     def __enter__(self) -> Self:
         with ExitStack() as stack:
             self._open_buses(stack)
-            names = ", ".join(bus.port for bus in self._config.buses.values())
-            findings = [self._identified(servo) for servo in self._wanted]
+            config = self._config
+            findings = [
+                identify(self._buses[config.bus_of(servo)], servo, config.model_of(servo), self.make.models)
+                for servo in self._wanted
+            ]
             self._health.note_found(findings)
-            servos = require_all(findings, names)
+            servos = require_all(findings, ", ".join(bus.port for bus in config.buses.values()))
             self.servos = [switch_torque_off(self._buses[servo.bus], servo) for servo in servos]
             self._prepare()
             self._anchor()
             stack.callback(self._restore)
-            for drive in self._drives:
+            for drive in self.drives:
                 drive.open(self._buses, self.servos)
             stack.callback(self._release, None)
             self._opened = stack.pop_all()
@@ -189,8 +189,7 @@ class ServoJoints:
     def read(self, timeout_s: float) -> JointReading | None:
         """Return the next reading; see `JointSource.read`.
 
-        Raises:
-            SourceLost: a port is gone, or a servo no longer answers, was restarted, or has torque.
+        Raise SourceLost if a port is gone, or a servo no longer answers, was restarted, or has torque.
         """
         if not self._is_open:
             raise SourceError("the servos are not open; use them in a with statement")
@@ -203,7 +202,7 @@ class ServoJoints:
 
     def temperature_c(self, joint: str) -> float | None:
         """Read the temperature of a joint's servo; None without an answer or port. For the reading thread only."""
-        servo = self.servos[self._names.index(joint)]
+        servo = self.servos[self.joints.index(joint)]
         bus, register = self._buses[servo.bus], servo.model.layout["temperature"]
         try:
             exchange = bus.ask(bus.read_request(servo.model, servo.id, register))
@@ -217,7 +216,11 @@ class ServoJoints:
                 self._wait_until(deadline)
                 return None
             if self._wait_until(self._next_poll):
-                self._next_poll = self._following_poll()
+                self._polls += 1
+                # The phase relative to the servos' ticks varies, to refine the clock offset.
+                shift = self._polls * GOLDEN % 1 - (self._polls - 1) * GOLDEN % 1
+                next_poll = self._next_poll + 1 / self._config.rate_hz + shift * self.make.tick_s
+                self._next_poll = max(next_poll, self._clock.now())
                 reading = self._poll()
                 if reading is not None:
                     return reading
@@ -233,20 +236,13 @@ class ServoJoints:
             port, latency_s = self._open_port(config, self._clock)
             stack.callback(_close, port)
             heard = without_echo(port, self._clock, latency_s)
-            self._buses[name] = self._make.bus(name, heard, self._clock, latency_s)
+            self._buses[name] = self.make.bus(name, heard, self._clock, latency_s)
             self._buses[name].counts = self._counts[name]
             self._health.away.discard(name)
 
-    def _identified(self, servo: ServoConfig) -> Finding:
-        return identify(self._buses[self._config.bus_of(servo)], servo, self._config.model_of(servo), self._make.models)
-
     def _prepare(self) -> None:
-        plans: dict[str, Plan] = {}
-        for name, bus in self._buses.items():
-            servos = [servo for servo in self.servos if servo.bus == name]
-            plans[name] = Plan(bus, self._make.ways(bus, servos, self._config.buses[name]))
-        self._plans = plans
-        self._channels = [self._make.channel(servo) for servo in self.servos]
+        self._plans = plans_of(self.make, self._buses, self.servos, self._config)
+        self._channels = [self.make.channel(servo) for servo in self.servos]
         self._at = {(servo.bus, servo.id): place for place, servo in enumerate(self.servos)}
         speed = math.radians(self._config.max_speed_deg_s)
         self._gate = SpeedGate(
@@ -256,7 +252,7 @@ class ServoJoints:
         now = self._clock.now()
         self._believed_s, self._failures, self._next_poll, self._polls = now, 0, now, 0
         self._improve_s = now + IMPROVE_EVERY_S
-        self._inspection = Inspection(self._buses, self.servos, self._health, self._drives, self._clock)
+        self._inspection = Inspection(self._buses, self.servos, self._health, self.drives, self._clock)
         self._why = "no answer"
 
     def _anchor(self) -> None:
@@ -297,7 +293,7 @@ class ServoJoints:
 
     def _release(self, why: str | None) -> None:
         with ExitStack() as stack:  # release each, even if one fails
-            for drive in self._drives:
+            for drive in self.drives:
                 stack.callback(drive.release, why)
 
     # --- reading
@@ -307,39 +303,30 @@ class ServoJoints:
         reading = None if samples is None else self._judge(samples)
         self._inspection.go_on()
         self._improve()
-        for why in [drive.step(reading, self.samples) for drive in self._drives]:
+        for why in [drive.step(reading, self.samples) for drive in self.drives]:
             if why is not None:
                 self._release(why)
         if reading is None:
-            self._dropped_one()
+            self.dropped += 1
+            self._failures += 1
+            if self._failures >= _SETTINGS.few_polls and self._clock.now() - self._believed_s > LOST_AFTER_S:
+                raise SourceLost(self._inspection.first_silent() or self._why, retry_s=RETRY_S)
         else:
             self._believed_s, self._failures = self._clock.now(), 0
         return reading
 
     def _improve(self) -> None:
         """Try a faster read method at intervals, but not while a drive holds joints."""
-        if self._clock.now() < self._improve_s or any(drive.holding for drive in self._drives):
+        if self._clock.now() < self._improve_s or any(drive.holding for drive in self.drives):
             return
         self._improve_s = self._clock.now() + IMPROVE_EVERY_S
         for name, plan in self._plans.items():
             if plan.improve():
                 log.info("%s is read with %s from now on", name, plan.name)
 
-    def _way(self, name: str) -> str:
-        return self._plans[name].name if name in self._plans else ""
-
     @property
     def _slow(self) -> list[str]:
         return [f"bus {name}: {complaint}" for name, plan in self._plans.items() for complaint in plan.complaints]
-
-    def _following_poll(self) -> float:
-        """Return the time of the next request.
-
-        Its phase relative to the servos' ticks varies, to refine the clock offset.
-        """
-        self._polls += 1
-        before, after = (self._polls - 1) * GOLDEN % 1, self._polls * GOLDEN % 1
-        return max(self._next_poll + 1 / self._config.rate_hz + (after - before) * self._make.tick_s, self._clock.now())
 
     def _ask_all(self) -> list[Sample] | None:
         """Ask all buses at the same time and return a sample of each joint; None when one is missing or doubtful."""
@@ -350,19 +337,23 @@ class ServoJoints:
                 bus.send(question)
             for bus, question in asked:
                 self._take(bus, question, samples)
-        return [samples[place] for place in range(len(self._names))] if len(samples) == len(self._names) else None
+        return [samples[place] for place in range(len(self.joints))] if len(samples) == len(self.joints) else None
 
     def _take(self, bus: Bus, question: Request, samples: dict[int, Sample]) -> None:
         exchange = bus.collect(question)
         stale = False
         for answer in exchange.answers:
             place = self._at[bus.name, answer.status.id]
-            sample = self._channels[place].take(answer)
+            channel = self._channels[place]
+            sample = channel.take(answer)
             if sample is None:
                 stale = True
-                self._why = f"joint {self._names[place]!r}: an answer from another time"
-                self._refuse_restarted(self._channels[place])
-            elif exchange.trouble is None and self._is_confirmed(bus, question, self._channels[place], sample):
+                self._why = f"joint {self.joints[place]!r}: an answer from another time"
+                if channel.doubts >= _SETTINGS.doubts:
+                    raise SourceLost(
+                        f"joint {channel.servo.joint!r} (ID {channel.servo.id}) was restarted", retry_s=RETRY_S
+                    )
+            elif exchange.trouble is None and self._is_confirmed(bus, question, channel, sample):
                 samples[place] = sample
         if exchange.trouble is not None and exchange.culprit is not None:
             servo = self.servos[self._at[bus.name, exchange.culprit]]
@@ -399,17 +390,6 @@ class ServoJoints:
             return None
         self._last_t = t
         return JointReading(t, frozen_array(self._turns.keep(counts)), unsure / math.sqrt(3))  # of a uniform error
-
-    def _dropped_one(self) -> None:
-        self.dropped += 1
-        self._failures += 1
-        if self._failures >= _SETTINGS.few_polls and self._clock.now() - self._believed_s > LOST_AFTER_S:
-            raise SourceLost(self._inspection.first_silent() or self._why, retry_s=RETRY_S)
-
-    def _refuse_restarted(self, channel: Channel) -> None:
-        if channel.doubts >= _SETTINGS.doubts:
-            servo = channel.servo
-            raise SourceLost(f"joint {servo.joint!r} (ID {servo.id}) was restarted", retry_s=RETRY_S)
 
     def _wait_until(self, t: float) -> bool:
         """Wait until a time. Return False when a servo sent bytes that were not requested."""

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
+from .packets import Status
+
 
 @dataclass(frozen=True, slots=True)
 class Register:
@@ -79,6 +81,13 @@ class Layout:
             return 0
         register = self.registers[name]
         return register.value(data[register.address - address : register.end - address])
+
+    def torque_and_errors(self, status: Status) -> tuple[int, int]:
+        """Return the torque flag and the hardware error bits in an answer that begins with `state`."""
+        begin = self.state.address
+        has_register = "hardware_error" in self
+        bits = self.value("hardware_error", status.data, begin) if has_register else status.error
+        return self.value("torque", status.data, begin), bits
 
 
 @dataclass(frozen=True, slots=True)

@@ -58,10 +58,15 @@ class Packets(Protocol):
 
     def take(self, received: bytes | bytearray, at: int) -> Status | None:
         """Return the status packet that begins at `at`; None when it is incomplete. Raise Garbled if there is none."""
-        ...
 
 
 HEADER, LARGEST_ID = b"\xff\xff", 0xFD
+
+
+def summed(id: int, code: int, params: bytes = b"") -> bytes:
+    """Build a packet of the older protocols; `code` is the instruction, or the error in a status packet."""
+    body = bytes((id, len(params) + 2, code)) + params
+    return HEADER + body + bytes((~sum(body) & 0xFF,))
 
 
 def take_summed(received: bytes | bytearray, at: int) -> Status | None:

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 
-from bodyschema.drivers.scan import ScannedPort
-from bodyschema.drivers.servos.handshake import ATTEMPTS
+from bodyschema.drivers.echo import BITS_PER_BYTE, HOST_S, Port, without_echo
+from bodyschema.drivers.serial_line import DEFAULT_LATENCY_S, SerialLine
+from bodyschema.drivers.servos.handshake import ask_again
+from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.protocols import Clock
-from bodyschema.interfaces.servos import FoundServo
+from bodyschema.interfaces.servos import FoundServo, ScannedBus
 
-from .bus import BITS_PER_BYTE, SLOWEST_DELAY_S, Bus, Exchange, Request, Trouble
+from .bus import LARGEST_RETURN_DELAY_S, Bus, Exchange, Request, Trouble
 from .model import Model, Register, no_driver
 from .packets import Garbled, Packets, Status
+from .settings import LARGEST_ID
 
-IDS = range(253)
-HOST_S = 5e-3  # the operating system's share of an answer's delay
+IDS = range(LARGEST_ID + 1)
 APART_S = 1e-3  # shortest time between two requests
 VOLT_PER_UNIT = 0.1  # for all series of all vendors; temperatures are in °C
-OVERHEAD_OF_PING = 6  # bytes of the request in the older protocols
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,16 +74,16 @@ class Identity:
 
 
 class PingScanner:
-    """Scanner for servos of kinds whose PING is identical (a `Scanner`).
+    """Scanner for servos of kinds whose PING is identical.
 
     Each ID is asked. The requests do not wait for the answers, which carry an ID. If an answer is unintelligible, each
     ID is asked by itself. The start of the control table identifies the kind.
     """
 
-    def __init__(self, *kinds: Kind, question: int = OVERHEAD_OF_PING) -> None:
-        """Scan for `kinds`, whose PING has `question` bytes."""
+    def __init__(self, *kinds: Kind) -> None:
+        """Scan for `kinds`."""
         self._kinds, self._packets = kinds, kinds[0].packets
-        self._ping_sizes = (question, self._packets.overhead + self._packets.ping_size)
+        self._ping_sizes = (len(self._packets.ping(0)), self._packets.overhead + self._packets.ping_size)
 
     @property
     def protocol(self) -> str:
@@ -93,15 +95,15 @@ class PingScanner:
         """Baud rates that robot.toml can name for one of them, likely ones first [bit/s]."""
         return tuple(dict.fromkeys(baud for kind in self._kinds for baud in kind.bauds))
 
-    def scan(self, name: str, port: ScannedPort, clock: Clock, latency_s: float) -> Iterator[FoundServo]:
-        """Yield the servos on the port; see `Scanner.scan`."""
+    def scan(self, name: str, port: Port, clock: Clock, latency_s: float) -> Iterator[FoundServo]:
+        """Yield the servos on the open port `name` in the order of their IDs. Never write to a register."""
         ids = set(self._ids(port, clock, latency_s))
         if ids:  # where there is one there may be others whose answers were lost
             ids.update(self._ids(port, clock, latency_s))
         for id in sorted(ids):
             yield self._found(name, port, clock, latency_s, id)
 
-    def _ids(self, port: ScannedPort, clock: Clock, latency_s: float) -> list[int]:
+    def _ids(self, port: Port, clock: Clock, latency_s: float) -> list[int]:
         """Return the IDs that answer. An ID with unintelligible answers counts if it answers again when asked alone."""
         port.flush()
         spacing = self._spacing_s(port.baud)
@@ -117,11 +119,11 @@ class PingScanner:
 
     def _spacing_s(self, baud: int) -> float:
         """Return the time between two requests [s], so that the answer to the first has ended."""
-        return max(sum(self._ping_sizes) * BITS_PER_BYTE / baud + SLOWEST_DELAY_S, APART_S)
+        return max(sum(self._ping_sizes) * BITS_PER_BYTE / baud + LARGEST_RETURN_DELAY_S, APART_S)
 
-    def _unclear(self, port: ScannedPort, clock: Clock, latency_s: float, known: set[int]) -> set[int]:
+    def _unclear(self, port: Port, clock: Clock, latency_s: float, known: set[int]) -> set[int]:
         """Return the IDs that answer anything, asked one by one."""
-        wait_s = sum(self._ping_sizes) * BITS_PER_BYTE / port.baud + SLOWEST_DELAY_S + 2 * latency_s + HOST_S
+        wait_s = sum(self._ping_sizes) * BITS_PER_BYTE / port.baud + LARGEST_RETURN_DELAY_S + 2 * latency_s + HOST_S
         found = set[int]()
         for id in IDS:
             if id in known:
@@ -148,7 +150,7 @@ class PingScanner:
             at += status.size
         return statuses, is_clean
 
-    def _found(self, name: str, port: ScannedPort, clock: Clock, latency_s: float, id: int) -> FoundServo:
+    def _found(self, name: str, port: Port, clock: Clock, latency_s: float, id: int) -> FoundServo:
         """Return the servo with its identity and state."""
         kind = self._kinds[0]
         servo, bus = FoundServo(name, port.baud, self.protocol, id), kind.bus(name, port, clock, latency_s)
@@ -157,7 +159,9 @@ class PingScanner:
             return replace(servo, troubles=tuple(dict.fromkeys(kind.packets.pinged_only for kind in self._kinds)))
         if head.trouble is not None:
             return replace(servo, is_double=True, troubles=(DOUBLE,))
-        identity = self._identity(head.answers[0].status.data, id)
+        told = [found for kind in self._kinds if (found := kind.told(head.answers[0].status.data, id)) is not None]
+        # The first kind with this model, else the first possible one.
+        identity = next((found for found in told if found.model is not None), told[0] if told else None)
         unsupported = kind.unsupported.get(int.from_bytes(head.answers[0].status.data[:2], "little"))
         if unsupported is not None:
             return replace(servo, model=unsupported, troubles=(no_driver(unsupported),))
@@ -176,12 +180,6 @@ class PingScanner:
         layouts = [model.layout for kind in self._kinds for model in kind.models.values()]
         return Register(0, max(layout[name].end for layout in layouts for name in ("model", "firmware", "id")))
 
-    def _identity(self, head: bytes, id: int) -> Identity | None:
-        """Return the identity from the first kind with this model, else from the first possible kind."""
-        told = [identity for kind in self._kinds if (identity := kind.told(head, id)) is not None]
-        known = [identity for identity in told if identity.model is not None]
-        return next(iter([*known, *told]), None)
-
 
 def _with_state(bus: Bus, servo: FoundServo, kind: Kind, model: Model) -> FoundServo:
     layout = model.layout
@@ -190,8 +188,7 @@ def _with_state(bus: Bus, servo: FoundServo, kind: Kind, model: Model) -> FoundS
     if told.trouble is not None:  # two servos of one model give the same answers until registers that differ are read
         return replace(servo, is_double=True, troubles=(DOUBLE,))
     status = told.answers[0].status
-    has_register = "hardware_error" in layout
-    bits = layout.value("hardware_error", status.data, first) if has_register else status.error
+    has_torque, bits = layout.torque_and_errors(status)
     troubles = [text for bit, text in kind.errors.items() if bits & bit]
     if servo.baud not in kind.bauds:
         troubles.append(f"robot.toml has no such rate: give it {kind.bauds[0]:,} bit/s")
@@ -199,30 +196,65 @@ def _with_state(bus: Bus, servo: FoundServo, kind: Kind, model: Model) -> FoundS
         servo,
         voltage_v=VOLT_PER_UNIT * layout.value("voltage", status.data, first),
         temperature_c=float(layout.value("temperature", status.data, first)),
-        has_torque=bool(layout.value("torque", status.data, first)),
+        has_torque=bool(has_torque),
         troubles=tuple(troubles),
     )
 
 
 def _asked(bus: Bus, kind: Kind, id: int, register: Register) -> Exchange:
     request = Request(lambda n: kind.packets.read(id, register.address, n), (id,), register.size, kind.version)
-    exchange = Exchange(())
-    for _ in range(ATTEMPTS):
-        exchange = bus.ask(request)
-        if exchange.trouble is None:
-            break
-        if exchange.trouble is not Trouble.TIMEOUT:  # on a busy machine bytes read late belong to an earlier request
-            bus.settle()
-    return exchange
+    return ask_again(bus, request)
 
 
 DOUBLE = "two servos have this ID, or the cable is bad: take one off, give the other another ID"
 UNKNOWN = "a model that no driver knows"
 
 
-def heard(port: ScannedPort, clock: Clock, end: float, enough: int | None = None) -> bytes:
+def heard(port: Port, clock: Clock, end: float, enough: int | None = None) -> bytes:
     """Return what arrives until `end`; with `enough` stop after this many bytes."""
     received = b""
     while clock.now() < end and (enough is None or len(received) < enough):
         received += port.receive(end)
     return received
+
+
+def open_line(port: str, baud: int, clock: Clock) -> Port:
+    """Open a real port."""
+    return SerialLine.open(port, baud, clock.now)
+
+
+Tell = Callable[[str], None]
+
+
+def scan_port(
+    port: str,
+    scanners: Sequence[PingScanner],
+    clock: Clock,
+    tell: Tell,
+    *,
+    bauds: Sequence[int] = (),
+    latency_s: float = DEFAULT_LATENCY_S,
+    open_port: Callable[[str, int, Clock], Port] = open_line,
+) -> ScannedBus:
+    """Find the servos on a port at all rates, or at `bauds`.
+
+    Args:
+        scanners: one per protocol.
+        tell: called with each step and with what was found.
+        bauds: rates to try; all by default.
+        latency_s: longest time that the adapter holds bytes back.
+    """
+    found: list[FoundServo] = []
+    all_bauds = dict.fromkeys(baud for scanner in scanners for baud in scanner.bauds)
+    try:
+        for baud in bauds or all_bauds:
+            with closing(open_port(port, baud, clock)) as opened:
+                line = without_echo(opened, clock, latency_s)
+                for scanner in scanners:
+                    if baud in scanner.bauds:
+                        count = f"{len(found)} servo{'' if len(found) == 1 else 's'}"
+                        tell(f"{port}: {scanner.protocol} at {baud:,} bit/s; {count} so far")
+                        found += scanner.scan(port, line, clock, latency_s)
+    except SourceError as error:
+        return ScannedBus(port, tuple(found), str(error))
+    return ScannedBus(port, tuple(found))

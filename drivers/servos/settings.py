@@ -11,6 +11,10 @@ from bodyschema.robot.suggest import did_you_mean
 from .model import Register
 
 ID, BAUD, HOMING_OFFSET = "id", "baud", "homing_offset"
+LARGEST_ID = 252  # 253 is legal, but no robot.toml can name it
+RENAMED = "set id in robot.toml"
+OTHER_RATE = "set baud in robot.toml; all servos of a bus need the same"
+OTHER_ZERO = "the joint's zero moves: pairs measured before do not fit those after"
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,11 +40,7 @@ class Setting:
     follows: str = ""
 
     def value(self, text: str) -> int:
-        """Parse the user's value.
-
-        Raises:
-            ConfigError: not a value of this setting, or out of range.
-        """
+        """Parse the user's value. Raise ConfigError if it is no value of this setting, or out of range."""
         if text in self.words:
             return self.words[text]
         try:

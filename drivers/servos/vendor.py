@@ -10,6 +10,7 @@ from bodyschema.drivers.servos.bus import Bus, Request
 from bodyschema.drivers.servos.handshake import ATTEMPTS
 
 from .channel import Channel
+from .config import ServosConfig
 from .handshake import IdentifiedServo
 from .model import Model
 from .settings import Setting
@@ -34,12 +35,7 @@ class Plan:
     """The fastest read method that works, for each group of servos of a bus."""
 
     def __init__(self, bus: Bus, groups: Sequence[Sequence[Way]]) -> None:
-        """Try each group's methods several times each. The last one is taken without a try.
-
-        Args:
-            bus: the bus.
-            groups: the methods of each group, the fastest first.
-        """
+        """Try each group's methods, the fastest first, several times each. The last one is taken without a try."""
         self._bus, self._groups = bus, groups
         self._taken = [self._first_answered(ways, ATTEMPTS) for ways in groups]
 
@@ -72,12 +68,16 @@ class Plan:
 
     def _first_answered(self, ways: Sequence[Way], attempts: int) -> int:
         for place, way in enumerate(ways[:-1]):
-            if any(self._is_answered(way) for _ in range(attempts)):
-                return place
+            for _ in range(attempts):
+                if all(self._bus.ask(request).trouble is None for request in way.requests):
+                    return place
         return len(ways) - 1
 
-    def _is_answered(self, way: Way) -> bool:
-        return all(self._bus.ask(request).trouble is None for request in way.requests)
+
+def one_by_one(bus: Bus, servos: Sequence[IdentifiedServo]) -> Way:
+    """Return the method that reads each servo by itself."""
+    requests = (bus.read_request(servo.model, servo.id, servo.model.layout.block) for servo in servos)
+    return Way("one by one", tuple(requests))
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,5 +103,15 @@ class ServoVendor:
     channel: Callable[[IdentifiedServo], Channel]
     ways: Callable[[Bus, Sequence[IdentifiedServo], Any], Sequence[Sequence[Way]]]
     settings: Callable[[Model], Sequence[Setting]]
-    homing_sign: Literal[1, -1]
+    homing_sign: Literal[1, -1] = 1
     tick_s: float = 0.0
+
+
+def plans_of(
+    make: ServoVendor, buses: Mapping[str, Bus], servos: Sequence[IdentifiedServo], config: ServosConfig[Any]
+) -> dict[str, Plan]:
+    """Return how the servos of each bus are read, by name of the bus."""
+    return {
+        name: Plan(bus, make.ways(bus, [servo for servo in servos if servo.bus == name], config.buses[name]))
+        for name, bus in buses.items()
+    }

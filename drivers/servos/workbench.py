@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Self
 
-from bodyschema.drivers.echo import without_echo
+from bodyschema.drivers.echo import Port, without_echo
 from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.protocols import Clock
 
@@ -16,7 +16,6 @@ from .bus import Bus, Trouble
 from .config import ServoConfig
 from .handshake import ATTEMPTS, IdentifiedServo, identify, read_register, switch_torque_off
 from .model import Model, Register
-from .port import Port
 from .settings import ID, Setting
 from .vendor import ServoVendor
 
@@ -62,13 +61,9 @@ class Done:
 
 
 class EepromEditor:
-    """Servos whose EEPROM is looked at and changed. Use as a context manager; it opens ports when they are needed.
-
-    The bus of a servo is its port.
-    """
+    """Servos whose EEPROM is looked at and changed. A context manager that opens ports (its buses) on demand."""
 
     def __init__(self, make: ServoVendor, clock: Clock, open_at: OpenAt) -> None:
-        """Store the arguments; open nothing yet."""
         self.make, self._clock, self._open_at = make, clock, open_at
         self._buses: dict[str, tuple[int, Bus]] = {}
 
@@ -99,15 +94,14 @@ class EepromEditor:
         finding = identify(bus, config, model, self.make.models)
         if finding.servo is None:
             raise SourceError(
-                f"{_named(config)} on {bus.name}: {finding.found}. "
+                f"joint {config.joint!r} (ID {config.id}, {config.model}) on {bus.name}: {finding.found}. "
                 "Look with `bodyschema scan` who is there; nothing was written"
             )
         return finding.servo
 
     def model_at(self, bus: Bus, id: int) -> Model | None:
         """Identify the model of the servo with an ID by trying every protocol of the make; None if it stays unknown."""
-        by_protocol = {model.protocol: model for model in self.make.models.values()}
-        for protocol, any_of_it in by_protocol.items():
+        for protocol, any_of_it in self._by_protocol.items():
             register = any_of_it.layout["model"]
             data, _ = read_register(bus, any_of_it, id, register)
             model = None if data is None else self.make.models.get(register.value(data))
@@ -117,23 +111,19 @@ class EepromEditor:
 
     def is_taken(self, bus: Bus, id: int) -> bool:
         """Return True if a servo answers to an ID in any protocol."""
-        by_protocol = {model.protocol: model for model in self.make.models.values()}
-        return any(bus.ping(model, id).trouble is not Trouble.TIMEOUT for model in by_protocol.values())
+        return any(bus.ping(model, id).trouble is not Trouble.TIMEOUT for model in self._by_protocol.values())
+
+    @property
+    def _by_protocol(self) -> dict[int, Model]:
+        return {model.protocol: model for model in self.make.models.values()}
 
     def value(self, bus: Bus, servo: IdentifiedServo, setting: Setting) -> int:
         """Return the setting's value in the servo's EEPROM. Raise SourceError if the servo does not answer."""
-        data, trouble = read_register(bus, servo.model, servo.id, setting.register)
-        if data is None:
-            raise SourceError(f"joint {servo.joint!r} (ID {servo.id}) on {bus.name}: {trouble}. Nothing was written")
-        return setting.register.value(data)
+        return _read(bus, servo, setting.register)
 
     def position(self, bus: Bus, servo: IdentifiedServo) -> int:
         """Return the servo's position [ticks]. Raise SourceError if it does not answer."""
-        position = servo.model.layout["position"]
-        data, trouble = read_register(bus, servo.model, servo.id, position)
-        if data is None:
-            raise SourceError(f"joint {servo.joint!r} (ID {servo.id}) on {bus.name}: {trouble}")
-        return position.value(data)
+        return _read(bus, servo, servo.model.layout["position"])
 
     def homing_offset(self, bus: Bus, servo: IdentifiedServo) -> int:
         """Return the homing offset that makes the servo's present position its `zero_ticks`, modulo full turns."""
@@ -170,7 +160,9 @@ class EepromEditor:
         id = change.then if change.setting.name == ID else servo.id
         data, trouble = read_register(bus, servo.model, id, register)
         if data is None and change.setting.name == ID:
-            return self._still_there(bus, change, trouble)
+            old, _ = read_register(bus, servo.model, servo.id, register)
+            if old is not None:
+                return Done(change, Outcome.KEPT, servo.id, "the servo refuses it, and answers to its old ID")
         if data is None:
             return _lost(change, trouble)
         found = register.value(data)
@@ -179,13 +171,6 @@ class EepromEditor:
         if found == change.now:
             return Done(change, Outcome.KEPT, found, "the servo refuses it: out of range for this model, or locked")
         return Done(change, Outcome.OTHER, found, f"{change.setting.shown(found)} was read back")
-
-    def _still_there(self, bus: Bus, change: Change, trouble: Trouble | None) -> Done:
-        """Return the outcome of an ID change when no servo answers to the new ID: read from the old one."""
-        data, _ = read_register(bus, change.servo.model, change.servo.id, change.setting.register)
-        if data is None:
-            return _lost(change, trouble)
-        return Done(change, Outcome.KEPT, change.servo.id, "the servo refuses it, and answers to its old ID")
 
     def _met(self, port: str, baud: int, then: int, change: Change) -> Done:
         servo, register = change.servo, change.setting.register
@@ -230,5 +215,8 @@ def _lost(change: Change, trouble: Trouble | None) -> Done:
     return Done(change, Outcome.UNKNOWN, None, said)
 
 
-def _named(config: ServoConfig) -> str:
-    return f"joint {config.joint!r} (ID {config.id}, {config.model})"
+def _read(bus: Bus, servo: IdentifiedServo, register: Register) -> int:
+    data, trouble = read_register(bus, servo.model, servo.id, register)
+    if data is None:
+        raise SourceError(f"joint {servo.joint!r} (ID {servo.id}) on {bus.name}: {trouble}. Nothing was written")
+    return register.value(data)

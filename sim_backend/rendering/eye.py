@@ -77,10 +77,8 @@ def cast_ball(
     mirrored = 2 * facing[:, None] * normals - to_light
     to_eye = -rays / np.linalg.norm(rays, axis=1, keepdims=True)
     shine = np.maximum(np.einsum("ij,ij->i", mirrored, to_eye), 0.0) ** _SETTINGS.shininess
-    colours = (_SETTINGS.ball_ambient + _SETTINGS.ball_diffuse * facing)[:, None] * bgr + (_SETTINGS.specular * shine)[
-        :, None
-    ]
-    return mask, np.minimum(colours, 1.0) * 255.0
+    lit = (_SETTINGS.ball_ambient + _SETTINGS.ball_diffuse * facing)[:, None] * bgr
+    return mask, np.minimum(lit + (_SETTINGS.specular * shine)[:, None], 1.0) * 255.0
 
 
 def cluttered_room(
@@ -166,9 +164,8 @@ class TagSheets:
             on_sheet = np.abs(place).max(axis=1) < tag.half_sheet_m
             seen[seen] = on_sheet
             lit = _SETTINGS.ambient + _SETTINGS.diffuse * max(float(axes[:, 2] @ to_light), 0.0)
-            level[seen] = lit * np.where(
-                _is_black(place[on_sheet] / tag.side_m, black), _SETTINGS.black, _SETTINGS.white
-            )
+            dark = _is_black(place[on_sheet] / tag.side_m, black)
+            level[seen] = lit * np.where(dark, _SETTINGS.black, _SETTINGS.white)
             nearest[seen] = z[seen]
         mask = np.isfinite(level)
         return mask, np.repeat(255.0 * level[mask][:, None], 3, axis=1)
@@ -311,10 +308,8 @@ class StereoEyes:
     def _add_noise(self, image: ImageArray, rng: np.random.Generator) -> None:
         if self._config.noise == 0:
             return
-        field, dy, dx = (
-            int(rng.integers(_SETTINGS.noise_fields)),
-            *(int(d) for d in rng.integers(_SETTINGS.noise_shift_px, size=2)),
-        )
+        field = int(rng.integers(_SETTINGS.noise_fields))
+        dy, dx = (int(d) for d in rng.integers(_SETTINGS.noise_shift_px, size=2))
         height, width = image.shape[:2]
         cv2.add(image, self._noise[field, dy : dy + height, dx : dx + width], dst=image, dtype=cv2.CV_8U)
 

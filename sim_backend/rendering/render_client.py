@@ -7,6 +7,7 @@ import os
 import select
 import subprocess
 from contextlib import ExitStack
+from multiprocessing.connection import Connection
 from typing import Self
 
 import numpy as np
@@ -18,6 +19,7 @@ from bodyschema.interfaces.records import ImageArray
 from bodyschema.interfaces.waits import END_LIMIT_S
 from bodyschema.sim_backend.bullet import PhysicsUrdf
 from bodyschema.sim_backend.config import SimConfig
+from bodyschema.sim_backend.truth import TrueRobot
 
 from .render_messages import SLOTS, Frame, Setup, Tool, frame_bytes, send, slot_images
 from .scene import Scene
@@ -30,18 +32,12 @@ class RenderProcess:
     either process ends.
     """
 
-    def __init__(
-        self,
-        urdf: PhysicsUrdf,
-        joints: tuple[str, ...],
-        marker_link: str,
-        calibration: StereoCalibration,
-        config: SimConfig,
-    ) -> None:
+    def __init__(self, urdf: PhysicsUrdf, truth: TrueRobot, calibration: StereoCalibration, config: SimConfig) -> None:
+        calibration = truth.true_eyes(calibration)
         self._setup = Setup(
             urdf=urdf,
-            joints=joints,
-            marker_link=marker_link,
+            joints=truth.robot.joints,
+            marker_link=truth.robot.robot.marker_link,
             focal_px=calibration.focal_px,
             principal_point_px=calibration.principal_point_px,
             baseline_m=calibration.baseline_m,
@@ -49,7 +45,6 @@ class RenderProcess:
             camera=config.camera,
             seed=config.seed,
         )
-        self._requests = self._answers = -1
         self._exit = ExitStack()
 
     def __enter__(self) -> Self:
@@ -59,7 +54,7 @@ class RenderProcess:
             stack.callback(os.close, memory)
             os.ftruncate(memory, size)
             self._shared = stack.enter_context(mmap.mmap(memory, size))
-            its_requests, self._requests = os.pipe()
+            its_requests, requests = os.pipe()
             self._answers, its_answers = os.pipe()
             stack.callback(os.close, self._answers)
             try:
@@ -68,7 +63,7 @@ class RenderProcess:
                 os.close(its_requests)
                 os.close(its_answers)
             stack.callback(self._end)
-            stack.callback(os.close, self._requests)
+            self._requests = stack.enter_context(Connection(requests, readable=False))
             self._send(self._setup)
             self._tip: tuple[float, float, float] | None = None
             self._exit = stack.pop_all()
@@ -96,8 +91,7 @@ class RenderProcess:
     def fetch(self, number: int, timeout_s: float) -> tuple[ImageArray, ...] | None:
         """Frame `number`, the earliest not yet fetched, as images of the caller's own; None after `timeout_s`.
 
-        Raises:
-            SourceLost: the renderer's process has died.
+        Raise SourceLost if the renderer's process has died.
         """
         if not select.select([self._answers], [], [], max(0.0, timeout_s))[0]:
             return None

@@ -1,9 +1,8 @@
-"""Messages from the world to its renderer: length-prefixed MessagePack over a pipe."""
+"""Messages from the world to its renderer: MessagePack over a pipe."""
 
 from __future__ import annotations
 
-import os
-import struct
+from multiprocessing.connection import Connection
 from typing import Any
 
 import msgspec
@@ -14,7 +13,6 @@ from bodyschema.interfaces.records import ImageArray
 from bodyschema.sim_backend.bullet import PhysicsUrdf
 from bodyschema.sim_backend.config import CameraConfig
 
-_LENGTH = struct.Struct("<I")
 # Frames in the shared memory; more than can be under way at once.
 SLOTS = 4
 
@@ -71,21 +69,17 @@ _encoder = msgspec.msgpack.Encoder()
 _decoder = msgspec.msgpack.Decoder(Message)
 
 
-def send(pipe: int, message: Message) -> None:
-    """Write a message to a file descriptor. Raise BrokenPipeError if the reader is gone."""
-    body = _encoder.encode(message)
-    data = memoryview(_LENGTH.pack(len(body)) + body)
-    while data:
-        data = data[os.write(pipe, data) :]
+def send(pipe: Connection, message: Message) -> None:
+    """Write a message. Raise BrokenPipeError if the reader is gone."""
+    pipe.send_bytes(_encoder.encode(message))
 
 
-def receive(pipe: int) -> Message | None:
-    """Return the next message from a file descriptor; None at its end."""
-    head = _read(pipe, _LENGTH.size)
-    if head is None:
+def receive(pipe: Connection) -> Message | None:
+    """Return the next message; None at the end of the pipe, even in the middle of one."""
+    try:
+        return _decoder.decode(pipe.recv_bytes())
+    except (EOFError, OSError):
         return None
-    body = _read(pipe, _LENGTH.unpack(head)[0])
-    return None if body is None else _decoder.decode(body)
 
 
 def frame_bytes(setup: Setup) -> int:
@@ -100,14 +94,3 @@ def slot_images(shared: Any, number: int, setup: Setup) -> tuple[ImageArray, ...
     size = frame_bytes(setup)
     pixels = np.frombuffer(shared, dtype=np.uint8, count=size, offset=(number % SLOTS) * size)
     return tuple(pixels.reshape(setup.eyes, height, width, 3))
-
-
-def _read(pipe: int, count: int) -> bytes | None:
-    parts: list[bytes] = []
-    while count:
-        part = os.read(pipe, count)
-        if not part:
-            return None
-        parts.append(part)
-        count -= len(part)
-    return b"".join(parts)

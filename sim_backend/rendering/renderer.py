@@ -7,16 +7,17 @@ from __future__ import annotations
 
 import mmap
 import os
-import select
 import signal
 import sys
+from multiprocessing.connection import Connection
 
 import cv2
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray, ImageArray
 from bodyschema.sim_backend.bullet import Body
-from bodyschema.sim_backend.geometry import quaternion_of, turn_of_z
+from bodyschema.sim_backend.geometry import turn_of_z
+from kbmaps.rotations import quaternions
 
 from .eye import TO_LIGHT, StereoEyes
 from .raster import Raster
@@ -64,14 +65,15 @@ class Stick:
         self._body.bullet.resetBasePositionAndOrientation(
             self._id,
             (T[:3, :3] @ middle + T[:3, 3]).tolist(),
-            quaternion_of(T[:3, :3] @ turn),
+            quaternions((T[:3, :3] @ turn)[None])[0].tolist(),
             physicsClientId=self._body.client,
         )
 
 
 def serve(memory: int, requests: int, answers: int) -> None:
     """Paint frames until the requests end."""
-    setup = _next(requests)
+    pipe = Connection(requests, writable=False)
+    setup = _next(pipe)
     if not isinstance(setup, Setup):
         return
     calibration = setup.calibration
@@ -79,7 +81,7 @@ def serve(memory: int, requests: int, answers: int) -> None:
         raster = Raster(body.bullet, body.client, calibration, TO_LIGHT)
         eyes = StereoEyes(raster, calibration, setup.camera, setup.seed)
         stick = Stick(body, setup.marker_link)
-        while (message := _next(requests)) is not None:
+        while (message := _next(pipe)) is not None:
             if isinstance(message, Tool):
                 stick.change(np.array(message.tip))
             elif isinstance(message, Frame):
@@ -94,13 +96,13 @@ def _paint(frame: Frame, body: Body, stick: Stick, eyes: StereoEyes, images: tup
     eyes.paint(frame.number, T_world_camera, x_eyes, np.array(frame.R_camera_marker).reshape(3, 3), images)
 
 
-def _next(requests: int) -> Message | None:
+def _next(pipe: Connection) -> Message | None:
     """Return the next request; None if the parent closed the pipe or is gone (its fork may keep the pipe open)."""
     parent = os.getppid()
-    while not select.select([requests], [], [], _PARENT_CHECK_S)[0]:
+    while not pipe.poll(_PARENT_CHECK_S):
         if os.getppid() != parent:
             return None
-    return receive(requests)
+    return receive(pipe)
 
 
 if __name__ == "__main__":

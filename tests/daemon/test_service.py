@@ -107,8 +107,7 @@ def test_a_start_that_works_is_given_more_time(systemd, tmp_path) -> None:
 
 
 def test_a_reload_begins_with_its_time_and_ends_with_ready(service, systemd) -> None:
-    service.reloading()
-    service.reloaded()
+    service.follow(lambda: "nothing changed")
     first, last = systemd.all()
     assert first.startswith("RELOADING=1\nMONOTONIC_USEC=")
     assert last == "READY=1"

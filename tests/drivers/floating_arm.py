@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections.abc import Sequence
+from operator import truediv
 
 import numpy as np
 from bench_arm import HeardPort
@@ -15,12 +16,12 @@ from bodyschema.drivers.dynamixel.bench.chain import Chain
 from bodyschema.drivers.dynamixel.bench.servo import CURRENT_MODE, Servo
 from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
 from bodyschema.drivers.dynamixel.joints import DynamixelJoints
-from bodyschema.drivers.dynamixel.models import BY_NAME
-from bodyschema.drivers.dynamixel.powered_config import FloatingJoint, ZeroForceConfig, torque_constant
+from bodyschema.drivers.dynamixel.models import BY_NAME, TORQUE_AT_CURRENT
+from bodyschema.drivers.dynamixel.powered_config import FloatingJoint, ZeroForceConfig
 from bodyschema.drivers.dynamixel.zero_force import ZeroForce
 
 MODEL = "XM430-W350"
-CONSTANT = torque_constant(MODEL) or math.nan
+CONSTANT = truediv(*TORQUE_AT_CURRENT[MODEL])
 WEIGHT_N_M = 1.2  # of a pendulum that lies level
 INERTIA, DAMPING, FRICTION_N_M = 0.03, 0.02, 0.01
 STEP_S = 1e-3

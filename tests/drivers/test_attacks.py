@@ -25,7 +25,7 @@ from bodyschema.drivers.feetech.bench.arm import Chain as FeetechChain
 from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
 from bodyschema.drivers.feetech.joints import Bus as FeetechBus
 from bodyschema.drivers.feetech.models import BY_NAME as FEETECH_MODELS
-from bodyschema.drivers.scan import scan_port
+from bodyschema.drivers.servos.scan import scan_port
 from bodyschema.drivers.servos.workbench import EepromEditor
 from bodyschema.interfaces.errors import SourceLost
 

@@ -14,13 +14,12 @@ from bodyschema.drivers.checks import Check, holders, port_checks
 from bodyschema.drivers.dynamixel.bench.arm import DynamixelArm
 from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
 from bodyschema.drivers.dynamixel.joints import DYNAMIXEL
-from bodyschema.drivers.dynamixel.joints import open_serial as open_dynamixel
 from bodyschema.drivers.feetech.bench.arm import FeetechArm
 from bodyschema.drivers.feetech.config import BusConfig as FeetechBus
 from bodyschema.drivers.feetech.config import FeetechConfig
 from bodyschema.drivers.feetech.joints import FEETECH
-from bodyschema.drivers.feetech.joints import open_serial as open_feetech
 from bodyschema.drivers.servos.checks import servo_checks
+from bodyschema.drivers.servos.joints import open_serial
 from bodyschema.interfaces.clock import SystemClock
 
 JOINTS = ("waist", "elbow")
@@ -36,11 +35,11 @@ FEETECH_CONFIG = FeetechConfig(
 # overloaded servo is fixed.
 MAKES = {
     "Dynamixel": (
-        DynamixelArm, CONFIG, DYNAMIXEL, open_dynamixel, "MX-28",
+        DynamixelArm, CONFIG, DYNAMIXEL, open_serial, "MX-28",
         "free the joint, then switch its supply off and on",
     ),
     "Feetech": (
-        FeetechArm, FEETECH_CONFIG, FEETECH, open_feetech, "SCS0009",
+        FeetechArm, FEETECH_CONFIG, FEETECH, open_serial, "SCS0009",
         "free the joint, then switch its supply off and on",
     ),
 }  # fmt: skip

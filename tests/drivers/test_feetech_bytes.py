@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from test_dynamixel_bus import TalkingPort
 from virtual_port import VirtualClock
 
-from bodyschema.drivers.feetech.bench.arm import Chain, Code, instructions_in, status_packet
+from bodyschema.drivers.feetech.bench.arm import Chain, Code, instructions_in, summed
 from bodyschema.drivers.feetech.bench.servo import CALIBRATE, Servo
 from bodyschema.drivers.feetech.joints import PACKETS, Bus, Channel
 from bodyschema.drivers.feetech.models import BY_NAME, MODELS
@@ -24,7 +24,7 @@ NOISE = st.lists(st.one_of(st.binary(max_size=12), st.sampled_from([b"\xff\xff",
 PIECES = st.lists(
     st.one_of(
         st.binary(max_size=40),
-        st.builds(lambda id, size: status_packet(id, 0, bytes(size)), st.integers(1, 3), st.sampled_from([15, 7])),
+        st.builds(lambda id, size: summed(id, 0, bytes(size)), st.integers(1, 3), st.sampled_from([15, 7])),
     ),
     max_size=6,
 )
@@ -38,7 +38,7 @@ def test_instructions_are_those_of_the_manual_s_examples() -> None:
 
 @given(data=NOISE, id=st.integers(0, 252), error=st.integers(0, 255))
 def test_what_a_servo_says_is_what_the_driver_reads(data, id, error) -> None:
-    packet = status_packet(id, error, data[:200])
+    packet = summed(id, error, data[:200])
     status = PACKETS.take(packet, 0)
     assert status == Status(id, error, data[:200], len(packet))
 
@@ -60,7 +60,7 @@ def test_only_intact_answers_of_who_was_asked_are_believed_whatever_comes(pieces
     said = b"".join(pieces)
     for answer, id in zip(exchange.answers, (1, 2), strict=False):
         assert answer.status.id == id
-        assert status_packet(id, answer.status.error, answer.status.data) in said
+        assert summed(id, answer.status.error, answer.status.data) in said
     assert clock.now() < 101.0
 
 
@@ -159,7 +159,7 @@ def test_servos_answer_a_sync_read_one_after_the_other() -> None:
 def test_a_broadcast_ping_is_answered_by_each() -> None:
     chain = Chain([Servo(BY_NAME["STS3215"], id, lambda t: 0.0) for id in (6, 2, 1, 252)])
     replies = chain.send(PACKETS.ping(0xFE), 0.0, BAUD)
-    assert [reply.data for reply in replies] == [status_packet(id, 0, b"") for id in (1, 2, 6, 252)]
+    assert [reply.data for reply in replies] == [summed(id, 0, b"") for id in (1, 2, 6, 252)]
     ends = [reply.start + 6 * 10 / BAUD for reply in replies]
     assert all(end < after.start for end, after in zip(ends[:-1], replies[1:], strict=True))
 

@@ -23,7 +23,8 @@ from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
 from bodyschema.drivers.feetech.joints import FeetechPackets
 from bodyschema.drivers.feetech.models import BAUDS as FEETECH_BAUDS
 from bodyschema.drivers.feetech.models import BY_NAME as FEETECH
-from bodyschema.drivers.scan import scan_port, serial_ports
+from bodyschema.drivers.serial_line import serial_ports
+from bodyschema.drivers.servos.scan import scan_port
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.servos import FoundServo, ScannedBus

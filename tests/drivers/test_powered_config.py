@@ -10,7 +10,7 @@ import pytest
 
 from bodyschema.drivers.config import DriversConfig
 from bodyschema.drivers.dynamixel.models import BY_NAME, MODELS
-from bodyschema.drivers.dynamixel.powered_config import TORQUE_AT_CURRENT, torque_constant
+from bodyschema.drivers.dynamixel.powered_config import TORQUE_AT_CURRENT
 from bodyschema.interfaces.errors import ConfigError
 
 SERVOS = """
@@ -115,4 +115,5 @@ def test_one_model_with_current_control_has_no_torque_constant() -> None:
 def test_each_torque_constant_is_of_a_servo_with_current_control() -> None:
     for name in TORQUE_AT_CURRENT:
         assert BY_NAME[name].current_unit is not None
-        assert 0.1 < (torque_constant(name) or 0) < 6
+        torque, current = TORQUE_AT_CURRENT[name]
+        assert 0.1 < torque / current < 6

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
+from operator import truediv
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +17,7 @@ from bodyschema.daemon.wiring.wiring import open_drives
 from bodyschema.drivers.dynamixel.bench.chain import Chain
 from bodyschema.drivers.dynamixel.bench.servo import CURRENT_MODE, Servo
 from bodyschema.drivers.dynamixel.joints import DynamixelJoints
-from bodyschema.drivers.dynamixel.models import BY_NAME
-from bodyschema.drivers.dynamixel.powered_config import torque_constant
+from bodyschema.drivers.dynamixel.models import BY_NAME, TORQUE_AT_CURRENT
 
 pybullet = pytest.importorskip("pybullet")
 
@@ -54,7 +54,7 @@ class BulletArm:
     def _step(self, now: float) -> None:
         q = self.path[-1]
         if not self.held:
-            constant = torque_constant("XM430-W350") or math.nan
+            constant = truediv(*TORQUE_AT_CURRENT["XM430-W350"])
             for joint, servo in enumerate(self.servos):
                 pybullet.setJointMotorControl2(
                     self.body,

@@ -3,5 +3,3 @@
 `chain.Chain` is the protocol, bytes in and timed bytes out; `pty_shell` runs it on a
 pseudo-terminal that any program opens like a serial port.
 """
-
-from __future__ import annotations

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bodyschema.drivers.bench.chain import ServoChain, mixed
 from bodyschema.drivers.bench.device import Reply, Sampling, no_faults
+from bodyschema.drivers.dynamixel.models import PING_SLOT_S
 
 from .frames import (
     ALERT,
@@ -20,8 +21,6 @@ from .frames import (
 from .servo import Servo
 
 __all__ = ["Chain", "no_faults"]
-
-PING_SLOT_S = 3e-3  # each ID has its time slot to answer a broadcast PING
 
 
 class Chain(ServoChain[Servo]):
@@ -47,18 +46,14 @@ class Chain(ServoChain[Servo]):
         for servo in hearing:
             if _is_for(instruction, servo.id):
                 servo.hear(t)
-        many = (
-            {
-                Code.SYNC_READ: self._sync_read,
-                Code.FAST_SYNC_READ: self._fast_sync_read,
-                Code.BULK_READ: self._bulk_read,
-                Code.FAST_BULK_READ: self._fast_bulk_read,
-                Code.SYNC_WRITE: self._sync_write,
-                Code.BULK_WRITE: self._bulk_write,
-            }.get(Code(instruction.code))
-            if instruction.code in _CODES
-            else None
-        )
+        many = {
+            Code.SYNC_READ: self._sync_read,
+            Code.FAST_SYNC_READ: self._fast_sync_read,
+            Code.BULK_READ: self._bulk_read,
+            Code.FAST_BULK_READ: self._fast_bulk_read,
+            Code.SYNC_WRITE: self._sync_write,
+            Code.BULK_WRITE: self._bulk_write,
+        }.get(instruction.code)  # type: ignore[call-overload]
         if many is not None and not (instruction.protocol == 1 and instruction.code in _ONLY2):
             return many(hearing, instruction, t)
         if instruction.id == BROADCAST:
@@ -162,7 +157,6 @@ class Chain(ServoChain[Servo]):
         return []
 
 
-_CODES = frozenset(Code)
 _LISTS = (Code.SYNC_READ, Code.FAST_SYNC_READ, Code.SYNC_WRITE)
 _ONLY2 = (Code.SYNC_READ, Code.FAST_SYNC_READ, Code.FAST_BULK_READ, Code.BULK_WRITE)
 

@@ -8,6 +8,7 @@ from enum import IntEnum
 from typing import Literal
 
 from bodyschema.drivers.dynamixel.crc16 import crc16
+from bodyschema.drivers.servos.packets import summed
 
 HEADER1, HEADER2 = b"\xff\xff", b"\xff\xff\xfd\x00"
 BROADCAST = 0xFE
@@ -118,8 +119,7 @@ def _instruction(packet: bytes, end: int) -> Instruction:
 def status_packet(protocol: int, id: int, error: int, params: bytes) -> bytes:
     """Build a servo's answer."""
     if protocol == 1:
-        body = bytes((id, len(params) + 2, error)) + params
-        return HEADER1 + body + bytes((~sum(body) & 0xFF,))
+        return summed(id, error, params)
     body = bytes((STATUS, error)) + params
     stuffed = body.replace(b"\xff\xff\xfd", b"\xff\xff\xfd\xfd")
     packet = HEADER2 + bytes((id,)) + (len(stuffed) + 2).to_bytes(2, "little") + stuffed

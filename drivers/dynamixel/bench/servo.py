@@ -82,10 +82,7 @@ class Servo:
         """Create a servo with factory settings, except for the arguments.
 
         Args:
-            model: its model.
-            id: on the bus.
             angle: shaft angle [rad] as a function of time [s]; 0 in the middle of its range, any number of turns.
-            baud: bits per second.
             return_delay_s: delay between instruction and answer.
             booted_s: time of power-up.
             fast: it supports FAST_SYNC_READ.
@@ -130,17 +127,14 @@ class Servo:
 
     @property
     def id(self) -> int:
-        """ID on the bus."""
         return self["id"]
 
     @property
     def baud(self) -> int:
-        """Baud rate of the servo [bit/s]."""
         return baud_of(self.model.layout, self["baud"])
 
     @property
     def return_delay_s(self) -> float:
-        """Delay between instruction and answer [s]."""
         return self["return_delay"] * TICKS_PER_REPLY_DELAY_US * 1e-6
 
     @property
@@ -158,7 +152,6 @@ class Servo:
             self["torque"] = 0
 
     def angle(self, t: float) -> float:
-        """Return the shaft angle at `t` [rad]."""
         return self._angle(t)
 
     def hear(self, t: float) -> None:
@@ -376,12 +369,10 @@ class Servo:
         self["position"] = self.position(t)
 
     def _told_current(self, t: float) -> int:
-        unit = self.model.current_unit
-        return (
-            0
-            if unit is None
-            else round((-1 if self._is_reversed else 1) * (self.motor_current(t) + self.excess_a) / unit)
-        )
+        if self.model.current_unit is None:
+            return 0
+        ticks = round((self.motor_current(t) + self.excess_a) / self.model.current_unit)
+        return -ticks if self._is_reversed else ticks
 
     def _refusal(self, address: int, data: bytes) -> Error:
         layout, end = self.model.layout, address + len(data)

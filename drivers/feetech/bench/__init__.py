@@ -1,3 +1,1 @@
 """Emulator of a chain of Feetech servos at the byte level, for tests and for trying a configuration without an arm."""
-
-from __future__ import annotations

@@ -16,6 +16,7 @@ from bodyschema.drivers.bench.servo_arm import AT_THE_START, ServoArm
 from bodyschema.drivers.feetech.bench.servo import Servo
 from bodyschema.drivers.feetech.config import FeetechConfig, ServoConfig
 from bodyschema.drivers.feetech.models import BAUDS
+from bodyschema.drivers.servos.packets import HEADER, summed
 
 
 def swapped(reply: Reply, rng: Random) -> Reply:
@@ -31,7 +32,6 @@ def storm(intensity: float, rng: Random, longest_late_s: float = 0.05) -> faults
     return faults.storm(intensity, rng, swapped, longest_late_s=longest_late_s)
 
 
-HEADER = b"\xff\xff"
 BROADCAST = 0xFE
 
 
@@ -87,12 +87,6 @@ def instructions_in(stream: bytearray) -> tuple[list[Instruction], int]:
             at += 1
 
 
-def status_packet(id: int, error: int, params: bytes) -> bytes:
-    """Build a servo's answer."""
-    body = bytes((id, len(params) + 2, error)) + params
-    return HEADER + body + bytes((~sum(body) & 0xFF,))
-
-
 # Shorter than the 3 ms per ID, besides the bytes, that scan_port of huggingface/lerobot waits, and longer than the
 # longest return delay.
 PING_GAP_S = 1e-3
@@ -108,7 +102,7 @@ class Chain(ServoChain[Servo]):
 
     def _packet(self, servo: Servo, id: int, error: int, params: bytes) -> bytes:
         del servo
-        return status_packet(id, error, params)
+        return summed(id, error, params)
 
     def _will_answer(self, servo: Servo, code: int) -> bool:
         return servo["status_return"] > 0 or code in (Code.PING, Code.READ, Code.SYNC_READ)
@@ -151,7 +145,7 @@ class Chain(ServoChain[Servo]):
         return replies
 
     def _pongs(self, servos: list[Servo]) -> list[bytes]:
-        return [status_packet(servo.id, servo["status"], b"") for servo in servos]
+        return [summed(servo.id, servo["status"]) for servo in servos]
 
     def _is_understood(self, servo: Servo, instruction: Instruction) -> bool:
         params = instruction.params

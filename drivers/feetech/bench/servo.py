@@ -84,10 +84,7 @@ class Servo:
         """Create a servo with factory settings, except for the arguments.
 
         Args:
-            model: its model.
-            id: on the bus.
             angle: shaft angle [rad] as a function of time [s]; 0 in the middle of its range, any number of turns.
-            baud: bits per second.
             return_delay_s: delay between instruction and answer.
             multi_turn: it counts turns until it loses power.
         """
@@ -118,21 +115,17 @@ class Servo:
 
     @property
     def id(self) -> int:
-        """ID on the bus."""
         return self["id"]
 
     @property
     def baud(self) -> int:
-        """Baud rate of the servo [bit/s]."""
         return BAUDS[min(self["baud"], len(BAUDS) - 1)]
 
     @property
     def return_delay_s(self) -> float:
-        """Delay between instruction and answer [s]."""
         return self["return_delay"] * RETURN_DELAY_UNIT_US * 1e-6
 
     def angle(self, t: float) -> float:
-        """Return the shaft angle at `t` [rad]."""
         return self._angle(t)
 
     def fail(self, bits: int) -> None:

@@ -1,3 +1,1 @@
 """OptiTrack's NatNet protocol, versions 3 and 4, as Motive streams it: no SDK is needed."""
-
-from __future__ import annotations

@@ -10,13 +10,13 @@ from collections.abc import Callable, Iterator
 from bodyschema.drivers.markers.config import NatnetTable
 from bodyschema.drivers.markers.report import Packet, Report, Unusable
 from bodyschema.drivers.markers.udp import await_any, listening, received
+from bodyschema.drivers.ros2.messages import NANO
 from bodyschema.interfaces.errors import SourceError, SourceLost
 from bodyschema.interfaces.protocols import Clock
 
 from . import packets
 from .packets import Message, ServerInfo
 
-NANO = 1_000_000_000
 ANSWER_S, ASK_EVERY_S = 2.0, 0.4
 RETRY_S = 10.0  # opening takes ANSWER_S where no server is
 ALIVE_EVERY_S = 1.0  # a server forgets clients that are silent for seconds
@@ -43,33 +43,27 @@ class NatnetReceiver:
     def open(self) -> None:
         """Request the server's version and join its stream.
 
-        Raises:
-            SourceLost: it does not answer.
-            SourceError: it speaks another version of NatNet.
+        Raise SourceLost if it does not answer. Raise SourceError if it speaks another version of NatNet.
         """
         self.server, self.names, self._frames = None, {}, 0
         try:
             self._commands = listening("0.0.0.0", 0)
             self._await_server()
             self._join()
-            self._await_names()
+            until = self._clock.now() + ANSWER_S  # without an answer the bodies' IDs are used
+            while not self.names and self._clock.now() < until:
+                self._ask(packets.packet(Message.REQUEST_MODEL), lambda: bool(self.names))
         except BaseException:
             self.close()
             raise
 
     def close(self) -> None:
-        """Leave the stream."""
         for found in (self._commands, self._data):
             if found is not None:
                 found.close()
         self._commands = self._data = None
 
     def receive(self, until: float) -> Packet | None:
-        """Return the next frame; None when none arrives by `until` [s].
-
-        Raises:
-            SourceLost: the server has been silent for seconds.
-        """
         while True:
             self._keep_alive()
             sockets = [found for found in (self._data, self._commands) if found is not None]
@@ -84,7 +78,6 @@ class NatnetReceiver:
                 await_any(sockets, min(until, now + ALIVE_EVERY_S), self._clock)
 
     def silence(self) -> str:
-        """Return why nothing may be coming, and what to do."""
         if self.server is None:
             return "start Motive"
         if self.server.group:
@@ -103,8 +96,10 @@ class NatnetReceiver:
         is_dated = rate > 0 and found.exposed > 0 and found.sent >= found.exposed
         stamp_ns = found.sent * NANO // rate if is_dated else round(found.time_s * NANO)
         age_s = (found.sent - found.exposed) / rate if is_dated else 0.0
-        if any(body.id not in self.names for body in found.bodies):
-            self._ask_names()
+        now = self._clock.now()
+        if any(body.id not in self.names for body in found.bodies) and now - self._asked_names > ALIVE_EVERY_S:
+            self._asked_names = now
+            self._send(packets.packet(Message.REQUEST_MODEL))
         for body in found.bodies:
             yield Report(
                 x=body.x if body.is_tracked else None,
@@ -135,12 +130,6 @@ class NatnetReceiver:
                 "Motive to 2.0 or later"
             )
 
-    def _await_names(self) -> None:
-        """Request the rigid bodies' names; without an answer their IDs are used."""
-        until = self._clock.now() + ANSWER_S
-        while not self.names and self._clock.now() < until:
-            self._ask(packets.packet(Message.REQUEST_MODEL), lambda: bool(self.names))
-
     def _ask(self, question: bytes, is_answered: Callable[[], bool]) -> None:
         """Send a question and take what comes until it is answered, for `ASK_EVERY_S` at most."""
         self._send(question)
@@ -151,12 +140,6 @@ class NatnetReceiver:
                 got = received(self._commands, self._clock)
                 if got is not None:
                     self._sorted(*got)
-
-    def _ask_names(self) -> None:
-        now = self._clock.now()
-        if now - self._asked_names > ALIVE_EVERY_S:
-            self._asked_names = now
-            self._send(packets.packet(Message.REQUEST_MODEL))
 
     def _join(self) -> None:
         """Join the multicast group, if the server sends to one."""

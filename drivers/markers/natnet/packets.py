@@ -133,13 +133,13 @@ def frame(contents: bytes, version: Version) -> Frame:
     reader = _Reader(contents)
     is_sized = version >= SIZED_SINCE
     number = reader.int32()
-    for skip in (_marker_set, _vector):
-        reader.section(is_sized, skip)
+    reader.section(is_sized, _marker_set)
+    reader.section(is_sized, lambda reader: reader.skip(VECTOR_BYTES))
     bodies = tuple(reader.bodies(is_sized))
     reader.section(is_sized, _skeleton)
     if is_sized:  # assets
-        reader.section(is_sized, _vector)
-    reader.section(is_sized, _labelled)
+        reader.section(is_sized, lambda reader: reader.skip(VECTOR_BYTES))
+    reader.section(is_sized, lambda reader: reader.skip(LABELLED_BYTES))
     for _ in range(2):  # force plates and other devices
         reader.section(is_sized, _device)
     _, _, time_s, exposed, _, sent = reader.take(STAMPS)
@@ -264,17 +264,9 @@ def _marker_set(reader: _Reader) -> None:
     reader.skip(VECTOR_BYTES * reader.count())
 
 
-def _vector(reader: _Reader) -> None:
-    reader.skip(VECTOR_BYTES)
-
-
 def _skeleton(reader: _Reader) -> None:
     reader.skip(4)
     reader.skip(BODY.size * reader.count())
-
-
-def _labelled(reader: _Reader) -> None:
-    reader.skip(LABELLED_BYTES)
 
 
 def _device(reader: _Reader) -> None:

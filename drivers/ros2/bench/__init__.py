@@ -2,5 +2,3 @@
 
 It runs in virtual time behind a `Link`, or over zenoh with this process as the robot's router.
 """
-
-from __future__ import annotations

@@ -43,10 +43,7 @@ def spoilt(fault: Fault, message: JointState, before_ns: int, rng: Random) -> by
     """Encode a message with a fault; return None for silence.
 
     Args:
-        fault: to apply.
-        message: the intact one.
         before_ns: stamp of the previous message.
-        rng: source of randomness.
     """
     if fault is Fault.SILENCE:
         return None
@@ -95,7 +92,6 @@ class Planned:
         """Start without any corrupted message.
 
         Args:
-            rng: source of randomness.
             share: share of the messages that are corrupted at random.
             kinds: faults to choose from.
         """

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 from collections.abc import Sequence
@@ -11,6 +10,7 @@ from typing import Any, Literal, Self
 import zenoh
 
 from bodyschema.drivers.ros2 import rmw
+from bodyschema.drivers.ros2.link import session_config
 from bodyschema.drivers.ros2.messages import JOINT_STATE
 
 from .node import Node
@@ -35,10 +35,8 @@ class ZenohRobot:
         """Prepare without opening anything.
 
         Args:
-            nodes: to publish.
             listen: endpoint of the router, such as tcp/127.0.0.1:7447.
             domain: ROS_DOMAIN_ID.
-            topic: of the joint states.
             via: whose keys: those of rmw_zenoh, or of zenoh-bridge-ros2dds.
         """
         self._via = via
@@ -49,18 +47,7 @@ class ZenohRobot:
         self.published = 0
 
     def __enter__(self) -> Self:
-        config = zenoh.Config()
-        settings: dict[str, Any] = {
-            "mode": "router",
-            "scouting/multicast/enabled": False,
-            "scouting/gossip/enabled": False,
-            "listen/endpoints": [self._listen],
-            "connect/endpoints": [],
-            "timestamping/enabled": True,
-        }
-        for key, value in settings.items():
-            config.insert_json5(key, json.dumps(value))
-        self._session = session = zenoh.open(config)
+        self._session = session = zenoh.open(session_config("router", listen=[self._listen]))
         self._stop.clear()
         key = self._topic.strip("/")
         if self._via == "rmw_zenoh":

@@ -11,7 +11,7 @@ from typing import ClassVar
 import msgspec
 
 from bodyschema.drivers.bench.asked_faults import ON_THE_WIRE, AskedFault, FaultKinds, WireFaults
-from bodyschema.drivers.bench.dry_run import Angle, BenchArm
+from bodyschema.drivers.bench.dry_run import GLITCH_TICKS, Angle, BenchArm
 from bodyschema.drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
 
 from .board import EncoderBoard
@@ -19,14 +19,13 @@ from .board import EncoderBoard
 KINDS = FaultKinds(ON_THE_WIRE, ("sensor", "glitch"))
 BUS = "board"
 TICKS_PER_TURN = 4096  # default if robot.toml gives none
-GLITCH_TICKS = 700
-RATE_HZ = 200.0
 
 
 class EncoderArm(BenchArm):
     """Encoders as configured, on one board."""
 
     unit: ClassVar[str] = "lines said"
+    kinds = KINDS
 
     def __init__(
         self,
@@ -35,18 +34,15 @@ class EncoderArm(BenchArm):
         *,
         faults: Sequence[AskedFault] = (),
         seed: int = 0,
-        rate_hz: float = RATE_HZ,
+        rate_hz: float = 200.0,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
         """Create a board with its power on.
 
         Args:
-            config: checked.
             angles: by joint, its angle as a function of time [rad].
-            faults: to apply.
             seed: of the faults on the wire.
             rate_hz: lines per second.
-            now: the clock [s].
         """
         self._config, rng = config, Random(seed)
         self._names = {encoder.joint: encoder.name for encoder in config.encoders}
@@ -59,24 +55,19 @@ class EncoderArm(BenchArm):
 
     @property
     def devices(self) -> Mapping[str, EncoderBoard]:
-        """Device behind the port."""
         return {BUS: self._board}
 
     @property
     def count(self) -> int:
-        """Number of lines sent."""
         return self._board.lines
 
     def at_ports(self, ports: Mapping[str, str]) -> SerialLinesConfig:
-        """Return the configuration with another port."""
         return msgspec.structs.replace(self._config, port=ports[BUS])
 
     def glitch(self, joint: str, is_wrong: bool) -> None:
-        """Start or end an encoder error of one joint."""
         self._board.glitch_ticks[self._names[joint]] = GLITCH_TICKS if is_wrong else 0
 
     def power_cycle(self, t: float) -> None:
-        """Cut the power of the board and restore it at `t`."""
         self._board.reboot(t)
 
 

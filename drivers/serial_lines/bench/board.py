@@ -48,7 +48,6 @@ class EncoderBoard:
             begun_s: time of power-up.
             boot: its boot number.
             drift: how much its clock is too fast.
-            faults: applied to the lines.
         """
         self.encoders, self.faults = dict(encoders), faults
         self.failing: set[str] = set()
@@ -59,7 +58,6 @@ class EncoderBoard:
 
     @property
     def speaks_at(self) -> float:
-        """Start of the next line [s]."""
         return self._next_s
 
     def reboot(self, t: float) -> None:
@@ -117,7 +115,6 @@ class Listener:
     """Thread that reads an open source and keeps the newest reading."""
 
     def __init__(self, source: JointSource) -> None:
-        """Start without a reading."""
         self._source = source
         self._newest: JointReading | None = None
         self._error: BodyschemaError | None = None
@@ -133,11 +130,7 @@ class Listener:
         self._thread.join()
 
     def after(self, t: float, timeout_s: float) -> JointReading | None:
-        """Return the first reading measured after `t` [s]; None when there is none in time.
-
-        Raises:
-            BodyschemaError: the error that ended the reading.
-        """
+        """Return the first reading after `t` [s], or None in time. Raise the error that ended the reading."""
         with self._told:
             self._told.wait_for(lambda: self._error is not None or self._is_after(t), timeout_s)
             if self._error is not None:
