@@ -26,9 +26,9 @@ Count = Annotated[int, msgspec.Meta(ge=1)]
 # One chunk of a zenoh key: no separators, no wild cards, and not the @ that hides a chunk from wild cards.
 NAME = r"^[A-Za-z0-9_][A-Za-z0-9_.-]*\Z"  # `$` would let a line break follow
 
-# Of zenoh; sockets in the file system have no port.
-# Up to 65535. Sockets in the file system have no port.
+# Of a port, up to 65535.
 _PORT = "([1-9][0-9]{0,3}|[1-5][0-9]{4}|6[0-4][0-9]{3}|65[0-4][0-9]{2}|655[0-2][0-9]|6553[0-5])"
+# Of zenoh; sockets in the file system have no port.
 ENDPOINT = re.compile(rf"(tcp|udp|tls|quic|ws)/.+:{_PORT}|unixsock-stream/.+")
 
 _UNKNOWN = re.compile(r"Object contains unknown field `(?P<field>[^`]*)`(?: - at `\$(?P<path>[^`]*)`)?")
