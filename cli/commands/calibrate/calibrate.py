@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import cyclopts
 from cyclopts import Parameter
 from cyclopts.validators import Number
+from rich.console import Console
 
 from bodyschema.cli.commands.calibrate.calibrate_cameras import cameras
 from bodyschema.cli.commands.calibrate.latency import latency
@@ -23,6 +25,7 @@ from bodyschema.cli.commands.options import (
     print_json,
     robot_file,
 )
+from bodyschema.interfaces.errors import RequestError
 
 if TYPE_CHECKING:
     from bodyschema.calibration.report import CalibrationReport
@@ -64,8 +67,6 @@ class FitOptions:
 
     def trusted(self) -> Trusted:
         """Return what of the URDF is right."""
-        from bodyschema.interfaces.errors import RequestError
-
         if self.trust_urdf and self.only is not None:
             raise RequestError("--trust-urdf has no offsets to find. Give it, or --only offsets")
         return "urdf" if self.trust_urdf else "nothing" if self.only is None else "links"
@@ -175,7 +176,6 @@ def arm(
     Next: `bodyschema run --robot OUT/robot.toml` starts from what was learnt. With --lerobot the joint offsets go into
     the servos instead, by LeRobot's own calibration file.
     """
-    import sys
 
     from bodyschema.calibration.next_poses import check_target
     from bodyschema.calibration.plausibility.check import plausibility, told_sigma
@@ -213,8 +213,6 @@ def arm(
 
 
 def _require_one_target(servos: LeRobotOptions, out: Path | None) -> None:
-    from bodyschema.interfaces.errors import RequestError
-
     if servos.write and (servos.lerobot is None or out is not None):
         raise RequestError(
             "--write is for --lerobot FILE, and without --out: offsets belong into the servos or into a URDF, not both"
@@ -265,7 +263,6 @@ def _written(config: Config, found: Calibration, report: CalibrationReport, out:
 
 
 def _show(report: CalibrationReport, lines: list[str], written: list[str]) -> None:
-    from rich.console import Console
 
     from bodyschema.cli.terminal.calibration_view import view
     from bodyschema.robot.hand_eye import in_shell_lines

@@ -9,9 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
+from rich.console import Console
 
 from bodyschema.cli.commands.board_options import AS_PRINTED, BY_NAME, EyeFiles, EyeImages, PrintedBoard
 from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json
+from bodyschema.daemon.service.signals import on_termination
+from bodyschema.interfaces.clock import SystemClock
 
 if TYPE_CHECKING:
     from bodyschema.cli.cameras.calibration import Board, Calibrated, CheckFile, Gathered, Wanted
@@ -130,7 +133,6 @@ def _calibrate(
     *,
     as_json: bool,
 ) -> None:
-    from rich.console import Console
 
     from bodyschema.cli.cameras.calibration import figures, write_calibrated_cameras
     from bodyschema.cli.cameras.calibration_view import cameras_view
@@ -167,7 +169,6 @@ def _check(
     *,
     as_json: bool,
 ) -> None:
-    from rich.console import Console
 
     from bodyschema.cli.cameras.calibration import checked
     from bodyschema.cli.cameras.calibration_view import check_view
@@ -189,7 +190,6 @@ def _check(
 
 
 def _print_board(made: Board, paper: str, out: Path) -> None:
-    from rich.console import Console
 
     from bodyschema.cli.cameras.calibration import write_board
 
@@ -203,7 +203,6 @@ def _print_board(made: Board, paper: str, out: Path) -> None:
 
 
 def _of_images(images: Path, files: EyeFiles, board: Board, wanted: Wanted) -> tuple[Gathered, Calibrated]:
-    from rich.console import Console
 
     from bodyschema.cli.cameras.calibration import calibrated, from_images
 
@@ -220,14 +219,11 @@ def _live(
     config: Config, board: Board, wanted: Wanted, save: Path | None
 ) -> tuple[Gathered, Calibrated, tuple[str, ...]]:
     """Return the views, their calibration, and what the cameras reported of their focus."""
-    from rich.console import Console
 
     from bodyschema.cli.cameras.calibration import kept_in, live_views, of_cameras
     from bodyschema.cli.cameras.live_calibration import LiveCalibration
     from bodyschema.cli.cameras.live_calibration_view import guidance_on
-    from bodyschema.daemon.service.signals import on_termination
     from bodyschema.daemon.wiring.cameras import focus_complaints, open_eyes, require_cameras
-    from bodyschema.interfaces.clock import SystemClock
 
     clock = SystemClock()
     eyes = open_eyes(config, clock)
@@ -240,13 +236,11 @@ def _live(
 
 
 def _checked_live(config: Config, file: Path, board: Board, seconds: float) -> tuple[CheckFile, str]:
-    from rich.console import Console
 
     from bodyschema.cli.cameras.calibration import check_figures
     from bodyschema.cli.cameras.live_calibration import LiveViews, checked_live
     from bodyschema.cli.cameras.live_calibration_view import guidance_on
     from bodyschema.daemon.wiring.cameras import open_eyes
-    from bodyschema.interfaces.clock import SystemClock
 
     clock = SystemClock()
     with guidance_on(Console(stderr=True, highlight=False), board.name, clock) as show:

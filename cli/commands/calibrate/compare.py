@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
+from rich.console import Console
 
 from bodyschema.cli.commands.options import flag, print_json
 
@@ -29,8 +30,6 @@ def compare(
 
     Next: `bodyschema simulate` with another robot.toml; `bodyschema calibrate`.
     """
-
-    from rich.console import Console
 
     from bodyschema.calibration.comparison import compared
     from bodyschema.cli.terminal.comparison_view import view

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
+from rich.console import Console
 
 from bodyschema.cli.commands.options import (
     ANYTHING,
@@ -20,10 +22,9 @@ from bodyschema.cli.commands.options import (
     flag,
     robot_file,
 )
+from bodyschema.interfaces.errors import RequestError
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from bodyschema.cli.terminal.diagnosis_run import Found
 
 
@@ -62,13 +63,9 @@ def diagnose(
     Next: open OUT/report.html; give OUT/extended.toml to any command as --robot, and
     `bodyschema export` turns it into models for MuJoCo, controllers and drivers.
     """
-    import sys
-
-    from rich.console import Console
 
     from bodyschema.cli.terminal.diagnosis_run import measured, results_in, run, written
     from bodyschema.daemon.config import Config
-    from bodyschema.interfaces.errors import RequestError
 
     if servos.write and servos.lerobot is None:
         raise RequestError("--write is for --lerobot FILE. Give LeRobot's calibration file")
@@ -102,7 +99,6 @@ def _joint_offsets(found: Found) -> dict[str, float]:
 
 
 def _show(found: Found, lines: list[str], out: Path | None) -> None:
-    from rich.console import Console
 
     from bodyschema.cli.terminal.diagnosis_view import view
 

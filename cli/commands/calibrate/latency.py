@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
+from rich.console import Console
 
 from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json
+from bodyschema.interfaces.errors import BodyschemaError, ConfigError
 
 if TYPE_CHECKING:
     from bodyschema.calibration.latency import Wiggle
@@ -43,12 +45,10 @@ def latency(
     Next: the same with --write, which puts latency_s and latency_sigma_s into [vision.cameras], or [marker_source]. The
     old file is kept as robot.toml.before.
     """
-    from rich.console import Console
 
     from bodyschema.calibration.latency import latency_of
     from bodyschema.cli.hardware.wiggling import write_wiggle
     from bodyschema.daemon.config import Config
-    from bodyschema.interfaces.errors import ConfigError
     from bodyschema.robot.toml_text import difference, with_values, write_edited
 
     config = Config.load(robot)
@@ -88,11 +88,9 @@ def latency(
 
 
 def _wiggle(config: Config, recording: Path | None, seconds: float, *, sim: bool) -> Wiggle:
-    from rich.console import Console
 
     from bodyschema.cli.hardware.wiggling import collected, read_wiggle
     from bodyschema.daemon.wiring.wiring import open_sources
-    from bodyschema.interfaces.errors import BodyschemaError
 
     if recording is not None and sim:
         raise BodyschemaError("give a recording or --sim, not both")

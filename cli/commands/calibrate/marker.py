@@ -9,9 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import cyclopts
 from cyclopts import Parameter
 from cyclopts.validators import Number
+from rich.console import Console
 
 from bodyschema.cli.commands.board_options import BY_NAME, EyeFiles
 from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import RequestError
 
 if TYPE_CHECKING:
     from bodyschema.cli.cameras.calibration import Images
@@ -75,7 +78,6 @@ def print_tags(
 
     Next: put the printed tables into robot.toml; `bodyschema marker learn` for tags glued by hand.
     """
-    from rich.console import Console
 
     from bodyschema.cli.cameras.tag_pages import Tags, as_printed, face_mm, tables, write_tags
 
@@ -140,7 +142,6 @@ def learn(
     Next: put the printed tables into robot.toml, a colour in place of `colour = ...`; `bodyschema watch cameras`.
     """
     from bodyschema.daemon.wiring.markers import learnt_colour_table
-    from bodyschema.interfaces.errors import RequestError
 
     if side_mm is not None:
         if auto or at is not None or len(images) != 1:
@@ -161,7 +162,6 @@ def learn(
 
 
 def _measure_cluster(images: Images, calibration: Path, wanted: Wanted, *, as_json: bool) -> None:
-    from rich.console import Console
 
     from bodyschema.daemon.wiring.markers import figures, measured, said, tables
 
@@ -175,12 +175,10 @@ def _measure_cluster(images: Images, calibration: Path, wanted: Wanted, *, as_js
 
 
 def _learnt_live(robot: Path, seconds: float) -> str:
-    from rich.console import Console
 
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.wiring.cameras import open_eyes
     from bodyschema.daemon.wiring.markers import moving_colour_table
-    from bodyschema.interfaces.clock import SystemClock
 
     clock, console = SystemClock(), Console(stderr=True, highlight=False, soft_wrap=True)
     eyes = open_eyes(Config.load(robot), clock)

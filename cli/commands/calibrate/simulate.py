@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
+from rich.console import Console
 
 from bodyschema.cli.commands.options import SourceRobotFile, flag, robot_file
 
@@ -32,10 +34,8 @@ def simulate(
 
     Next: `bodyschema compare LIKE OUT`.
     """
-    import sys
 
     import numpy as np
-    from rich.console import Console
 
     from bodyschema.calibration.plausibility.limits import require_units
     from bodyschema.cli.recordings.rerun_scene import scene_for

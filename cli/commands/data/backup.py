@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
+from rich.console import Console
 
 from bodyschema.cli.commands.options import HERE, VARIABLE, flag, print_json
+from bodyschema.interfaces.clock import SystemClock
 
 
 def backup(
@@ -49,13 +52,9 @@ def backup(
 
 
 def _write(file: Path, robot: Path, state_dir: Path | None, *, force: bool, as_json: bool) -> None:
-    from importlib.metadata import version
-
-    from rich.console import Console
 
     from bodyschema.cli.install.backup import write_backup
     from bodyschema.daemon.config import Config
-    from bodyschema.interfaces.clock import SystemClock
 
     config = Config.load(robot)
     if state_dir is not None:
@@ -83,7 +82,6 @@ def _write(file: Path, robot: Path, state_dir: Path | None, *, force: bool, as_j
 
 
 def _restore(file: Path, robot: Path, state_dir: Path | None, *, force: bool, as_json: bool) -> None:
-    from rich.console import Console
 
     from bodyschema.cli.install.backup import Backup
     from bodyschema.cli.install.restore import restore

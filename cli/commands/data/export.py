@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from cyclopts import Parameter
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
 from bodyschema.cli.commands.options import AS_THEY_ARE, HERE, DatasetCalibration, RobotFile, SourceOptions, flag
-
-if TYPE_CHECKING:
-    from rich.console import Console
+from bodyschema.interfaces.errors import RequestError
 
 
 def export(
@@ -52,11 +53,9 @@ def export(
 
     Next: `bodyschema replay` on a CSV or Parquet file; `python -m mujoco.viewer --mjcf=OUT` on an MJCF file.
     """
-    from rich.console import Console
 
     from bodyschema.cli.recordings.rerun_scene import scene_for
     from bodyschema.daemon.config import Config
-    from bodyschema.interfaces.errors import RequestError
     from bodyschema.recordings import files as recordings
 
     console = Console(highlight=False, soft_wrap=True)
@@ -78,8 +77,6 @@ def export(
 
 
 def _export_robot(source: Path, out: Path, measured: Path | None, console: Console, *, force: bool) -> None:
-    from rich.table import Table
-    from rich.text import Text
 
     from bodyschema.calibration.plausibility.limits import require_units
     from bodyschema.cli.terminal import robot_export

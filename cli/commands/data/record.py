@@ -7,8 +7,10 @@ from typing import Annotated
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
+from rich.console import Console
 
 from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json
+from bodyschema.daemon.service.signals import SignalFlags, on_termination
 
 
 def record(
@@ -31,11 +33,9 @@ def record(
 
     Next: `bodyschema replay` on a CSV or Parquet file.
     """
-    from rich.console import Console
 
     from bodyschema.cli.recordings.recorder import History, copy_history, follow_history
     from bodyschema.daemon.config import Config
-    from bodyschema.daemon.service.signals import SignalFlags, on_termination
     from bodyschema.daemon.transport.bus import client
     from bodyschema.recordings import files as recordings
 

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
+from rich.console import Console
 
 from bodyschema.cli.commands.options import HERE, RobotFile, flag, several
+from bodyschema.daemon.service.signals import on_termination
 from bodyschema.interfaces.waits import POLL_S
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from bodyschema.cli.hardware.bench_run import BenchRun
 
 PORT = Path("bus")
@@ -45,11 +45,9 @@ def bench(
 
     Next: in another terminal `bodyschema scan`, `doctor` or `watch joints`, each with --robot PORT.toml.
     """
-    from rich.console import Console
 
     from bodyschema.cli.hardware.bench_run import FAULTS, BenchRun
     from bodyschema.daemon.config import Config
-    from bodyschema.daemon.service.signals import on_termination
 
     console = Console(highlight=False, soft_wrap=True)
     if list_faults:

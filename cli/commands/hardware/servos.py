@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
+from rich.console import Console
+from rich.prompt import Confirm
 
 from bodyschema.cli.commands.options import HERE, RobotFile, flag, several
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import ConfigError, RequestError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-    from rich.console import Console
 
     from bodyschema.cli.servos.changes import Planned
     from bodyschema.cli.servos.log import ServoLog
@@ -64,7 +66,6 @@ def servos(
     Next: the changes to robot.toml that it prints; `bodyschema watch joints` shows the angles.
     """
     from bodyschema.cli.servos.changes import assignments
-    from bodyschema.interfaces.errors import ConfigError, RequestError
 
     if bool(settings) + zero + undo > 1:
         raise RequestError("give NAME=VALUE, --zero or --undo, one of them")
@@ -87,7 +88,6 @@ def servos(
 
 
 def _show(wanted: Sequence[Wanted], *, as_json: bool) -> None:
-    from rich.console import Console
 
     from bodyschema.cli.servos.changes_view import settings_json, settings_table
     from bodyschema.daemon.wiring.eeprom import settings_by_name
@@ -115,11 +115,9 @@ def _set(
 
 
 def _zero(robot: Path, joint: tuple[str, ...], *, in_servo: bool, dry_run: bool, yes: bool) -> None:
-    from rich.console import Console
 
     from bodyschema.cli.servos.changes import plan_zeros, zero_ticks
     from bodyschema.cli.servos.changes_view import zero_lines
-    from bodyschema.interfaces.errors import ConfigError
 
     if not joint:
         raise ConfigError("no joint is named", remedy="Name it with --joint")
@@ -135,11 +133,9 @@ def _zero(robot: Path, joint: tuple[str, ...], *, in_servo: bool, dry_run: bool,
 
 
 def _undo(robot: Path, port: str | None, *, dry_run: bool, yes: bool) -> None:
-    from rich.console import Console
 
     from bodyschema.cli.servos.changes import plan_undo
     from bodyschema.daemon.wiring.eeprom import workbench_of
-    from bodyschema.interfaces.errors import ConfigError
 
     log = _log(robot, port)
     entries = log.to_undo()
@@ -160,7 +156,6 @@ def _wanted(
 ) -> list[Wanted]:
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.wiring.eeprom import configured, stranger
-    from bodyschema.interfaces.errors import ConfigError
 
     if (port is None) != (id is None):
         raise ConfigError("--port and --id belong together", remedy="Give both, or --joint for a servo of robot.toml")
@@ -194,11 +189,9 @@ def _carry_out(
     yes: bool,
     undoes: int | None = None,
 ) -> None:
-    from rich.console import Console
 
     from bodyschema.cli.servos.changes import carry_out, is_well
     from bodyschema.cli.servos.changes_view import done_table, planned_table
-    from bodyschema.interfaces.clock import SystemClock
 
     console = Console(highlight=False)
     if planned:
@@ -220,7 +213,5 @@ def _carry_out(
 
 
 def _agreed(console: Console) -> bool:
-    from rich.prompt import Confirm
-
     asked = "Write it? Torque is switched off first: hold the arm"
     return Confirm.ask(asked, console=console, default=False)

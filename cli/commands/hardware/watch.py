@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import sys
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
+from rich.console import Console
+from rich.live import Live
 
 from bodyschema.cli.commands.options import HERE, RobotFile, flag
+from bodyschema.daemon.service.signals import on_termination
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.waits import LINE_EVERY_S, POLL_S, STATUS_EVERY_S
 
 if TYPE_CHECKING:
@@ -81,15 +87,11 @@ def watch(
 
 
 def _joints(robot: Path, *, once: bool, json: bool, zero_force: bool) -> None:
-    from rich.console import Console
-    from rich.live import Live
 
     from bodyschema.cli.hardware.joints_watch import JointsWatch, as_json, screen
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.sampler.powered import find_powered
-    from bodyschema.daemon.service.signals import on_termination
     from bodyschema.daemon.wiring.wiring import open_joints
-    from bodyschema.interfaces.clock import SystemClock
     from bodyschema.interfaces.servos import ServoJoints
 
     clock = SystemClock()
@@ -115,14 +117,10 @@ def _joints(robot: Path, *, once: bool, json: bool, zero_force: bool) -> None:
 
 
 def _cameras(robot: Path, out: Path | None, port: int, every: float, count: int | None) -> None:
-    from contextlib import ExitStack
-
-    from rich.console import Console
 
     from bodyschema.cli.cameras.mjpeg import MjpegServer
     from bodyschema.cli.cameras.watching import Watching
     from bodyschema.daemon.config import Config
-    from bodyschema.daemon.service.signals import on_termination
     from bodyschema.daemon.wiring.cameras import open_watched
 
     console = Console(highlight=False, soft_wrap=True)
@@ -149,15 +147,10 @@ def _cameras(robot: Path, out: Path | None, port: int, every: float, count: int 
 
 
 def _marker(robot: Path, seconds: float | None) -> None:
-    from contextlib import ExitStack
-
-    from rich.console import Console
 
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.marker_watch import MarkerWatch
-    from bodyschema.daemon.service.signals import on_termination
     from bodyschema.daemon.wiring.wiring import open_streams
-    from bodyschema.interfaces.clock import SystemClock
 
     console = Console(highlight=False, soft_wrap=True)
     clock = SystemClock()
@@ -197,8 +190,6 @@ def _line(text: str) -> None:
 
 def _first(watch: JointsWatch) -> Seen:
     """Return the first complete state. SourceError if there is none in time."""
-    from bodyschema.interfaces.errors import SourceError
-
     end = time.monotonic() + FIRST_READING_S
     while time.monotonic() < end:
         if watch.look() is not None:

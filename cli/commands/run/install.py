@@ -7,12 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
+from rich.console import Console
+from rich.prompt import Confirm
 
 from bodyschema.cli.commands.options import HERE, VARIABLE, flag, several
+from bodyschema.interfaces.errors import ConfigError
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from bodyschema.cli.install.service_files import UnitFiles
     from bodyschema.cli.install.udev import Rules
 
@@ -70,8 +71,6 @@ def install(
 
 
 def _udev(root: Path, *, uninstall: bool, yes: bool, dry_run: bool) -> None:
-    from rich.console import Console
-    from rich.prompt import Confirm
 
     from bodyschema.cli.install.udev import Rules, rules
 
@@ -118,7 +117,6 @@ def _service(
     from bodyschema.daemon.learner.host import session_settings
     from bodyschema.daemon.wiring.wiring import check_sources
     from bodyschema.fleet.hosting import configs_of, descriptions
-    from bodyschema.interfaces.errors import ConfigError
 
     files, folder = descriptions(robot or (Path(os.environ.get(VARIABLE, HERE)),)), UnitFolder(root)
     several_robots = len(files) > 1
@@ -164,8 +162,6 @@ def _router(file: Path, user: str | None, root: Path, *, uninstall: bool, yes: b
 
 def _install_units(units: UnitFiles, texts: dict[Path, str], *, yes: bool, dry_run: bool) -> bool:
     """Return True if they are installed now."""
-    from rich.console import Console
-    from rich.prompt import Confirm
 
     from bodyschema.cli.install.service_files import missing
 
@@ -185,9 +181,6 @@ def _install_units(units: UnitFiles, texts: dict[Path, str], *, yes: bool, dry_r
 
 
 def _uninstall_units(units: UnitFiles, removed: str, *, yes: bool, dry_run: bool) -> None:
-    from rich.console import Console
-    from rich.prompt import Confirm
-
     console = Console(highlight=False, soft_wrap=True)
     there = "\n".join(map(str, units.installed()))
     if not there:
@@ -202,8 +195,6 @@ def _uninstall_units(units: UnitFiles, removed: str, *, yes: bool, dry_run: bool
 
 
 def _uninstall(console: Console, of_machine: Rules, *, yes: bool, dry_run: bool) -> None:
-    from rich.prompt import Confirm
-
     if dry_run:
         there = "would be removed" if of_machine.file.exists() else "is not there"
         console.print(f"{of_machine.file} {there}. Nothing was changed.", markup=False)

@@ -6,9 +6,11 @@ from typing import Annotated
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
+from rich.console import Console
 
 from bodyschema.cli.commands.options import HERE, RobotFile, flag
 from bodyschema.cli.terminal.view_process import PORT
+from bodyschema.interfaces.extras import require_extra
 
 
 def view(
@@ -29,11 +31,9 @@ def view(
 
     Next: open the address in a browser.
     """
-    from rich.console import Console
 
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.service import logs
-    from bodyschema.interfaces.extras import require_extra
 
     require_extra("view", "the page")
     from bodyschema.dashboard.server import serve

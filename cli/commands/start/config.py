@@ -7,6 +7,8 @@ import sys
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Annotated
 
+from rich.console import Console
+
 from bodyschema.cli.commands.options import HERE, RobotFile, flag
 
 if TYPE_CHECKING:
@@ -124,6 +126,4 @@ def _standing_still(description: RobotDescription) -> list[str]:
 
 def say(text: str) -> None:
     """Print a line as it is."""
-    from rich.console import Console
-
     Console(highlight=False, soft_wrap=True).print(text, markup=False)
