@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
+from rich.console import Console
 
 if TYPE_CHECKING:
     from bodyschema.cli.terminal.diagnosis_run import Asked
@@ -151,6 +152,13 @@ WITHOUT_LEROBOT = LeRobotOptions()
 def flag(text: str, *, name: str | None = None) -> Parameter:
     """Return an option without a value, off by default."""
     return Parameter(name=name, help=text, negative="", show_default=False)
+
+
+def say(*lines: str, stderr: bool = False) -> None:
+    """Print lines as they are: neither wrapped nor read as markup."""
+    console = Console(stderr=stderr, highlight=False, soft_wrap=True)
+    for line in lines:
+        console.print(line, markup=False)
 
 
 def print_json(value: object) -> None:

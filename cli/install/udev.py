@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-import subprocess
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
-from bodyschema.interfaces.errors import ConfigError
+from .machine_files import MachineFiles
 
 FILE = Path("etc/udev/rules.d/60-bodyschema.rules")
-ROOT = Path("/")
 # Vendor and product of USB adapters for servos, and of boards that read encoders: from published udev rules (ROBOTIS,
 # SO-101, Reachy Mini) and outputs of lsusb and udevadm; not tried on hardware.
 ADAPTERS = (
@@ -32,9 +26,6 @@ _LATENCY = """\
 # Adapters of FTDI keep bytes back for 16 ms, unless configured otherwise.
 ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{latency_timer}="1"
 """
-RELOAD = (("udevadm", "control", "--reload-rules"), ("udevadm", "trigger", "--subsystem-match=tty", "--action=add"))
-
-Run = Callable[[Sequence[str]], None]
 
 
 def rules() -> str:
@@ -50,69 +41,16 @@ def rules() -> str:
     return "\n".join(lines) + "\n"
 
 
-def run_quietly(command: Sequence[str]) -> None:
-    """Run the command; on a machine without udev its output is useless."""
-    if shutil.which(command[0]) is not None:
-        subprocess.run(command, capture_output=True, check=False, timeout=10)
+class UdevRules(MachineFiles):
+    """The rules file of a machine."""
 
+    kind = "udev"
+    reload = (("udevadm", "control", "--reload-rules"), ("udevadm", "trigger", "--subsystem-match=tty", "--action=add"))
+    is_used = "Plug the adapter in again; `bodyschema doctor` checks it."
 
-@dataclass(frozen=True, slots=True)
-class Rules:
-    """The rules file of a machine.
+    def texts(self) -> dict[Path, str]:
+        """Return the contents of the file."""
+        return {self.root / FILE: rules()}
 
-    Attributes:
-        root: root of its file system.
-        run: runs a command; only if `root` is this machine's.
-    """
-
-    root: Path = ROOT
-    run: Run = run_quietly
-
-    @property
-    def file(self) -> Path:
-        """The rules file."""
-        return self.root / FILE
-
-    @property
-    def is_current(self) -> bool:
-        """True if the file exists and is up to date."""
-        return self.file.exists() and self.file.read_text(encoding="utf-8") == rules()
-
-    def install(self) -> None:
-        """Write the file, and let udev reload it.
-
-        Raises:
-            ConfigError: the file cannot be written.
-        """
-        try:
-            self.file.parent.mkdir(parents=True, exist_ok=True)
-            self.file.write_text(rules(), encoding="utf-8")
-        except OSError as error:
-            raise self._refused(error, "") from error
-        self._reload()
-
-    def uninstall(self) -> bool:
-        """Remove the file; return False if there was none.
-
-        Raises:
-            ConfigError: the file cannot be removed.
-        """
-        try:
-            self.file.unlink()
-        except FileNotFoundError:
-            return False
-        except OSError as error:
-            raise self._refused(error, " --uninstall") from error
-        self._reload()
-        return True
-
-    def _reload(self) -> None:
-        if self.root == ROOT:
-            for command in RELOAD:
-                self.run(command)
-
-    def _refused(self, error: OSError, option: str) -> ConfigError:
-        remedy = f'Type: sudo "$(command -v bodyschema)" install udev --yes{option}'
-        if os.geteuid() == 0:
-            remedy = "Look at the file system of that folder"
-        return ConfigError(f"cannot be changed: {error.strerror}", file=self.file, remedy=remedy)
+    def installed(self) -> list[Path]:
+        return [file for file in self.texts() if file.exists()]

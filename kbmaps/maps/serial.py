@@ -21,7 +21,7 @@ import numpy as np
 
 from kbmaps.arrays import FloatArray
 from kbmaps.errors import ModelFormatError
-from kbmaps.maps.basis import PARAMETER_NAMES, JointBasis, parse_bases
+from kbmaps.maps.basis import PARAMETER_NAMES, BasisKind, JointBasis, parse_bases
 from kbmaps.packed import framed, named, unframed
 
 MAGIC = b"KBMAP\r\n\0"
@@ -82,8 +82,9 @@ def _listed(entry: Any) -> list[Any]:
     kind = fields["kind"]
     if not isinstance(kind, str) or kind not in PARAMETER_NAMES:
         raise ModelFormatError("a basis is of no known kind")
-    values = named(fields["parameters"], f"the parameters of a {kind} basis", PARAMETER_NAMES[kind])
-    return [kind, *(values[name] for name in PARAMETER_NAMES[kind])]
+    names = PARAMETER_NAMES[cast(BasisKind, kind)]
+    values = named(fields["parameters"], f"the parameters of a {kind} basis", names)
+    return [kind, *(values[name] for name in names)]
 
 
 def _parse_metadata(entry: Any) -> dict[str, str]:
