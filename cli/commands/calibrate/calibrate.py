@@ -24,6 +24,7 @@ from bodyschema.cli.commands.options import (
     flag,
     print_json,
     robot_file,
+    say,
 )
 from bodyschema.interfaces.errors import RequestError
 
@@ -267,8 +268,5 @@ def _show(report: CalibrationReport, lines: list[str], written: list[str]) -> No
     from bodyschema.cli.terminal.calibration_view import view
     from bodyschema.robot.hand_eye import in_shell_lines
 
-    console = Console(highlight=False)
-    console.print(view(report))
-    in_ros = f"\nIn ROS 2:\n{in_shell_lines(report.hand_eye)}"
-    for line in [*(["", *lines] if lines else []), in_ros, *written]:
-        console.print(line, markup=False, soft_wrap=True)
+    Console(highlight=False).print(view(report))
+    say(*(["", *lines] if lines else []), f"\nIn ROS 2:\n{in_shell_lines(report.hand_eye)}", *written)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -12,7 +13,7 @@ from cyclopts.validators import Number
 from rich.console import Console
 
 from bodyschema.cli.commands.board_options import AS_PRINTED, BY_NAME, EyeFiles, EyeImages, PrintedBoard
-from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json
+from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json, say
 from bodyschema.daemon.service.signals import on_termination
 from bodyschema.interfaces.clock import SystemClock
 
@@ -153,11 +154,10 @@ def _calibrate(
     if as_json:
         print_json(told)
         return
-    console = Console(highlight=False)
-    console.print(cameras_view(told))
-    console.print(f"\n{out} written. Open {report}.", markup=False, soft_wrap=True)
+    Console(highlight=False).print(cameras_view(told))
+    say(f"\n{out} written. Open {report}.")
     if not named:
-        console.print(f'In [vision.cameras] write\ncalibration = "{out.name}"', markup=False, soft_wrap=True)
+        say(f'In [vision.cameras] write\ncalibration = "{out.name}"')
 
 
 def _check(
@@ -194,11 +194,9 @@ def _print_board(made: Board, paper: str, out: Path) -> None:
     from bodyschema.cli.cameras.calibration import write_board
 
     across, upright = write_board(made, paper, out)
-    Console(highlight=False).print(
+    say(
         f"{out} written: {made.name}. Print it at 100 %, then measure both rulers: {across:g} mm below, {upright:g} mm "
-        "beside the board.",
-        markup=False,
-        soft_wrap=True,
+        "beside the board."
     )
 
 
@@ -206,11 +204,7 @@ def _of_images(images: Path, files: EyeFiles, board: Board, wanted: Wanted) -> t
 
     from bodyschema.cli.cameras.calibration import calibrated, from_images
 
-    progress = Console(stderr=True, highlight=False)
-
-    def tell(text: str) -> None:
-        progress.print(text, soft_wrap=True, markup=False)
-
+    tell = partial(say, stderr=True)
     found = from_images(files.of(images), board, tell)
     return found, calibrated(found, wanted, tell)
 

@@ -21,6 +21,7 @@ from bodyschema.cli.commands.options import (
     SourceRobotFile,
     flag,
     robot_file,
+    say,
 )
 from bodyschema.interfaces.errors import RequestError
 
@@ -73,14 +74,12 @@ def diagnose(
     servos.require(config)
     asked = search.asked()
     source = measured(config, recording, lambda file: taken.opened(config, file, servos.lerobot), live=live)
-    told = Console(stderr=True, highlight=False)
-    with results_in(out), _progress(told) as tell:
+    with results_in(out), _progress(Console(stderr=True, highlight=False)) as tell:
         found = run(config, source, asked, tell, force=force)
         if out is not None:
             tell("writing the report")
             written(found, out)
-    for warning in found.warnings:
-        told.print(f"Warning: {warning}", markup=False, soft_wrap=True)
+    say(*(f"Warning: {warning}" for warning in found.warnings), stderr=True)
     lines = servos.lines(config, _joint_offsets(found), recording)
     if as_json:
         sys.stdout.write(found.json + "\n")
@@ -102,16 +101,12 @@ def _show(found: Found, lines: list[str], out: Path | None) -> None:
 
     from bodyschema.cli.terminal.diagnosis_view import view
 
-    console = Console(highlight=False)
-    console.print(view(found.file, found.remedies, timed=found.timed))
-    for line in ["", *lines] if lines else []:
-        console.print(line, markup=False, soft_wrap=True)
+    Console(highlight=False).print(view(found.file, found.remedies, timed=found.timed))
+    say(*(["", *lines] if lines else []))
     if out is not None:
-        console.print(
+        say(
             f"\nOpen {out / 'report.html'}. Beside it are diagnosis.json and extended.toml, the simulation with what "
-            f"was found: give it to any command as --robot {out / 'extended.toml'}; robot.toml is unchanged.",
-            markup=False,
-            soft_wrap=True,
+            f"was found: give it to any command as --robot {out / 'extended.toml'}; robot.toml is unchanged."
         )
 
 

@@ -9,7 +9,7 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 from rich.console import Console
 
-from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json
+from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json, say
 from bodyschema.interfaces.errors import BodyschemaError, ConfigError
 
 if TYPE_CHECKING:
@@ -54,7 +54,6 @@ def latency(
     config = Config.load(robot)
     is_sent = not sim and config.tables.vision.cameras is None and bool(config.tables.marker_source)
     table = "marker_source" if is_sent else "vision.cameras"
-    console = Console(highlight=False, soft_wrap=True)
     wiggle = _wiggle(config, recording, seconds, sim=sim)
     if save is not None:
         write_wiggle(wiggle, config.robot.joints, save)
@@ -63,28 +62,26 @@ def latency(
     if as_json:
         print_json(found)
     else:
-        console.print(
+        say(
             f"{found.fixes} fixes at {found.speed_m_s:.2f} m/s, {1e3 * found.residual_m:.1f} mm from where the angles "
             f"bring the marker: images are taken {1e3 * found.latency_s:.1f} ± {1e3 * found.sigma_s:.1f} ms before "
-            "their time stamps.",
-            markup=False,
+            "their time stamps."
         )
     if sim or (as_json and not write):
         return
     if not as_json:
-        console.print("\n".join(f"{key} = {value}" for key, value in values.items()), markup=False)
+        say(*(f"{key} = {value}" for key, value in values.items()))
     try:
         edited = with_values(config.robot.file, table, values)
     except ConfigError as error:
         if write:
             raise
-        console.print(str(error), markup=False)
+        say(str(error))
         return
     changed = difference(config.robot.file, edited)
     backup = write_edited(config.robot.file, edited) if write else None
     if not as_json:
-        console.print("\n".join(changed), markup=False)
-        console.print(f"Written; the old file is {backup}" if write else "Nothing is written without --write.")
+        say(*changed, f"Written; the old file is {backup}" if write else "Nothing is written without --write.")
 
 
 def _wiggle(config: Config, recording: Path | None, seconds: float, *, sim: bool) -> Wiggle:
@@ -101,7 +98,5 @@ def _wiggle(config: Config, recording: Path | None, seconds: float, *, sim: bool
     known_s = 0.0 if sim or seen is None else seen.latency_s
     with open_sources(config, sim=sim) as sources, console.status("move the arm to and fro, unevenly") as status:
         seen = collected(sources, seconds, lambda t: status.update(f"go on moving: {max(seconds - t, 0):.0f} s"))
-    for text in (*seen.health, seen.said):
-        if text:
-            console.print(text, markup=False, soft_wrap=True)
+    say(*filter(None, (*seen.health, seen.said)), stderr=True)
     return seen.wiggle.with_stamps_later(known_s)  # as the camera sent them, before robot.toml's latency was subtracted

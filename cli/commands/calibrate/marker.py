@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import cyclopts
 from cyclopts import Parameter
 from cyclopts.validators import Number
-from rich.console import Console
 
 from bodyschema.cli.commands.board_options import BY_NAME, EyeFiles
-from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json
+from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json, say
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import RequestError
 
@@ -88,7 +88,7 @@ def print_tags(
     said = f"{out} written. Print it at 100 %, then measure both rulers: {rulers}."
     if drawn.body is not None:
         said += f" Each face is {face_mm(tags):.1f} mm wide."
-    Console(stderr=True, highlight=False).print(said, markup=False, soft_wrap=True)
+    say(said, stderr=True)
     sys.stdout.write(tables(tags))
 
 
@@ -165,12 +165,11 @@ def _measure_cluster(images: Images, calibration: Path, wanted: Wanted, *, as_js
 
     from bodyschema.daemon.wiring.markers import figures, measured, said, tables
 
-    progress = Console(stderr=True, highlight=False, soft_wrap=True)
-    found = measured(images, calibration, wanted, lambda text: progress.print(text, markup=False))
+    found = measured(images, calibration, wanted, partial(say, stderr=True))
     if as_json:
         print_json(figures(found))
         return
-    progress.print(said(found), markup=False)
+    say(said(found), stderr=True)
     sys.stdout.write(tables(found, wanted))
 
 
@@ -180,6 +179,6 @@ def _learnt_live(robot: Path, seconds: float) -> str:
     from bodyschema.daemon.wiring.cameras import open_eyes
     from bodyschema.daemon.wiring.markers import moving_colour_table
 
-    clock, console = SystemClock(), Console(stderr=True, highlight=False, soft_wrap=True)
+    clock = SystemClock()
     eyes = open_eyes(Config.load(robot), clock)
-    return moving_colour_table(eyes, clock, seconds, lambda text: console.print(text, markup=False))
+    return moving_colour_table(eyes, clock, seconds, partial(say, stderr=True))

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from bodyschema.cli.commands.options import AS_THEY_ARE, HERE, DatasetCalibration, RobotFile, SourceOptions, flag
+from bodyschema.cli.commands.options import AS_THEY_ARE, HERE, DatasetCalibration, RobotFile, SourceOptions, flag, say
 from bodyschema.interfaces.errors import RequestError
 
 
@@ -58,9 +58,8 @@ def export(
     from bodyschema.daemon.config import Config
     from bodyschema.recordings import files as recordings
 
-    console = Console(highlight=False, soft_wrap=True)
     if source.suffix.lower() == ".toml":
-        _export_robot(source, out, measured, console, force=force)
+        _export_robot(source, out, measured, force=force)
         return
     if measured is not None:
         raise RequestError("--measured goes with a robot: give an extended.toml in the place of SOURCE")
@@ -71,12 +70,12 @@ def export(
         recording, devices = taken.opened(Config.load(robot), source, lerobot), []
     scene = scene_for(out, robot, recording) if robot.exists() else None
     if scene is None and out.suffix.lower() == recordings.RERUN:
-        console.print(f"Without robot and cameras: there is no {robot}. Give --robot", markup=False)
+        say(f"Without robot and cameras: there is no {robot}. Give --robot")
     recordings.write(recording, out, devices, scene)
-    console.print(f"{len(recording)} pairs written to {out}", markup=False)
+    say(f"{len(recording)} pairs written to {out}")
 
 
-def _export_robot(source: Path, out: Path, measured: Path | None, console: Console, *, force: bool) -> None:
+def _export_robot(source: Path, out: Path, measured: Path | None, *, force: bool) -> None:
 
     from bodyschema.calibration.plausibility.limits import require_units
     from bodyschema.cli.terminal import robot_export
@@ -89,9 +88,8 @@ def _export_robot(source: Path, out: Path, measured: Path | None, console: Conso
     if measured is not None:
         recording = recordings.opened(measured, simulation.robot.joints)
         require_units(simulation.robot, recording, measured)
-    for sentence in robot_export.write(simulation, out):
-        console.print(sentence, markup=False)
-    console.print(f"{simulation.robot.name} {robot_export.effects_of(simulation)} written to {out}", markup=False)
+    say(*robot_export.write(simulation, out))
+    say(f"{simulation.robot.name} {robot_export.effects_of(simulation)} written to {out}")
     if recording is None:
         return
     rows, why_not = robot_export.compared(simulation, recording, out)
@@ -101,6 +99,6 @@ def _export_robot(source: Path, out: Path, measured: Path | None, console: Conso
     for row in rows:
         gain = "" if row.gain_percent is None else f"{row.gain_percent:.1f}"
         table.add_row(row.model, f"{row.rms_mm:.3f}", f"{row.mean_mm:.3f}", gain)
-    console.print(table)
+    Console(highlight=False, soft_wrap=True).print(table)
     if why_not is not None:
-        console.print(why_not, markup=False)
+        say(why_not)

@@ -13,7 +13,7 @@ from cyclopts.validators import Number
 from rich.console import Console
 from rich.live import Live
 
-from bodyschema.cli.commands.options import ANYTHING, HERE, VARIABLE, SearchOptions, flag, print_json, several
+from bodyschema.cli.commands.options import ANYTHING, HERE, VARIABLE, SearchOptions, flag, print_json, say, several
 from bodyschema.interfaces.errors import BusError, RequestError
 from bodyschema.interfaces.waits import STATUS_EVERY_S
 
@@ -159,10 +159,9 @@ def _diagnose(
     if as_json:
         print_json(found)
     else:
-        console = Console(highlight=False)
-        console.print(view(found))
+        Console(highlight=False).print(view(found))
         if out is not None:
-            console.print(f"\nEach report is {out}/NAME/report.html.", markup=False)
+            say(f"\nEach report is {out}/NAME/report.html.")
     if all(row.error is not None for row in found.rows):
         sys.exit(1)
 

@@ -10,7 +10,7 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 from rich.console import Console
 
-from bodyschema.cli.commands.options import HERE, RobotFile, flag, several
+from bodyschema.cli.commands.options import HERE, RobotFile, flag, say, several
 from bodyschema.daemon.service.signals import on_termination
 from bodyschema.interfaces.waits import POLL_S
 
@@ -51,14 +51,12 @@ def bench(
 
     console = Console(highlight=False, soft_wrap=True)
     if list_faults:
-        for kind, meaning in FAULTS.items():
-            console.print(f"{kind:12} {meaning}", markup=False)
+        say(*(f"{kind:12} {meaning}" for kind, meaning in FAULTS.items()))
         return
     config = Config.load(robot)
     run = BenchRun(config, port, faults=fault, return_delay_s=return_delay_us * 1e-6, seed=seed)
     with on_termination(run.stop), _made(run, console) as opened:
-        for line in opened.introduction():
-            console.print(line, markup=False)
+        say(*opened.introduction())
         _look_on(opened, console)
 
 

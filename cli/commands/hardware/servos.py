@@ -11,7 +11,7 @@ from cyclopts.validators import Number
 from rich.console import Console
 from rich.prompt import Confirm
 
-from bodyschema.cli.commands.options import HERE, RobotFile, flag, several
+from bodyschema.cli.commands.options import HERE, RobotFile, flag, say, several
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError, RequestError
 
@@ -126,10 +126,8 @@ def _zero(robot: Path, joint: tuple[str, ...], *, in_servo: bool, dry_run: bool,
         if in_servo:
             _carry_out(workbench, plan_zeros(workbench, wanted), _log(robot, None), dry_run=dry_run, yes=yes)
             return
-        console = Console(highlight=False, soft_wrap=True)
-        for line in zero_lines(zero_ticks(workbench, wanted)):
-            console.print(line, markup=False)
-        console.print(f"Put it into the entry of the joint in {robot}. Nothing was written.", markup=False)
+        say(*zero_lines(zero_ticks(workbench, wanted)))
+        say(f"Put it into the entry of the joint in {robot}. Nothing was written.")
 
 
 def _undo(robot: Path, port: str | None, *, dry_run: bool, yes: bool) -> None:
@@ -145,9 +143,7 @@ def _undo(robot: Path, port: str | None, *, dry_run: bool, yes: bool) -> None:
         )
     with workbench_of(entries[0].table) as workbench:
         planned, left = plan_undo(workbench, entries)
-        console = Console(highlight=False, soft_wrap=True)
-        for line in left:
-            console.print(f"left alone: {line}", markup=False)
+        say(*(f"left alone: {line}" for line in left))
         _carry_out(workbench, planned, log, dry_run=dry_run, yes=yes, undoes=entries[0].batch)
 
 
@@ -197,21 +193,14 @@ def _carry_out(
     if planned:
         console.print(planned_table(planned))
     if not any(each.is_needed for each in planned):
-        console.print("Nothing is to be written.")
+        say("Nothing is to be written.")
         return
-    if dry_run:
-        console.print("Nothing was written, and torque is as it was.")
-        return
-    if not yes and not _agreed(console):
-        console.print("Nothing was written, and torque is as it was.")
+    asked = "Write it? Torque is switched off first: hold the arm"
+    if dry_run or not (yes or Confirm.ask(asked, console=console, default=False)):
+        say("Nothing was written, and torque is as it was.")
         return
     done = carry_out(workbench, planned, log, SystemClock(), undoes=undoes)
     console.print(done_table(done))
-    console.print(f"Kept in {log.file}.", markup=False, soft_wrap=True)
+    say(f"Kept in {log.file}.")
     if not is_well(done):
         sys.exit(1)
-
-
-def _agreed(console: Console) -> bool:
-    asked = "Write it? Torque is switched off first: hold the arm"
-    return Confirm.ask(asked, console=console, default=False)

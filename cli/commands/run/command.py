@@ -5,9 +5,8 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 from cyclopts import Parameter
-from rich.console import Console
 
-from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json
+from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json, say
 from bodyschema.daemon.transport.keys import BOTHS, SAMPLERS, CommandName
 from bodyschema.interfaces.errors import RequestError
 
@@ -56,4 +55,4 @@ def command(
     if as_json:
         print_json(done)
         return
-    Console(highlight=False, soft_wrap=True).print(f"{process}: {done.message}", markup=False)
+    say(f"{process}: {done.message}")

@@ -6,9 +6,8 @@ from typing import Annotated
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
-from rich.console import Console
 
-from bodyschema.cli.commands.options import HERE, RobotFile, flag
+from bodyschema.cli.commands.options import HERE, RobotFile, flag, say
 from bodyschema.cli.terminal.view_process import PORT
 from bodyschema.interfaces.extras import require_extra
 
@@ -39,5 +38,4 @@ def view(
     from bodyschema.dashboard.server import serve
 
     logs.set_up(verbose=verbose)
-    console = Console(highlight=False, soft_wrap=True)
-    serve(Config.load(robot), port, lambda address: console.print(f"look at {address}", markup=False))
+    serve(Config.load(robot), port, lambda address: say(f"look at {address}"))

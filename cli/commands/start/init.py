@@ -12,8 +12,7 @@ from cyclopts.validators import Number
 from rich.console import Console
 from rich.prompt import Prompt
 
-from bodyschema.cli.commands.options import HERE, flag, several
-from bodyschema.cli.commands.start.config import say
+from bodyschema.cli.commands.options import HERE, flag, say, several
 from bodyschema.interfaces.errors import BodyschemaError, ConfigError
 
 if TYPE_CHECKING:
