@@ -21,7 +21,7 @@ from kbmaps.changes.kinds import any_change as any_change
 from kbmaps.changes.kinds import change_kinds as change_kinds
 from kbmaps.changes.naming import Explanation as Explanation
 from kbmaps.changes.naming import explanations as explanations
-from kbmaps.changes.shared_noise import SharedNoise as SharedNoise
+from kbmaps.changes.white_noise import SharedNoise as SharedNoise
 from kbmaps.changes.white_noise import WhiteNoise as WhiteNoise
 from kbmaps.contest import PrequentialComparison as PrequentialComparison
 from kbmaps.contest import Recent as Recent

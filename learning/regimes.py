@@ -11,8 +11,7 @@ import msgspec
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray, Pair
-from bodyschema.learning.changes.adaptation import Adapted, Origin
-from bodyschema.learning.changes.known_arm import KnownArm
+from bodyschema.learning.changes.known_arm import Adapted, KnownArm, Origin
 from bodyschema.learning.changes.monitor import LOOK_AGAIN, DetectedChange
 from bodyschema.learning.changes.outlier_gate import DOUBT, explained, sound
 from bodyschema.learning.changes.record import NAMED_WITHIN, ChangeRecord, KindOfChange

@@ -18,8 +18,14 @@ from kbmaps.maps.stack import BasisStack
 from kbmaps.model import Estimate, near_data
 from kbmaps.packed import complete, count, flag, named, number, pack, restoring, unpack
 from kbmaps.pairs import checked_pairs, stored_pairs
-from kbmaps.trains.core_evidence import USUAL_ELLIPSE_STD, core_equations, likely_ellipse_std
-from kbmaps.trains.core_prior import CORE_NUMBERS, CoreFamily, CorePrior
+from kbmaps.trains.core_prior import (
+    CORE_NUMBERS,
+    USUAL_ELLIPSE_STD,
+    CoreFamily,
+    CorePrior,
+    core_equations,
+    likely_ellipse_std,
+)
 from kbmaps.trains.posterior import TensorPosterior, misfit_sizes
 from kbmaps.trains.search import PLAUSIBLE, Fit, Pairs, information, refine, search
 from kbmaps.trains.train import TensorSettings, TensorTrain, parse_settings

@@ -8,7 +8,7 @@ import re
 import pytest
 
 from bodyschema.cli.install import machine_files
-from bodyschema.cli.install.udev import ADAPTERS, FILE, UdevRules, rules
+from bodyschema.cli.install.machine_files import ADAPTERS, FILE, UdevRules, rules
 from bodyschema.cli.main import command_line
 from bodyschema.interfaces.errors import ConfigError
 

@@ -16,8 +16,7 @@ from shown_board import BOARD, SIZE, KnownCorners, corner_views, known_rig, phot
 from small_arm import write_small_arm
 
 from bodyschema.cli.cameras.calibration import CheckFile, Wanted, kept_in, of_cameras
-from bodyschema.cli.cameras.live_calibration import LiveCalibration, Shown, checked_live
-from bodyschema.cli.cameras.live_calibration_view import Lines, guidance_on, screen
+from bodyschema.cli.cameras.live_calibration import Lines, LiveCalibration, Shown, checked_live, guidance_on, screen
 from bodyschema.cli.main import app
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError, SourceEnded, SourceLost

@@ -135,8 +135,7 @@ def _calibrate(
     as_json: bool,
 ) -> None:
 
-    from bodyschema.cli.cameras.calibration import figures, write_calibrated_cameras
-    from bodyschema.cli.cameras.calibration_view import cameras_view
+    from bodyschema.cli.cameras.calibration import cameras_view, figures, write_calibrated_cameras
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.wiring.cameras import calibration_file, names_calibration
 
@@ -170,8 +169,7 @@ def _check(
     as_json: bool,
 ) -> None:
 
-    from bodyschema.cli.cameras.calibration import checked
-    from bodyschema.cli.cameras.calibration_view import check_view
+    from bodyschema.cli.cameras.calibration import check_view, checked
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.wiring.cameras import calibration_file
 
@@ -215,8 +213,7 @@ def _live(
     """Return the views, their calibration, and what the cameras reported of their focus."""
 
     from bodyschema.cli.cameras.calibration import kept_in, live_views, of_cameras
-    from bodyschema.cli.cameras.live_calibration import LiveCalibration
-    from bodyschema.cli.cameras.live_calibration_view import guidance_on
+    from bodyschema.cli.cameras.live_calibration import LiveCalibration, guidance_on
     from bodyschema.daemon.wiring.cameras import focus_complaints, open_eyes, require_cameras
 
     clock = SystemClock()
@@ -232,8 +229,7 @@ def _live(
 def _checked_live(config: Config, file: Path, board: Board, seconds: float) -> tuple[CheckFile, str]:
 
     from bodyschema.cli.cameras.calibration import check_figures
-    from bodyschema.cli.cameras.live_calibration import LiveViews, checked_live
-    from bodyschema.cli.cameras.live_calibration_view import guidance_on
+    from bodyschema.cli.cameras.live_calibration import LiveViews, checked_live, guidance_on
     from bodyschema.daemon.wiring.cameras import open_eyes
 
     clock = SystemClock()

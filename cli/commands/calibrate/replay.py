@@ -69,9 +69,8 @@ def replay(
     from bodyschema.calibration.plausibility.check import plausibility, told_sigma
     from bodyschema.calibration.plausibility.limits import require_units
     from bodyschema.cli.replay.report import as_text
-    from bodyschema.cli.replay.run import Job
+    from bodyschema.cli.replay.run import Job, Steps, require_path
     from bodyschema.cli.replay.run import replay as run_replay
-    from bodyschema.cli.replay.steps import Steps, require_path
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.transport.wire import encode
     from bodyschema.learning.nominal import NominalModel

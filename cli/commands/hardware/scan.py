@@ -35,8 +35,7 @@ def scan(
     Next: `bodyschema init --urdf YOUR.urdf --from scan`; `bodyschema doctor`.
     """
 
-    from bodyschema.cli.hardware.scan_report import as_json, report_of
-    from bodyschema.cli.hardware.scan_view import show
+    from bodyschema.cli.hardware.scan_report import as_json, report_of, show
     from bodyschema.cli.terminal.progress import shown_on
     from bodyschema.daemon.wiring import servos as servo_wiring
     from bodyschema.daemon.wiring import wiring

@@ -89,7 +89,7 @@ def servos(
 
 def _show(wanted: Sequence[Wanted], *, as_json: bool) -> None:
 
-    from bodyschema.cli.servos.changes_view import settings_json, settings_table
+    from bodyschema.cli.servos.changes import settings_json, settings_table
     from bodyschema.daemon.wiring.eeprom import settings_by_name
 
     found = []
@@ -116,8 +116,7 @@ def _set(
 
 def _zero(robot: Path, joint: tuple[str, ...], *, in_servo: bool, dry_run: bool, yes: bool) -> None:
 
-    from bodyschema.cli.servos.changes import plan_zeros, zero_ticks
-    from bodyschema.cli.servos.changes_view import zero_lines
+    from bodyschema.cli.servos.changes import plan_zeros, zero_lines, zero_ticks
 
     if not joint:
         raise ConfigError("no joint is named", remedy="Name it with --joint")
@@ -186,8 +185,7 @@ def _carry_out(
     undoes: int | None = None,
 ) -> None:
 
-    from bodyschema.cli.servos.changes import carry_out, is_well
-    from bodyschema.cli.servos.changes_view import done_table, planned_table
+    from bodyschema.cli.servos.changes import carry_out, done_table, is_well, planned_table
 
     console = Console(highlight=False)
     if planned:

@@ -61,7 +61,7 @@ def install(
     docs/operation.md describes logs, upgrades and backups.
     """
     if what == "udev":
-        from bodyschema.cli.install.udev import UdevRules
+        from bodyschema.cli.install.machine_files import UdevRules
 
         rules = UdevRules(root)
         if uninstall:
