@@ -122,7 +122,7 @@ class LeRobotOptions:
 
     def require(self, config: Config) -> None:
         """Raise ConfigError if joint offsets could not be put into the file, if there is one."""
-        from bodyschema.cli.hardware.lerobot_offsets import CorrectedCalibration
+        from bodyschema.cli.hardware.lerobot_robot import CorrectedCalibration
 
         if self.lerobot is not None:
             CorrectedCalibration.of(config, self.lerobot, {})
@@ -132,7 +132,7 @@ class LeRobotOptions:
 
         Where the file has the offsets of this `recording` already, this is said, and nothing is written.
         """
-        from bodyschema.cli.hardware.lerobot_offsets import CorrectedCalibration, after_writing, difference
+        from bodyschema.cli.hardware.lerobot_robot import CorrectedCalibration, after_writing, difference
 
         if self.lerobot is None:
             return []

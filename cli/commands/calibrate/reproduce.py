@@ -72,7 +72,7 @@ def _experiments(name: Name, out: Path, seed: int, *, real: bool, quiet: bool) -
     import msgspec
     import numpy as np
 
-    from bodyschema.cli.terminal.progress import shown_on
+    from bodyschema.cli.terminal.screen import shown_on
     from bodyschema.reproduce import EXPERIMENTS, Run
     from bodyschema.reproduce.plot import plot
     from bodyschema.reproduce.show import show

@@ -36,7 +36,7 @@ def scan(
     """
 
     from bodyschema.cli.hardware.scan_report import as_json, report_of, show
-    from bodyschema.cli.terminal.progress import shown_on
+    from bodyschema.cli.terminal.screen import shown_on
     from bodyschema.daemon.wiring import servos as servo_wiring
     from bodyschema.daemon.wiring import wiring
 

@@ -118,8 +118,7 @@ def _joints(robot: Path, *, once: bool, json: bool, zero_force: bool) -> None:
 
 def _cameras(robot: Path, out: Path | None, port: int, every: float, count: int | None) -> None:
 
-    from bodyschema.cli.cameras.mjpeg import MjpegServer
-    from bodyschema.cli.cameras.watching import Watching
+    from bodyschema.cli.cameras.watching import MjpegServer, Watching
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.wiring.cameras import open_watched
 

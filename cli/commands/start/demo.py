@@ -60,8 +60,7 @@ def demo(
     """
     import numpy as np
 
-    from bodyschema.cli.demo.play import play
-    from bodyschema.cli.demo.plot import plot_curve, write_curve
+    from bodyschema.cli.demo.play import play, plot_curve, write_curve
     from bodyschema.cli.demo.scene import prepare
     from bodyschema.cli.demo.view import show_outcome, shown_on
     from bodyschema.daemon.wiring.wiring import require_simulation

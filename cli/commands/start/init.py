@@ -186,7 +186,7 @@ def _candidates(source: str, ports: Sequence[str], bauds: Sequence[int]) -> list
 
     from bodyschema.cli.hardware.scan_report import as_json, report_of
     from bodyschema.cli.servos.fitting import candidates_in, read_scan
-    from bodyschema.cli.terminal.progress import shown_on
+    from bodyschema.cli.terminal.screen import shown_on
     from bodyschema.daemon.wiring import servos as servo_wiring
 
     if source != SCAN:
