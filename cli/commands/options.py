@@ -16,7 +16,6 @@ from rich.console import Console
 if TYPE_CHECKING:
     from bodyschema.cli.terminal.diagnosis_run import Asked
     from bodyschema.daemon.config import Config
-    from bodyschema.recordings.recording import Recording
 
 HERE = Path("robot.toml")
 VARIABLE = "BODYSCHEMA_ROBOT"
@@ -64,22 +63,6 @@ class SourceOptions:
             validator=Number(gte=-10_000, lte=10_000),
         ),
     ] = 0.0
-
-    def opened(self, config: Config, source: Path, lerobot: Path | None = None) -> Recording:
-        """Return the recording in `source`; `lerobot` is LeRobot's calibration of the arm of a dataset."""
-        from bodyschema.cli.recordings.foreign import Taken, opened
-
-        taken = Taken(
-            self.joint_topic,
-            self.marker_topic,
-            self.marker_frame,
-            self.markers,
-            self.video,
-            lerobot,
-            self.lerobot_unit,
-            1e-3 * self.marker_delay_ms,
-        )
-        return opened(config, source, taken)
 
 
 AS_THEY_ARE = SourceOptions()

@@ -5,9 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
-import os
 import queue
-import signal
 import subprocess
 import threading
 import time
@@ -20,11 +18,10 @@ from typing import IO, Literal
 import numpy as np
 
 from bodyschema.cli.demo.scene import Scene
-from bodyschema.cli.replay.processes import END_LIMIT_S, START_LIMIT_S
+from bodyschema.cli.replay.processes import Process, end, started
 from bodyschema.cli.terminal.screen import rejected
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.service.signals import with_parent
-from bodyschema.daemon.transport.bus import ZenohSession, is_alive
+from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import CommandRequest, JointsRequest, PairsReply, PredictReply, decode, encode
@@ -215,44 +212,6 @@ def _turned(answer: PredictReply, truth: FloatArray) -> dict[str, float]:
     }
 
 
-class Daemon:
-    """`bodyschema run --sim` with its output in the scene's log."""
-
-    def __init__(self, process: subprocess.Popen[bytes], scene: Scene) -> None:
-        self._process, self._scene = process, scene
-
-    def check(self) -> None:
-        """Raise BusError if it has ended."""
-        if self._process.poll() is not None:
-            raise BusError(
-                f"the daemon ended with exit code {self._process.returncode}; {self._scene.log_file} says why"
-            )
-
-    def wait_for(self, endpoint: str, alive: str) -> None:
-        """Return once the process that listens on `endpoint` is alive. BusError if it is not alive in time."""
-        limit = time.monotonic() + START_LIMIT_S
-        while not is_alive(endpoint, alive):
-            self.check()
-            if time.monotonic() > limit:
-                raise BusError(
-                    f"nothing runs on {endpoint} after {START_LIMIT_S:.0f} s; {self._scene.log_file} says why"
-                )
-            time.sleep(0.1)
-
-
-@contextmanager
-def started_daemon(scene: Scene) -> Iterator[Daemon]:
-    """Run sampler and learner until the end of the with statement."""
-    command = module_command("bodyschema", "run", "--sim", "--robot", str(scene.robot_file))
-    with scene.log_file.open("wb") as log:
-        environment = os.environ | with_parent()
-        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment)
-        try:
-            yield Daemon(process, scene)
-        finally:
-            _end(process)
-
-
 class Asker:
     """Output of the asking process."""
 
@@ -284,7 +243,7 @@ def started_asker(scene: Scene, seed: int) -> Iterator[Asker]:
     try:
         yield Asker(lines)
     finally:
-        _end(process)
+        end(process)
         reader.join()
         process.stdout.close()
 
@@ -292,15 +251,6 @@ def started_asker(scene: Scene, seed: int) -> Iterator[Asker]:
 def _collect(stream: IO[bytes], lines: queue.SimpleQueue[bytes]) -> None:
     for line in stream:
         lines.put(line)
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    process.send_signal(signal.SIGTERM)
-    try:
-        process.wait(END_LIMIT_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
 
 
 STALL_LIMIT_S = 60.0
@@ -369,7 +319,7 @@ def play(scene: Scene, *, first: int, second: int, seed: int, show: Callable[[Sn
     config = Config.load(scene.robot_file)
     endpoints, keys = config.tables.zenoh, Keys(config.robot.name)
     with ExitStack() as stack:
-        daemon = stack.enter_context(started_daemon(scene))
+        daemon = stack.enter_context(started("daemon", ["--sim", "--robot", str(scene.robot_file)], {}, scene.log_file))
         daemon.wait_for(endpoints.sampler, keys.alive("sampler"))
         daemon.wait_for(endpoints.learner, keys.alive("learner"))
         sampler = stack.enter_context(ZenohSession(connect=endpoints.sampler, client=True))
@@ -392,7 +342,7 @@ def stalled(sampler: SamplerStatus) -> str:
 @dataclass
 class _Stage:
     config: Config
-    daemon: Daemon
+    daemon: Process
     sampler: ZenohSession
     learner: ZenohSession
     asker: Asker

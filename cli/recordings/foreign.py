@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
 import numpy as np
 
+from bodyschema.cli.commands.options import SourceOptions
 from bodyschema.cli.hardware.lerobot_robot import joint_servos
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.wiring.servos import require_servos
@@ -108,38 +108,19 @@ def _fixes(config: Config, file: Path, parts: list[VideoPart]) -> list[tuple[flo
     return found
 
 
-@dataclass(frozen=True)
-class Taken:
-    """Selection from a bag or a dataset whose contents are ambiguous.
-
-    Attributes:
-        joint_topic, marker_topic, marker_frame: of a bag; see `BagTopics`.
-        video: the camera in whose videos the marker is tracked; of a bag, the topic of its images.
-        markers: a file with the marker's positions: t, x, y, z, and in `segment` the episode.
-        lerobot: LeRobot's calibration of the arm that a dataset was recorded with.
-        lerobot_unit: of a dataset's readings.
-        delay_s: delay of the time stamps of the marker's positions [s].
-    """
-
-    joint_topic: str | None = None
-    marker_topic: str | None = None
-    marker_frame: str | None = None
-    markers: Path | None = None
-    video: str | None = None
-    lerobot: Path | None = None
-    lerobot_unit: Unit | None = None
-    delay_s: float = 0.0
-
-
-def opened(config: Config, source: Path, taken: Taken) -> Recording:
+def opened(config: Config, source: Path, taken: SourceOptions, lerobot: Path | None) -> Recording:
     """Return the recording in `source`, whatever its format.
+
+    Args:
+        taken: the parts of a bag or a dataset.
+        lerobot: LeRobot's calibration of the arm that a dataset was recorded with.
 
     Raises:
         RecordingError, StoreError: it cannot be read, or what to take of it is not clear.
         ConfigError: a file that it needs besides is wrong.
     """
     marker = None if taken.markers is None else read_marker_track(taken.markers)
-    joints = config.robot.joints
+    joints, delay_s = config.robot.joints, 1e-3 * taken.marker_delay_ms
     if is_lerobot_dataset(source):
         if marker is None and taken.video is not None:
             marker = markers_in_video(config, source, taken.video)
@@ -150,13 +131,15 @@ def opened(config: Config, source: Path, taken: Taken) -> Recording:
                 remedy="Name its camera with --video observation.images.NAME, or give the marker's positions with "
                 "--markers FILE.csv: t, x, y, z, and the episode as segment",
             )
-        return read_lerobot_dataset(source, _units(config, source, taken), marker.earlier(taken.delay_s))
+        return read_lerobot_dataset(
+            source, _units(config, source, lerobot, taken.lerobot_unit), marker.earlier(delay_s)
+        )
     if is_bag(source):
         if marker is None and taken.video is not None:
             marker = markers_in_images(config, source, taken.video)
         robot = config.tables.drivers.ros2
         names = {} if robot is None else robot.names
-        topics = BagTopics(taken.joint_topic, taken.marker_topic, taken.marker_frame, names, taken.delay_s)
+        topics = BagTopics(taken.joint_topic, taken.marker_topic, taken.marker_frame, names, delay_s)
         return read_bag(source, joints, topics, marker)
     if source.is_dir() and not source.suffix:
         raise RecordingError(
@@ -182,8 +165,8 @@ def read_marker_track(file: Path) -> MarkerTrack:
     return MarkerTrack(t, found.x, run, found.cov, found.orientation)
 
 
-def _units(config: Config, source: Path, taken: Taken) -> LeRobotUnits:
-    if taken.lerobot is None:
+def _units(config: Config, source: Path, lerobot: Path | None, unit: Unit | None) -> LeRobotUnits:
+    if lerobot is None:
         raise RecordingError(
             "a dataset does not say how its arm was calibrated",
             file=source,
@@ -191,4 +174,4 @@ def _units(config: Config, source: Path, taken: Taken) -> LeRobotUnits:
         )
     servos = {servo.joint: servo for servo in joint_servos(require_servos(config))}
     wanted = [servos[joint] for joint in config.robot.joints]
-    return LeRobotUnits(read_calibration(taken.lerobot, config.robot.joints), wanted, taken.lerobot_unit)
+    return LeRobotUnits(read_calibration(lerobot, config.robot.joints), wanted, unit)

@@ -293,9 +293,9 @@ def _running(job: Job) -> Iterator[_Live]:
     }
     arguments = ["--robot", os.fspath(job.config.file), "--state-dir", os.fspath(job.folder)]
     with (
-        started("learner", arguments, environment, job.folder / "learner.log") as learner,
+        started("learner", ["learner", *arguments], environment, job.folder / "learner.log") as learner,
         _connected(learner, learner_endpoint, keys.alive(learner.name)) as learner_bus,
-        started("sampler", arguments, environment, job.folder / "sampler.log") as sampler,
+        started("sampler", ["sampler", *arguments], environment, job.folder / "sampler.log") as sampler,
         _connected(sampler, sampler_endpoint, keys.alive(sampler.name)) as sampler_bus,
     ):
         yield _Live(job, (sampler, sampler_bus), (learner, learner_bus))

@@ -177,7 +177,6 @@ def arm(
     Next: `bodyschema run --robot OUT/robot.toml` starts from what was learnt. With --lerobot the joint offsets go into
     the servos instead, by LeRobot's own calibration file.
     """
-
     from bodyschema.calibration.next_poses import check_target
     from bodyschema.calibration.plausibility.check import plausibility, told_sigma
     from bodyschema.calibration.plausibility.limits import require_units
@@ -224,6 +223,7 @@ def _rows(
     config: Config, source: Path, taken: SourceOptions, lerobot: Path | None, between: tuple[int | None, int | None]
 ) -> tuple[Recording, int]:
     """Return the rows to learn, and the number of the first; of a store, those with the present tool."""
+    from bodyschema.cli.recordings.foreign import opened
     from bodyschema.daemon.learner.checkpoint import first_pair
     from bodyschema.recordings import files as recordings
 
@@ -233,7 +233,7 @@ def _rows(
         recording = recordings.of_robot(stored.recording, config.robot.joints, source)
         first = first or first_pair(stored, source.with_name(config.checkpoint_file.name), config.robot.name)
     else:
-        recording = taken.opened(config, source, lerobot)
+        recording = opened(config, source, taken, lerobot)
     first = first or 1
     return recordings.between(recording, first, last, source), first
 
@@ -264,7 +264,6 @@ def _written(config: Config, found: Calibration, report: CalibrationReport, out:
 
 
 def _show(report: CalibrationReport, lines: list[str], written: list[str]) -> None:
-
     from bodyschema.cli.terminal.calibration_view import view
     from bodyschema.robot.hand_eye import in_shell_lines
 

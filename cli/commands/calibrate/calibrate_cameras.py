@@ -134,7 +134,6 @@ def _calibrate(
     *,
     as_json: bool,
 ) -> None:
-
     from bodyschema.cli.cameras.calibration import cameras_view, figures, write_calibrated_cameras
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.wiring.cameras import calibration_file, names_calibration
@@ -168,7 +167,6 @@ def _check(
     *,
     as_json: bool,
 ) -> None:
-
     from bodyschema.cli.cameras.calibration import check_view, checked
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.wiring.cameras import calibration_file
@@ -188,7 +186,6 @@ def _check(
 
 
 def _print_board(made: Board, paper: str, out: Path) -> None:
-
     from bodyschema.cli.cameras.calibration import write_board
 
     across, upright = write_board(made, paper, out)
@@ -199,7 +196,6 @@ def _print_board(made: Board, paper: str, out: Path) -> None:
 
 
 def _of_images(images: Path, files: EyeFiles, board: Board, wanted: Wanted) -> tuple[Gathered, Calibrated]:
-
     from bodyschema.cli.cameras.calibration import calibrated, from_images
 
     tell = partial(say, stderr=True)
@@ -211,7 +207,6 @@ def _live(
     config: Config, board: Board, wanted: Wanted, save: Path | None
 ) -> tuple[Gathered, Calibrated, tuple[str, ...]]:
     """Return the views, their calibration, and what the cameras reported of their focus."""
-
     from bodyschema.cli.cameras.calibration import kept_in, live_views, of_cameras
     from bodyschema.cli.cameras.live_calibration import LiveCalibration, guidance_on
     from bodyschema.daemon.wiring.cameras import focus_complaints, open_eyes, require_cameras
@@ -227,7 +222,6 @@ def _live(
 
 
 def _checked_live(config: Config, file: Path, board: Board, seconds: float) -> tuple[CheckFile, str]:
-
     from bodyschema.cli.cameras.calibration import check_figures
     from bodyschema.cli.cameras.live_calibration import LiveViews, checked_live, guidance_on
     from bodyschema.daemon.wiring.cameras import open_eyes

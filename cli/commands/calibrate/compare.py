@@ -37,7 +37,6 @@ def compare(
 
     Next: `bodyschema simulate` with another robot.toml; `bodyschema calibrate`.
     """
-
     from bodyschema.calibration.comparison import compared
     from bodyschema.cli.commands.calibrate.compare import view
     from bodyschema.recordings import files as recordings

@@ -64,7 +64,7 @@ def diagnose(
     Next: open OUT/report.html; give OUT/extended.toml to any command as --robot, and
     `bodyschema export` turns it into models for MuJoCo, controllers and drivers.
     """
-
+    from bodyschema.cli.recordings.foreign import opened
     from bodyschema.cli.terminal.diagnosis_run import measured, results_in, run, written
     from bodyschema.daemon.config import Config
 
@@ -73,7 +73,7 @@ def diagnose(
     config = Config.load(robot_file(robot, recording))
     servos.require(config)
     asked = search.asked()
-    source = measured(config, recording, lambda file: taken.opened(config, file, servos.lerobot), live=live)
+    source = measured(config, recording, lambda file: opened(config, file, taken, servos.lerobot), live=live)
     with results_in(out), _progress(Console(stderr=True, highlight=False)) as tell:
         found = run(config, source, asked, tell, force=force)
         if out is not None:
@@ -98,7 +98,6 @@ def _joint_offsets(found: Found) -> dict[str, float]:
 
 
 def _show(found: Found, lines: list[str], out: Path | None) -> None:
-
     from bodyschema.cli.terminal.diagnosis_view import view
 
     Console(highlight=False).print(view(found.file, found.remedies, timed=found.timed))

@@ -45,7 +45,6 @@ def latency(
     Next: the same with --write, which puts latency_s and latency_sigma_s into [vision.cameras], or [marker_source]. The
     old file is kept as robot.toml.before.
     """
-
     from bodyschema.calibration.latency import latency_of
     from bodyschema.cli.hardware.wiggling import write_wiggle
     from bodyschema.daemon.config import Config
@@ -85,7 +84,6 @@ def latency(
 
 
 def _wiggle(config: Config, recording: Path | None, seconds: float, *, sim: bool) -> Wiggle:
-
     from bodyschema.cli.hardware.wiggling import collected, read_wiggle
     from bodyschema.daemon.wiring.wiring import open_sources
 

@@ -78,7 +78,6 @@ def print_tags(
 
     Next: put the printed tables into robot.toml; `bodyschema marker learn` for tags glued by hand.
     """
-
     from bodyschema.cli.cameras.tag_pages import Tags, as_printed, face_mm, tables, write_tags
 
     drawn = Tags(shape, ids, family, side_mm, columns, rows, fold_deg)
@@ -162,7 +161,6 @@ def learn(
 
 
 def _measure_cluster(images: Images, calibration: Path, wanted: Wanted, *, as_json: bool) -> None:
-
     from bodyschema.daemon.wiring.markers import figures, measured, said, tables
 
     found = measured(images, calibration, wanted, partial(say, stderr=True))
@@ -174,7 +172,6 @@ def _measure_cluster(images: Images, calibration: Path, wanted: Wanted, *, as_js
 
 
 def _learnt_live(robot: Path, seconds: float) -> str:
-
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.wiring.cameras import open_eyes
     from bodyschema.daemon.wiring.markers import moving_colour_table

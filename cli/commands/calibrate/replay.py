@@ -64,10 +64,10 @@ def replay(
 
     Next: `bodyschema run` with the arm.
     """
-
     from bodyschema.calibration.evaluate import split_blocks
     from bodyschema.calibration.plausibility.check import plausibility, told_sigma
     from bodyschema.calibration.plausibility.limits import require_units
+    from bodyschema.cli.recordings.foreign import opened
     from bodyschema.cli.replay.report import as_text
     from bodyschema.cli.replay.run import Job, Steps, require_path
     from bodyschema.cli.replay.run import replay as run_replay
@@ -77,7 +77,7 @@ def replay(
 
     config = Config.load(robot_file(robot, recording))
     config.require_learnable()
-    rows = taken.opened(config, recording, lerobot)
+    rows = opened(config, recording, taken, lerobot)
     require_units(config.robot, rows, recording)
     split = split_blocks(len(rows), held_out)
     any_step |= config.tables.daemon.any_step

@@ -48,7 +48,6 @@ def reproduce(
 
     Next: docs/results/paper.md describes what the paper leaves open, how it was interpreted, and what --json prints.
     """
-
     import msgspec
 
     require_extra("plots", "a figure")
@@ -68,7 +67,6 @@ def reproduce(
 
 def _experiments(name: Name, out: Path, seed: int, *, real: bool, quiet: bool) -> Iterator[dict[str, object]]:
     """Run the experiments and plot each into `out`; yield curves and figures, which are shown unless `quiet`."""
-
     import msgspec
     import numpy as np
 

@@ -34,7 +34,6 @@ def simulate(
 
     Next: `bodyschema compare LIKE OUT`.
     """
-
     import numpy as np
 
     from bodyschema.calibration.plausibility.limits import require_units

@@ -51,7 +51,6 @@ def backup(
 
 
 def _write(file: Path, robot: Path, state_dir: Path | None, *, force: bool, as_json: bool) -> None:
-
     from bodyschema.cli.install.backup import write_backup
     from bodyschema.daemon.config import Config
 
@@ -76,7 +75,6 @@ def _write(file: Path, robot: Path, state_dir: Path | None, *, force: bool, as_j
 
 
 def _restore(file: Path, robot: Path, state_dir: Path | None, *, force: bool, as_json: bool) -> None:
-
     from bodyschema.cli.install.backup import Backup
     from bodyschema.cli.install.restore import restore
 

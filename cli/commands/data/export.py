@@ -53,7 +53,7 @@ def export(
 
     Next: `bodyschema replay` on a CSV or Parquet file; `python -m mujoco.viewer --mjcf=OUT` on an MJCF file.
     """
-
+    from bodyschema.cli.recordings.foreign import opened
     from bodyschema.cli.recordings.rerun_scene import scene_for
     from bodyschema.daemon.config import Config
     from bodyschema.recordings import files as recordings
@@ -67,7 +67,7 @@ def export(
     if source.suffix.lower() in recordings.STORE_ENDINGS:
         recording, devices = recordings.from_store(source), recordings.devices_of(source)
     else:
-        recording, devices = taken.opened(Config.load(robot), source, lerobot), []
+        recording, devices = opened(Config.load(robot), source, taken, lerobot), []
     scene = scene_for(out, robot, recording) if robot.exists() else None
     if scene is None and out.suffix.lower() == recordings.RERUN:
         say(f"Without robot and cameras: there is no {robot}. Give --robot")
@@ -76,7 +76,6 @@ def export(
 
 
 def _export_robot(source: Path, out: Path, measured: Path | None, *, force: bool) -> None:
-
     from bodyschema.calibration.plausibility.limits import require_units
     from bodyschema.cli.terminal import robot_export
     from bodyschema.effects import load_simulation

@@ -93,7 +93,6 @@ def fleet(
 
 
 def _list(looked_at: list[Place], *, watch: bool, json: bool) -> None:
-
     from bodyschema.fleet.roster import Fleet, as_json, screen
 
     console = Console(highlight=False)
@@ -118,7 +117,6 @@ def _list(looked_at: list[Place], *, watch: bool, json: bool) -> None:
 
 
 def _compare(looked_at: list[Place], *, as_json: bool) -> None:
-
     from bodyschema.fleet.comparison import compare_types, view
     from bodyschema.fleet.roster import Fleet
 
@@ -144,7 +142,6 @@ def _diagnose(
     *,
     as_json: bool,
 ) -> None:
-
     from bodyschema.fleet.diagnosing import diagnose_all
     from bodyschema.fleet.diagnosing import workers as cluster
     from bodyschema.fleet.summary import summary
@@ -167,7 +164,6 @@ def _diagnose(
 
 
 def _places(connect: tuple[str, ...], robot: tuple[Path, ...]) -> list[Place]:
-
     from bodyschema.fleet.roster import places
 
     described = robot or (() if connect else (Path(os.environ.get(VARIABLE, HERE)),))

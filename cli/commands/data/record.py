@@ -32,7 +32,6 @@ def record(
 
     Next: `bodyschema replay` on a CSV or Parquet file.
     """
-
     from bodyschema.cli.recordings.recorder import History, copy_history, follow_history
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.transport.bus import client

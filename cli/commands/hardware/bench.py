@@ -45,7 +45,6 @@ def bench(
 
     Next: in another terminal `bodyschema scan`, `doctor` or `watch joints`, each with --robot PORT.toml.
     """
-
     from bodyschema.cli.hardware.bench_run import FAULTS, BenchRun
     from bodyschema.daemon.config import Config
 

@@ -34,7 +34,6 @@ def scan(
 
     Next: `bodyschema init --urdf YOUR.urdf --from scan`; `bodyschema doctor`.
     """
-
     from bodyschema.cli.hardware.scan_report import as_json, report_of, show
     from bodyschema.cli.terminal.screen import shown_on
     from bodyschema.daemon.wiring import servos as servo_wiring

@@ -88,7 +88,6 @@ def servos(
 
 
 def _show(wanted: Sequence[Wanted], *, as_json: bool) -> None:
-
     from bodyschema.cli.servos.changes import settings_json, settings_table
     from bodyschema.daemon.wiring.eeprom import settings_by_name
 
@@ -115,7 +114,6 @@ def _set(
 
 
 def _zero(robot: Path, joint: tuple[str, ...], *, in_servo: bool, dry_run: bool, yes: bool) -> None:
-
     from bodyschema.cli.servos.changes import plan_zeros, zero_lines, zero_ticks
 
     if not joint:
@@ -130,7 +128,6 @@ def _zero(robot: Path, joint: tuple[str, ...], *, in_servo: bool, dry_run: bool,
 
 
 def _undo(robot: Path, port: str | None, *, dry_run: bool, yes: bool) -> None:
-
     from bodyschema.cli.servos.changes import plan_undo
     from bodyschema.daemon.wiring.eeprom import workbench_of
 
@@ -184,7 +181,6 @@ def _carry_out(
     yes: bool,
     undoes: int | None = None,
 ) -> None:
-
     from bodyschema.cli.servos.changes import carry_out, done_table, is_well, planned_table
 
     console = Console(highlight=False)

@@ -87,7 +87,6 @@ def watch(
 
 
 def _joints(robot: Path, *, once: bool, json: bool, zero_force: bool) -> None:
-
     from bodyschema.cli.hardware.joints_watch import JointsWatch, as_json, screen
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.sampler.powered import find_powered
@@ -117,7 +116,6 @@ def _joints(robot: Path, *, once: bool, json: bool, zero_force: bool) -> None:
 
 
 def _cameras(robot: Path, out: Path | None, port: int, every: float, count: int | None) -> None:
-
     from bodyschema.cli.cameras.watching import MjpegServer, Watching
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.wiring.cameras import open_watched
@@ -143,7 +141,6 @@ def _cameras(robot: Path, out: Path | None, port: int, every: float, count: int 
 
 
 def _marker(robot: Path, seconds: float | None) -> None:
-
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.marker_watch import MarkerWatch
     from bodyschema.daemon.wiring.wiring import open_streams

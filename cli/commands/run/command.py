@@ -37,7 +37,6 @@ def command(
 
     Next: `bodyschema status`.
     """
-
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.transport.bus import client
     from bodyschema.daemon.transport.keys import Keys

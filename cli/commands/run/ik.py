@@ -47,7 +47,6 @@ def ik(
 
     Next: the same from your own program, starting at your arm's current angles: docs/zenoh.md.
     """
-
     from bodyschema.daemon.client_config import ClientConfig
     from bodyschema.daemon.transport.bus import client
     from bodyschema.daemon.transport.keys import Keys
@@ -67,7 +66,6 @@ def ik(
 
 
 def _show(reply: IkReply, config: ClientConfig, deg: bool) -> None:
-
     from bodyschema.cli.terminal.screen import two_digits
 
     table = Table(box=None, pad_edge=False, header_style="bold", show_header=False)

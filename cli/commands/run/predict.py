@@ -91,7 +91,6 @@ def _notes(config: Config, q: FloatArray, deg: bool) -> Iterator[str]:
 
 def _rows(values: tuple[float, ...], config: ClientConfig, deg: bool) -> list[list[float]]:
     """Return the vectors of joint values [rad, m]. RequestError if the input is none."""
-
     from bodyschema.daemon.transport.wire import JointsRequest, joint_angles, joint_rows
 
     if values:
@@ -124,7 +123,6 @@ def _from_standard_input(config: ClientConfig) -> JointsRequest:
 
 
 def _show(reply: PredictReply) -> None:
-
     from bodyschema.cli.terminal.screen import two_digits
 
     table = Table(box=None, pad_edge=False, header_style="bold")

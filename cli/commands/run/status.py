@@ -24,7 +24,6 @@ def status(
 
     Next: `bodyschema command` to pause, or to report a tool change; `bodyschema predict`.
     """
-
     from bodyschema.cli.terminal.status_view import Watcher, as_json, screen
     from bodyschema.daemon.client_config import ClientConfig
 

@@ -30,7 +30,6 @@ def view(
 
     Next: open the address in a browser.
     """
-
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.service import logs
 

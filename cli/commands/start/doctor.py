@@ -20,7 +20,6 @@ def doctor(*, robot: RobotFile = HERE, json: Annotated[bool, flag("As JSON.")] =
 
     Next: the commands in the last column; `bodyschema scan` if a servo is missing.
     """
-
     from bodyschema.cli.hardware.doctor import as_json, run, show
     from bodyschema.daemon.config import Config
 

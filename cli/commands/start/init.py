@@ -183,7 +183,6 @@ def _copy_model(robot: Path) -> None:
 
 
 def _candidates(source: str, ports: Sequence[str], bauds: Sequence[int]) -> list[Candidate]:
-
     from bodyschema.cli.hardware.scan_report import as_json, report_of
     from bodyschema.cli.servos.fitting import candidates_in, read_scan
     from bodyschema.cli.terminal.screen import shown_on
