@@ -81,11 +81,7 @@ class Fitting:
         self._before, self._chain, self._due_at, self._is_first = before, hand, first_at, True
 
     def rest(self, hand: RigidChain) -> None:
-        """Stop fitting.
-
-        Args:
-            hand: a chain that gives the orientation of the hand.
-        """
+        """Stop fitting. `hand`: a chain that gives the orientation of the hand."""
         self._before, self._chain, self._due_at, self._is_first = None, hand, None, False
 
     def fit(self, q: FloatArray, x: FloatArray) -> Fit | None:

@@ -20,7 +20,7 @@ from kbmaps.maps.basis import JointBasis, check_net_size, describe_bases, parse_
 from kbmaps.maps.kbmap import POSITION_OUTPUTS, KBMap
 from kbmaps.maps.support import SUPPORT_LIMIT
 from kbmaps.memory import Memory, describe_memory, parse_memory
-from kbmaps.model import Estimate
+from kbmaps.model import Estimate, Model
 from kbmaps.packed import complete, count, named, number, pack, restoring, unpack
 from kbmaps.pairs import checked_pairs, stored_pairs, with_units
 
@@ -166,8 +166,8 @@ def slopes(model: Predictor, q: ArrayLike, bases: Sequence[JointBasis]) -> Float
     return columns.swapaxes(1, 2).reshape(*angles.shape[:-1], 3, len(bases))
 
 
-class KernelLearner:
-    """Learns a KB-Map around a prior from n pairs with n² numbers instead of 3^d control points. A `Model`.
+class KernelLearner(Model):
+    """Learns a KB-Map around a prior from n pairs with n² numbers instead of 3^d control points.
 
     Gives the same solution as `ExactLearner` where both can be computed. Use this one for fewer pairs than control
     points, and for more joints than a net has room for. The fit runs on first use after `learn`, at n³ / 3
@@ -207,7 +207,6 @@ class KernelLearner:
 
     @property
     def joints(self) -> int:
-        """Number of joints d."""
         return self._kernel.joints
 
     @property
@@ -239,7 +238,6 @@ class KernelLearner:
         return self._fitted().log_evidence
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Return positions (n, 3) [m] at q (n, d), or (3,) at q (d,)."""
         angles = rows_or_vector("q", q, self.joints)
         batch = np.atleast_2d(angles)
         x = self._prior.predict(batch)
@@ -264,11 +262,7 @@ class KernelLearner:
 
     @property
     def prior_precision(self) -> float:
-        """λ of the current fit; 0 for the exact one.
-
-        Raises:
-            DegenerateDataError: no pair has been learnt.
-        """
+        """λ of the current fit; 0 for the exact one. Raises DegenerateDataError: no pair has been learnt."""
         return self._fitted().precision
 
     @property
@@ -277,17 +271,7 @@ class KernelLearner:
         return math.sqrt(self._fitted().prior_variance)
 
     def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
-        """Learn pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,).
-
-        Args:
-            q: joint values.
-            x: measured positions.
-            sigma: 1-sigma of the positions [m], () or (n,); None where it is to be estimated.
-
-        Raises:
-            ShapeError, NonFiniteError, SettingError (a sigma that is not positive)
-            DegenerateDataError: more pairs than control points, and no precision to weigh them. Nothing has changed.
-        """
+        """Learn pairs; DegenerateDataError: more than control points, and no precision to weigh them."""
         angles, positions, sigmas = self._pairs.checked(q, x, sigma)
         kept = self._memory.kept(self.kept + len(angles))
         points = math.prod(basis.size for basis in self.bases)
@@ -325,7 +309,7 @@ class KernelLearner:
         return Estimate(self.predict(batch), sigma, fit.unexplained(weights) <= SUPPORT_LIMIT).like(angles)
 
     def to_bytes(self) -> bytes:
-        """Return the learner with the pairs that count; `from_bytes` restores the same predictions to the last bit.
+        """Return the learner with the pairs that count.
 
         A prior that is neither a `KBMap` nor a `RigidChain` is not stored. The one given in its place has to predict
         the same at the pairs, up to rounding; elsewhere predictions differ as the priors do.

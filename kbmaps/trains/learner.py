@@ -16,7 +16,7 @@ from kbmaps.chains.chain import RigidChain
 from kbmaps.errors import DegenerateDataError, ModelFormatError, SettingError, ShapeError
 from kbmaps.maps.basis import JointBasis, describe_bases, parse_bases
 from kbmaps.maps.stack import BasisStack
-from kbmaps.model import Estimate, near_data
+from kbmaps.model import Estimate, Model, near_data
 from kbmaps.packed import complete, count, flag, named, number, pack, restoring, unpack
 from kbmaps.pairs import checked_pairs, stored_pairs
 from kbmaps.trains.core_prior import CORE_NUMBERS, CoreFamily, CorePrior
@@ -130,8 +130,8 @@ class _Settings:
 _SETTINGS = _Settings()
 
 
-class TensorLearner:
-    """Learns a TensorTrain. A `kbmaps.model.Model`.
+class TensorLearner(Model):
+    """Learns a TensorTrain.
 
     With a prior, every fit is the most likely train under it (`TensorLearner.around` makes one from a nominal chain).
     Without, the first fits search from random chains once there are `pairs_needed`; later ones continue from the one
@@ -219,12 +219,10 @@ class TensorLearner:
 
     @property
     def joints(self) -> int:
-        """Number of joints d."""
         return len(self.bases)
 
     @property
     def pairs(self) -> int:
-        """Number of learnt pairs."""
         return self._pairs
 
     @property
@@ -268,7 +266,6 @@ class TensorLearner:
         return np.zeros(0, dtype=np.bool_) if self._fit is None else ~self._fit.used
 
     def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
-        """Learn pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,); see `Model.learn`."""
         angles, positions, sigmas = checked_pairs(q, x, sigma, self.joints)
         self._q = np.concatenate([self._q, angles])
         self._x = np.concatenate([self._x, positions])
@@ -282,11 +279,7 @@ class TensorLearner:
             self.refit()
 
     def forget(self, keep: int) -> None:
-        """Drop all but the last `keep` pairs. The train stays until the next fit.
-
-        Raises:
-            SettingError: keep below 0.
-        """
+        """Drop all but the last `keep` pairs. The train stays until the next fit. Raises SettingError: keep below 0."""
         if keep < 0:
             raise SettingError(f"keep must be at least 0, got {keep}")
         self._keep(keep)
@@ -349,29 +342,15 @@ class TensorLearner:
         return self._posterior
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Return positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
-
-        Raises:
-            DegenerateDataError: there is neither a prior nor enough pairs.
-        """
         return self.train.predict(q)
 
     def jacobian(self, q: ArrayLike) -> FloatArray:
-        """Return the derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d); exact.
-
-        Raises:
-            DegenerateDataError: there is neither a prior nor enough pairs.
-        """
         return self.train.jacobian(q)
 
     def estimate(self, q: ArrayLike) -> Estimate:
-        """Return positions at q (n, d), or (d,), with the standard deviation of the Gauss-Newton posterior.
+        """Return positions with the standard deviation of the Gauss-Newton posterior.
 
-        Where residuals show joint or instrument errors that no train can follow, their uncertainty is added
-        (`kbmaps.trains.misfit`).
-
-        Raises:
-            DegenerateDataError: there is neither a prior nor enough pairs.
+        Where residuals show joint or instrument errors that no train can follow, their uncertainty is added.
         """
         angles = rows_or_vector("q", q, self.joints)
         batch = np.atleast_2d(angles)
@@ -380,7 +359,6 @@ class TensorLearner:
         return Estimate(self.predict(batch), np.sqrt(variance), inside).like(angles)
 
     def to_bytes(self) -> bytes:
-        """Return the train, its prior, the kept pairs and the settings as one self-describing byte string."""
         arrays = {"q": self._q, "x": self._x, "sigma": self._sigma}
         if self._prior is not None:
             arrays |= {"mean": self._prior.mean, "spread": self._prior.spread}
@@ -404,7 +382,6 @@ class TensorLearner:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
-        """Return the learner in the bytes of `to_bytes`."""
         content, arrays = unpack(data, KIND)
         with restoring("a tensor learner"):
             named(content, "the fields", _FIELDS)
