@@ -41,7 +41,6 @@ from bodyschema.interfaces.extras import require_extra
 from bodyschema.recordings.store.file import LOW_DISK_BYTES
 from bodyschema.recordings.store.store import PairReader
 
-LITTLE_DISK_BYTES = 2**30
 TIME_ERROR = 5  # adjtimex(2): the clock is not synchronised
 TIMEX_BYTES = 512  # more than struct timex has
 CONNECT_S = 0.3
@@ -178,7 +177,7 @@ def disk_checks(folder: Path) -> Iterator[Check]:
         return
     free = shutil.disk_usage(there).free
     said = f"{free / 2**30:.1f} GiB are free for {folder}"
-    if free < LITTLE_DISK_BYTES:
+    if free < 5 * LOW_DISK_BYTES:
         state = "wrong" if free < LOW_DISK_BYTES else "warning"
         yield Check("disk", state, said, f"du -xh {there} | sort -h | tail    # what could go")
     else:

@@ -22,7 +22,7 @@ from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import JointsRequest, PredictReply, decode, encode
 from bodyschema.interfaces.errors import BusError, RecordingError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.recordings.recording import Recording
+from bodyschema.recordings.recording import ROW_INTERVAL_S, Recording
 from bodyschema.robot.description import RobotDescription
 from kbmaps import rotation_matrices, rotation_vectors
 
@@ -81,7 +81,6 @@ GLANCE_S = 0.25
 STALL_LIMIT_S = 120.0
 BATCH = 2000
 # Live pairs come at most at the frame rate, and over some time: background learning is designed for that.
-LIVE_ROWS_PER_S = 30.0
 SHORTEST_S = 20.0
 
 
@@ -93,7 +92,7 @@ class Job:
         config: the robot's configuration.
         recording: the recording.
         split: its held-out rows.
-        speed: 1 as recorded, 0 as fast as the sampler takes it; None at `LIVE_ROWS_PER_S` on average,
+        speed: 1 as recorded, 0 as fast as the sampler takes it; None at the usual frame rate on average,
             but in `SHORTEST_S` at least.
         sigma_m: 1-sigma of the positions if the recording has none [m]; None as in robot.toml.
         any_step: relax the sampler's step and speed rules.
@@ -114,7 +113,7 @@ class Job:
     def drivers(self) -> dict[str, float]:
         """Keys of the table [drivers] for this job."""
         times = self.learnt_rows.play_times
-        live = float(times[-1] - times[0]) / max(len(times) / LIVE_ROWS_PER_S, SHORTEST_S)
+        live = float(times[-1] - times[0]) / max(len(times) * ROW_INTERVAL_S, SHORTEST_S)
         keys = {"speed": live if self.speed is None else self.speed}
         return keys if self.sigma_m is None else keys | {"recording_sigma_m": self.sigma_m}
 

@@ -226,7 +226,7 @@ class RigidLearner(Model):
         Args:
             q, x, sigma: once one pair came without its sigma, the noise is estimated for all, and those told count
                 relative to their median.
-            cov: in the place of sigma: covariances [m²], (3, 3) or (n, 3, 3), where some directions are surer than others:
+            cov: in the place of sigma: covariances [m²], (3, 3) or (n, 3, 3), where some directions are surer:
                 one camera tells depth far worse than what is across.
 
         Raises:

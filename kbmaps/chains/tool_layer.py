@@ -23,7 +23,6 @@ from kbmaps.pairs import checked_pairs
 from kbmaps.robust import UNCALIBRATED_SIGMAS
 
 _KIND = "tool layer, 1"
-DEFAULT_OUTLIER_SIGMAS = 6.0
 # Finite stand-in for an infinite spread [m].
 _WIDE = 1e6
 # Number of pairs kept to judge outliers; older ones remain in sums.
@@ -67,7 +66,7 @@ class ToolLayer(Model):
         *,
         spread: float = 1.0,
         noise: float = 0.01,
-        outlier_sigmas: float = DEFAULT_OUTLIER_SIGMAS,
+        outlier_sigmas: float = 6.0,
     ) -> None:
         if not (noise > 0.0 and math.isfinite(noise)):
             raise SettingError(f"noise must be finite and greater than 0 m, got {noise!r}")

@@ -34,7 +34,7 @@ PARAMETER_NAMES: Mapping[BasisKind, tuple[str, ...]] = {
 
 SINGULAR_ALPHA = (math.radians(80.0), math.radians(100.0))
 # Rounding of degrees to radians must not let 80 or 100 degrees through.
-_ANGLE_ROUNDING = 1e-12
+_ANGLE_ROUNDING = math.ulp(math.pi)
 DEFAULT_SCALE = 0.7
 
 

@@ -19,8 +19,6 @@ from kbmaps.maps.stack import BasisStack
 from kbmaps.maps.targets import pose_targets
 from kbmaps.packed import complete, count, named, number, or_infinite, pack, restoring, unless_infinite, unpack
 
-DEFAULT_MU0 = 0.5
-
 
 @dataclass(frozen=True)
 class StepSize:
@@ -38,7 +36,7 @@ class StepSize:
         SettingError: mu0 is not between 0 and 2, decay not above 0, or floor not within 0..mu0.
     """
 
-    mu0: float = DEFAULT_MU0
+    mu0: float = 0.5
     decay: float = math.inf
     floor: float = 0.0
 
@@ -89,7 +87,7 @@ class NLMS:
         array([0.5, 0. , 0. ])
     """
 
-    def __init__(self, kbmap: KBMap, mu0: float | StepSize = DEFAULT_MU0) -> None:
+    def __init__(self, kbmap: KBMap, mu0: float | StepSize = StepSize.mu0) -> None:
         self._bases = kbmap.bases
         self._step_size = mu0 if isinstance(mu0, StepSize) else StepSize(mu0)
         self._pairs = 0

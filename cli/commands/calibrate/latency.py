@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from bodyschema.calibration.latency import Wiggle
     from bodyschema.daemon.config import Config
 
-SECONDS = 5.0
-
 
 def latency(
     recording: Annotated[
@@ -26,9 +24,7 @@ def latency(
     /,
     *,
     robot: RobotFile = HERE,
-    seconds: Annotated[
-        float, Parameter(help="How long the arm is moved [s].", validator=Number(gte=3, lte=120))
-    ] = SECONDS,
+    seconds: Annotated[float, Parameter(help="How long the arm is moved [s].", validator=Number(gte=3, lte=120))] = 5.0,
     sim: Annotated[bool, flag("The simulated robot in the place of the hardware: to see it done.")] = False,
     save: Annotated[Path | None, Parameter(help="Keep readings and positions in this CSV file.")] = None,
     write: Annotated[bool, flag("Put the latency into robot.toml; without it the change is shown.")] = False,
