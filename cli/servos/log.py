@@ -50,7 +50,6 @@ class ServoLog:
     """The log in a state directory; a missing file counts as empty."""
 
     def __init__(self, folder: Path) -> None:
-        """Set the folder; nothing is opened yet."""
         self.file = folder / FILE
 
     def append(self, entries: Sequence[LoggedWrite]) -> None:

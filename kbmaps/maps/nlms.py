@@ -13,10 +13,9 @@ from numpy.typing import ArrayLike
 from kbmaps.arrays import FloatArray, IntArray, rows, rows_or_vector, vector
 from kbmaps.errors import ModelFormatError, SettingError, ShapeError
 from kbmaps.maps.basis import describe_bases, parse_bases
-from kbmaps.maps.kbmap import POSITION_OUTPUTS, KBMap
+from kbmaps.maps.kbmap import POSITION_OUTPUTS, KBMap, pose_targets
 from kbmaps.maps.kernels import net_kernel
 from kbmaps.maps.stack import BasisStack
-from kbmaps.maps.targets import pose_targets
 from kbmaps.packed import complete, count, named, number, or_infinite, pack, restoring, unless_infinite, unpack
 
 

@@ -12,8 +12,18 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 from rich.console import Console
 
-from bodyschema.cli.commands.board_options import AS_PRINTED, BY_NAME, EyeFiles, EyeImages, PrintedBoard
-from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json, say
+from bodyschema.cli.commands.options import (
+    AS_PRINTED,
+    BY_NAME,
+    HERE,
+    EyeFiles,
+    EyeImages,
+    PrintedBoard,
+    RobotFile,
+    flag,
+    print_json,
+    say,
+)
 from bodyschema.daemon.service.signals import on_termination
 from bodyschema.interfaces.clock import SystemClock
 

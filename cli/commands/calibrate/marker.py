@@ -11,8 +11,7 @@ import cyclopts
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from bodyschema.cli.commands.board_options import BY_NAME, EyeFiles
-from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json, say
+from bodyschema.cli.commands.options import BY_NAME, HERE, EyeFiles, RobotFile, flag, print_json, say
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import RequestError
 

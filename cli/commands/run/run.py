@@ -78,7 +78,7 @@ def run(
 
 
 def _both(robot: Path, state_dir: Path | None, *, sim: bool, view: bool, verbose: bool) -> None:
-    from bodyschema.cli.terminal.view_process import shown
+    from bodyschema.cli.commands.run.view import shown
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.service.supervise import Child, Supervisor
     from bodyschema.daemon.wiring.wiring import check_sources
@@ -123,7 +123,7 @@ def _sampler(robot: Path, state_dir: Path | None, *, sim: bool, exit_at_end: boo
 
 
 def _learner(robots: tuple[Path, ...], state_dir: Path | None, processes: int, *, view: bool, verbose: bool) -> None:
-    from bodyschema.cli.terminal.view_process import shown
+    from bodyschema.cli.commands.run.view import shown
     from bodyschema.daemon.learner.host import run_learners
     from bodyschema.daemon.service.notify import Notifier
     from bodyschema.fleet.hosting import configs_of, descriptions, spread
