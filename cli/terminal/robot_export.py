@@ -27,8 +27,10 @@ from bodyschema.effects.joint_errors import JointErrors
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.recordings.recording import Recording
+from bodyschema.robot.calibrated_files import CAMERA_LINK, MARKER_LINK
 from bodyschema.robot.limited import read_at_most
 from bodyschema.robot.rpy import rpy_of
+from bodyschema.robot.urdf import UrdfTree, chain_between
 
 # ur_description, from the base outwards: the joint's name without prefix, and its link's name in kinematics.yaml.
 _UR = {
@@ -271,9 +273,6 @@ def _rows(predicted: dict[str, FloatArray], x: FloatArray) -> list[Row]:
 
 
 def _seen_by_urdf(file: Path, simulation: Simulation, q: FloatArray) -> FloatArray:
-    from bodyschema.robot.calibrated_files import CAMERA_LINK, MARKER_LINK
-    from bodyschema.robot.urdf import UrdfTree, chain_between
-
     robot, none = simulation.robot, np.zeros(3)
     chain = chain_between(
         UrdfTree.load(file),
