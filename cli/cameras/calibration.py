@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -25,21 +26,22 @@ from bodyschema.robot.hand_eye import HandEye, pose_covariance
 from bodyschema.vision.board import Board
 from bodyschema.vision.board.board import Pattern
 from bodyschema.vision.board.page import page as board_page
-from bodyschema.vision.calibration.calibrate import Asked, Calibrated, ModelChoice, calibrate
+from bodyschema.vision.calibration.calibrate import Asked, Calibrated, calibrate
 from bodyschema.vision.calibration.check import Check, check
 from bodyschema.vision.calibration.gather import Gathered, gathered, require_both
 from bodyschema.vision.calibration.images import ImagePair, Images, read_pairs, write_pair
-from bodyschema.vision.calibration.live import LiveViews
 from bodyschema.vision.calibration.refocus import refocused
 from bodyschema.vision.calibration.report import page as report_page
 from bodyschema.vision.calibration.report.page import to_its_interval
-from bodyschema.vision.calibration.view import EYES, ONE_EYE
 from bodyschema.vision.printing.sheet import rulers_mm
 from bodyschema.vision.rig.rectified import Rectification
 from bodyschema.vision.rig.rig_file import read_rig, write_rig
 from bodyschema.vision.rig.spread import covariance_of
 from bodyschema.vision.rig.stereo_rig import CalibrationError, OneEyeRig, StereoRig
 from bodyschema.vision.rig.triangulated import triangulated
+
+if TYPE_CHECKING:
+    from bodyschema.cli.commands.calibrate.calibrate_cameras import KnownCameras
 
 REPORT = "report.html"
 NORMAL_95 = 1.96
@@ -193,42 +195,22 @@ def from_images(images: Images, board: Board, tell: Tell) -> Gathered:
     return found
 
 
-@dataclass(frozen=True)
-class Wanted:
-    """Settings of a calibration besides views and board; see `bodyschema.vision.calibration.calibrate.Asked`."""
+def calibrated(found: Gathered, known: KnownCameras, tell: Tell, serials: Sequence[str] = ("", "")) -> Calibrated:
+    """Calibrate from the views. Raise CalibrationError with the reasons if the result is not good enough.
 
-    serials: tuple[str, ...] = ("", "")
-    model: ModelChoice = "auto"
-    scale_sigma: float = 0.001
-    baseline_mm: float | None = None
-
-
-def calibrated(found: Gathered, wanted: Wanted, tell: Tell) -> Calibrated:
-    """Calibrate from the views. Raise CalibrationError with the reasons if the result is not good enough."""
+    Args:
+        serials: those of the cameras; what is `known` takes precedence.
+    """
+    given = (known.left_serial, known.right_serial)
     asked = Asked(
         image_size_px=found.image_size_px,
-        serials=wanted.serials[: len(found.eyes)],
+        serials=tuple(own or told for own, told in zip(given, serials, strict=False))[: len(found.eyes)],
         date=SystemClock().utc(),
-        model=wanted.model,
-        scale_sigma=wanted.scale_sigma,
-        baseline_m=_metres(wanted.baseline_mm),
+        model=known.lens,
+        scale_sigma=0.01 * known.scale_sigma_percent,
+        baseline_m=_metres(known.baseline_mm),
     )
     return calibrate(found.views, found.board, asked, tell)
-
-
-def of_cameras(wanted: Wanted) -> Callable[[Gathered, tuple[str, ...], Tell], Calibrated]:
-    """Return a variant of `calibrated` for cameras with known serials; the serials in `wanted` take precedence."""
-
-    def of(found: Gathered, serials: tuple[str, ...], tell: Tell) -> Calibrated:
-        known = tuple(own or told for own, told in zip(wanted.serials, serials, strict=False))
-        return calibrated(found, replace(wanted, serials=known), tell)
-
-    return of
-
-
-def live_views(board: Board, eyes: int) -> LiveViews:
-    """Return an empty collection of views of the board, for one eye or two."""
-    return LiveViews(board, eyes=EYES if eyes > 1 else ONE_EYE)
 
 
 def kept_in(folder: Path | None) -> Callable[[ImagePair, int], None]:

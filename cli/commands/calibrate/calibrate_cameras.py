@@ -28,7 +28,7 @@ from bodyschema.daemon.service.signals import on_termination
 from bodyschema.interfaces.clock import SystemClock
 
 if TYPE_CHECKING:
-    from bodyschema.cli.cameras.calibration import Board, Calibrated, CheckFile, Gathered, Wanted
+    from bodyschema.cli.cameras.calibration import Board, Calibrated, CheckFile, Gathered
     from bodyschema.daemon.config import Config
 
 CAMERAS, BOARD = Path("cameras.toml"), Path("board.pdf")
@@ -54,13 +54,6 @@ class KnownCameras:
         Parameter(help="Serial number of the left camera, kept in the file; live, it is known.", show_default=False),
     ] = ""
     right_serial: Annotated[str, Parameter(help="Serial number of the right camera.", show_default=False)] = ""
-
-    def wanted(self) -> Wanted:
-        """Return the settings of the calibration."""
-        from bodyschema.cli.cameras.calibration import Wanted
-
-        serials = (self.left_serial, self.right_serial)
-        return Wanted(serials, self.lens, 0.01 * self.scale_sigma_percent, self.baseline_mm)
 
 
 @Parameter(name="*")
@@ -148,13 +141,13 @@ def _calibrate(
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.wiring.cameras import calibration_file, names_calibration
 
-    board, wanted, named, autofocus = printed.board(), known.wanted(), True, ()
+    board, named, autofocus = printed.board(), True, ()
     if images is not None:
-        found, result = _of_images(images, files, board, wanted)
+        found, result = _of_images(images, files, board, known)
         out = out or CAMERAS
     else:
         config = Config.load(robot)
-        found, result, autofocus = _live(config, board, wanted, save)
+        found, result, autofocus = _live(config, board, known, save)
         out, named = out or calibration_file(config), names_calibration(config)
     report = write_calibrated_cameras(result, found, out)
     measured = printed.ruler_mm is not None or known.baseline_mm is not None
@@ -205,27 +198,36 @@ def _print_board(made: Board, paper: str, out: Path) -> None:
     )
 
 
-def _of_images(images: Path, files: EyeFiles, board: Board, wanted: Wanted) -> tuple[Gathered, Calibrated]:
+def _of_images(images: Path, files: EyeFiles, board: Board, known: KnownCameras) -> tuple[Gathered, Calibrated]:
     from bodyschema.cli.cameras.calibration import calibrated, from_images
 
     tell = partial(say, stderr=True)
     found = from_images(files.of(images), board, tell)
-    return found, calibrated(found, wanted, tell)
+    return found, calibrated(found, known, tell)
 
 
 def _live(
-    config: Config, board: Board, wanted: Wanted, save: Path | None
+    config: Config, board: Board, known: KnownCameras, save: Path | None
 ) -> tuple[Gathered, Calibrated, tuple[str, ...]]:
     """Return the views, their calibration, and what the cameras reported of their focus."""
-    from bodyschema.cli.cameras.calibration import kept_in, live_views, of_cameras
+    from bodyschema.cli.cameras.calibration import calibrated, kept_in
     from bodyschema.cli.cameras.live_calibration import LiveCalibration, guidance_on
     from bodyschema.daemon.wiring.cameras import focus_complaints, open_eyes, require_cameras
+    from bodyschema.vision.calibration.live import LiveViews
+    from bodyschema.vision.calibration.view import EYES, ONE_EYE
 
     clock = SystemClock()
     eyes = open_eyes(config, clock)
-    views = live_views(board, require_cameras(config).eyes)
+    views = LiveViews(board, eyes=EYES if require_cameras(config).eyes > 1 else ONE_EYE)
     with guidance_on(Console(stderr=True, highlight=False), board.name, clock) as show:
-        calibration = LiveCalibration(eyes, views, of_cameras(wanted), show, clock, keep=kept_in(save))
+        calibration = LiveCalibration(
+            eyes,
+            views,
+            lambda found, serials, tell: calibrated(found, known, tell, serials),
+            show,
+            clock,
+            keep=kept_in(save),
+        )
         with on_termination(calibration.stop):
             found, result = calibration.run()
     return found, result, focus_complaints(eyes)
