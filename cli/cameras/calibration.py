@@ -30,9 +30,11 @@ from bodyschema.vision.calibration.calibrate import Asked, Calibrated, calibrate
 from bodyschema.vision.calibration.check import Check, check
 from bodyschema.vision.calibration.gather import Gathered, gathered, require_both
 from bodyschema.vision.calibration.images import ImagePair, Images, read_pairs, write_pair
+from bodyschema.vision.calibration.live import LiveViews
 from bodyschema.vision.calibration.refocus import refocused
 from bodyschema.vision.calibration.report import page as report_page
 from bodyschema.vision.calibration.report.page import to_its_interval
+from bodyschema.vision.calibration.view import EYES, ONE_EYE
 from bodyschema.vision.printing.sheet import rulers_mm
 from bodyschema.vision.rig.rectified import Rectification
 from bodyschema.vision.rig.rig_file import read_rig, write_rig
@@ -211,6 +213,11 @@ def calibrated(found: Gathered, known: KnownCameras, tell: Tell, serials: Sequen
         baseline_m=_metres(known.baseline_mm),
     )
     return calibrate(found.views, found.board, asked, tell)
+
+
+def live_views(board: Board, eyes: int) -> LiveViews:
+    """Return an empty collection of views of the board, for one eye or two."""
+    return LiveViews(board, eyes=EYES if eyes > 1 else ONE_EYE)
 
 
 def kept_in(folder: Path | None) -> Callable[[ImagePair, int], None]:

@@ -210,15 +210,13 @@ def _live(
     config: Config, board: Board, known: KnownCameras, save: Path | None
 ) -> tuple[Gathered, Calibrated, tuple[str, ...]]:
     """Return the views, their calibration, and what the cameras reported of their focus."""
-    from bodyschema.cli.cameras.calibration import calibrated, kept_in
+    from bodyschema.cli.cameras.calibration import calibrated, kept_in, live_views
     from bodyschema.cli.cameras.live_calibration import LiveCalibration, guidance_on
     from bodyschema.daemon.wiring.cameras import focus_complaints, open_eyes, require_cameras
-    from bodyschema.vision.calibration.live import LiveViews
-    from bodyschema.vision.calibration.view import EYES, ONE_EYE
 
     clock = SystemClock()
     eyes = open_eyes(config, clock)
-    views = LiveViews(board, eyes=EYES if require_cameras(config).eyes > 1 else ONE_EYE)
+    views = live_views(board, require_cameras(config).eyes)
     with guidance_on(Console(stderr=True, highlight=False), board.name, clock) as show:
         calibration = LiveCalibration(
             eyes,
