@@ -33,8 +33,7 @@ import numpy as np
 from benchmarks.first_pairs import REACH
 from benchmarks.rough_arm import RoughArm, rough_arm
 from bodyschema.interfaces.records import FloatArray, Pair, frozen_array
-from bodyschema.learning.changes.adaptation import Origin
-from bodyschema.learning.changes.known_arm import KnownArm
+from bodyschema.learning.changes.known_arm import KnownArm, Origin
 from bodyschema.learning.changes.monitor import LOOKED_BACK, ChangeMonitor, Reference
 from bodyschema.learning.changes.record import ChangeRecord, KindOfChange
 from bodyschema.learning.solvers.solver import fitted_belief

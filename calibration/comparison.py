@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from bodyschema.interfaces.errors import RecordingError
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.recordings.recording import Recording
+from kbmaps.chains.align import rigid_motion
 
 # Rows whose joints differ by more are not at the same joint angles [rad, m].
 SAME_ANGLES = 1e-6
@@ -197,14 +198,9 @@ def _aligned(x: FloatArray, other: FloatArray) -> Aligned | None:
 
 
 def laid_on(x: FloatArray, other: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the positions `other` (n, 3) rigidly aligned with `x` (n, 3), and the rotation (3, 3).
-
-    By least squares (Kabsch 1976).
-    """
-    middle, other_middle = x.mean(axis=0), other.mean(axis=0)
-    U, _, Vt = np.linalg.svd((other - other_middle).T @ (x - middle))
-    turn = Vt.T @ np.diag([1.0, 1.0, np.sign(np.linalg.det(Vt.T @ U.T))]) @ U.T
-    return (other - other_middle) @ turn.T + middle, turn
+    """Return the positions `other` (n, 3) rigidly aligned with `x` (n, 3), and the rotation (3, 3)."""
+    turn, shift = rigid_motion(other, x, np.ones(len(x)))
+    return other @ turn.T + shift, turn
 
 
 def _worst(first: Recording, match: _Match, apart: FloatArray) -> tuple[WorstRow, ...]:

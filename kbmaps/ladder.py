@@ -64,7 +64,7 @@ class Rung:
             raise SettingError(f"growth must be 0 or greater, got {self.growth!r}")
 
 
-class Ladder:
+class Ladder(Model):
     """Holds models side by side, lets each learn at its own pace, and answers with the best predictor.
 
     Each pair is predicted by every model before it is learnt. The answer comes from the most trusted model that is not
@@ -147,12 +147,10 @@ class Ladder:
 
     @property
     def joints(self) -> int:
-        """Number of joints d."""
         return self._joints
 
     @property
     def pairs(self) -> int:
-        """Number of pairs so far."""
         return len(self._q)
 
     @property
@@ -197,22 +195,12 @@ class Ladder:
             self._catch_up()
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Return positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
-
-        Raises:
-            DegenerateDataError: no model that may extrapolate has enough pairs yet.
-        """
         angles = rows_or_vector("q", q, self._joints)
         if self._rungs[self._answering].extrapolates:
             return self._rungs[self._answering].model.predict(angles)
         return self.estimate(angles).x
 
     def jacobian(self, q: ArrayLike) -> FloatArray:
-        """Return the answering model's derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d).
-
-        Raises:
-            DegenerateDataError: no model that may extrapolate has enough pairs yet.
-        """
         angles = rows_or_vector("q", q, self._joints)
         rung = self._rungs[self._answering]
         if rung.extrapolates:
@@ -225,11 +213,6 @@ class Ladder:
         return columns[0] if angles.ndim == 1 else columns
 
     def estimate(self, q: ArrayLike) -> Estimate:
-        """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and True where data is near.
-
-        Raises:
-            DegenerateDataError: no model that may extrapolate has enough pairs yet.
-        """
         angles = rows_or_vector("q", q, self._joints)
         batch, rung = np.atleast_2d(angles), self._rungs[self._answering]
         inside = rung.model.estimate(batch)
@@ -242,10 +225,6 @@ class Ladder:
         return Estimate(x, sigma, inside.in_support).like(angles)
 
     def to_bytes(self) -> bytes:
-        """Return the ladder with all its models and pairs.
-
-        `from_bytes` restores the same predictions to the last bit.
-        """
         entries = [
             {
                 "name": name,

@@ -112,7 +112,7 @@ class Model(PositionModel, Protocol):
         ...
 
     def to_bytes(self) -> bytes:
-        """Return the model with its learning state as one self-describing byte string."""
+        """Return the model with its learning state; `from_bytes` restores the same predictions to the last bit."""
         ...
 
     @classmethod

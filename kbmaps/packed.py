@@ -39,8 +39,36 @@ def pack(kind: str, fields: Mapping[str, Any], arrays: Mapping[str, FloatArray])
     content = {"kind": kind, "fields": dict(fields), "arrays": shapes}
     header = json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
     payload = b"".join(array.astype("<f8", copy=False).tobytes() for array in arrays.values())
-    body = _PREFIX.pack(MAGIC, VERSION, len(header)) + header + payload
+    return framed(MAGIC, header, payload)
+
+
+def framed(magic: bytes, header: bytes, payload: bytes) -> bytes:
+    """Return magic, version, length of the header, header, payload and checksum as one byte string."""
+    body = _PREFIX.pack(magic, VERSION, len(header)) + header + payload
     return body + _checksum(body)
+
+
+def unframed(data: bytes, magic: bytes) -> tuple[bytes, memoryview]:
+    """Return header and payload of `framed`. Raises ModelFormatError."""
+    if not isinstance(data, bytes | bytearray | memoryview):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise ModelFormatError(
+            f"a stored model is bytes, as to_bytes gives them and Path.read_bytes reads them; got {type(data).__name__}"
+        )
+    view = memoryview(data)
+    if len(view) < _PREFIX.size + _CHECKSUM_BYTES:
+        raise ModelFormatError(f"{len(view)} bytes are too few for a stored model")
+    found, version, header_length = cast(tuple[bytes, int, int], _PREFIX.unpack_from(view))
+    if found != magic:
+        raise ModelFormatError("not a stored model: the first eight bytes are not its signature")
+    if version != VERSION:
+        raise ModelFormatError(f"format version {version} is not known here (this code reads {VERSION})")
+    body, checksum = view[:-_CHECKSUM_BYTES], bytes(view[-_CHECKSUM_BYTES:])
+    if _checksum(body) != checksum:
+        raise ModelFormatError("the checksum does not match: the bytes are damaged or truncated")
+    end = _PREFIX.size + header_length
+    if end > len(body):
+        raise ModelFormatError(f"the header claims {header_length} bytes, more than there are")
+    return bytes(body[_PREFIX.size : end]), body[end:]
 
 
 def unpack(data: bytes, kind: str) -> tuple[dict[str, Any], dict[str, FloatArray]]:
@@ -49,11 +77,7 @@ def unpack(data: bytes, kind: str) -> tuple[dict[str, Any], dict[str, FloatArray
     Raises:
         ModelFormatError: the bytes are damaged, truncated, of another kind, or of another format.
     """
-    if not isinstance(data, bytes | bytearray | memoryview):  # pyright: ignore[reportUnnecessaryIsInstance]
-        raise ModelFormatError(
-            f"a stored model is bytes, as to_bytes gives them and Path.read_bytes reads them; got {type(data).__name__}"
-        )
-    header, payload = _split(memoryview(data))
+    header, payload = unframed(data, MAGIC)
     try:
         content: Any = json.loads(header, parse_float=_finite, parse_constant=_finite)
     except (ValueError, RecursionError) as error:
@@ -134,24 +158,6 @@ def unless_infinite(value: float) -> float | None:
 def or_infinite(value: Any, what: str) -> float:
     """Return the number from `unless_infinite`. Raises ModelFormatError."""
     return math.inf if value is None else number(value, what)
-
-
-def _split(view: memoryview) -> tuple[bytes, memoryview]:
-    """Return header and arrays, after checking magic, version, lengths and checksum."""
-    if len(view) < _PREFIX.size + _CHECKSUM_BYTES:
-        raise ModelFormatError(f"{len(view)} bytes are too few for a stored model")
-    magic, version, header_length = cast(tuple[bytes, int, int], _PREFIX.unpack_from(view))
-    if magic != MAGIC:
-        raise ModelFormatError("not a stored model: the first eight bytes are not its signature")
-    if version != VERSION:
-        raise ModelFormatError(f"format version {version} is not known here (this code reads {VERSION})")
-    body, checksum = view[:-_CHECKSUM_BYTES], bytes(view[-_CHECKSUM_BYTES:])
-    if _checksum(body) != checksum:
-        raise ModelFormatError("the checksum does not match: the bytes are damaged or truncated")
-    end = _PREFIX.size + header_length
-    if end > len(body):
-        raise ModelFormatError(f"the header claims {header_length} bytes, more than there are")
-    return bytes(body[_PREFIX.size : end]), body[end:]
 
 
 def _arrays(shapes: dict[str, Any], payload: memoryview) -> dict[str, FloatArray]:

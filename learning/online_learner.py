@@ -23,10 +23,9 @@ from bodyschema.learning.snapshot import Snapshot
 from bodyschema.learning.solvers.solver import Solver, SolverClient
 from bodyschema.learning.state import Counters, LearningState
 from bodyschema.learning.status import CurvePoint, OrientationStatus
+from bodyschema.learning.uncertainty import WARM
 from kbmaps import ChainBelief, Recent
 
-# Number of predicted pairs before a model's errors give an expected error.
-FEWEST_TO_CLAIM = 5.0
 FEED_PAIRS = 256
 REGION_RAD = np.radians(3.0)
 REGION_SAMPLES = 256
@@ -125,7 +124,9 @@ class OnlineLearner:
         with self._lock:
             regime, snapshot = self._core.regimes.present, self._snapshot
             answering = None if regime is None else self._core.regimes.claims.errors.get(regime.answering)
-            if regime is None or answering is None or answering.weight < FEWEST_TO_CLAIM:
+            if (
+                regime is None or answering is None or answering.weight < WARM / 2
+            ):  # the prior expectation counts more than the errors
                 return None
             region = self._region(regime)
         return snapshot.expected_error_m(region)
@@ -147,7 +148,7 @@ class OnlineLearner:
                 regime.orientations.prequential_rad(),
                 self._region(regime),
             )
-        claimed = model.expected_error(region) if pairs >= FEWEST_TO_CLAIM else None
+        claimed = model.expected_error(region) if pairs >= WARM / 2 else None
         return OrientationStatus(pairs, model.name, errors, claimed)
 
     def known(self) -> LearnerEvidence | None:

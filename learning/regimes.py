@@ -11,10 +11,9 @@ import msgspec
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray, Pair
-from bodyschema.learning.changes.adaptation import Adapted, Origin
-from bodyschema.learning.changes.known_arm import KnownArm
+from bodyschema.learning.changes.known_arm import Adapted, KnownArm, Origin
 from bodyschema.learning.changes.monitor import LOOK_AGAIN, DetectedChange
-from bodyschema.learning.changes.outlier_gate import DOUBT, explained, sound
+from bodyschema.learning.changes.outlier_gate import DOUBT, FEWEST_FOR_CHANGE, explained, sound
 from bodyschema.learning.changes.record import NAMED_WITHIN, ChangeRecord, KindOfChange
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.model_bank import PRIOR
@@ -82,11 +81,7 @@ class Fitting:
         self._before, self._chain, self._due_at, self._is_first = before, hand, first_at, True
 
     def rest(self, hand: RigidChain) -> None:
-        """Stop fitting.
-
-        Args:
-            hand: a chain that gives the orientation of the hand.
-        """
+        """Stop fitting. `hand`: a chain that gives the orientation of the hand."""
         self._before, self._chain, self._due_at, self._is_first = None, hand, None, False
 
     def fit(self, q: FloatArray, x: FloatArray) -> Fit | None:
@@ -127,8 +122,6 @@ class Fitting:
 
 # Ordinary RMS distance between a nominal model and reality [m].
 EXPECTED_M = 0.1
-# Minimum number of pairs for a held-out comparison.
-FEWEST_TO_ADAPT = 3
 
 
 class Regimes:
@@ -256,7 +249,7 @@ class Regimes:
         gate = regime.gate
         together = gate.perhaps_changed and self._moved_together(regime, regime.limit_m(pair) / DOUBT)
         noticed = regime.monitor.noticed(run=gate.in_a_row if gate.changed or together else 0)
-        return None if noticed is None or len(noticed.q) - noticed.first < FEWEST_TO_ADAPT else noticed
+        return None if noticed is None or len(noticed.q) - noticed.first < FEWEST_FOR_CHANGE else noticed
 
     def adapt(self, regime: Regime, noticed: DetectedChange) -> bool:
         """Begin the regime after a change, if that improves the held-out predictions of the pairs since."""

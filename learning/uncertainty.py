@@ -25,7 +25,6 @@ from kbmaps.robust import OUTLIER_SIGMAS
 
 # Weight of the error one pair back: the memory is about 50 pairs long.
 DISCOUNT = 0.98
-# Below this many pairs the prior expectation counts too.
 
 
 class ErrorMemory(msgspec.Struct):
@@ -94,7 +93,7 @@ def _resolution(samples: float) -> float:
     return math.sqrt(2.0 / max(samples, 2.0))
 
 
-# Below this number of pairs, the discrepancy with the last tool counts too.
+# Below this number of pairs the prior expectation, or the discrepancy with the last tool, counts too.
 WARM = 10.0
 _SUPPORT, _CONTEST = "support_q", "squares_"
 

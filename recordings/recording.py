@@ -165,11 +165,7 @@ class Recording:
         return Table(names, np.hstack([values for _, values in blocks]))
 
     def write_csv(self, file: Path) -> None:
-        """Write CSV; reading it gives every number back exactly.
-
-        Raises:
-            RecordingError: the file cannot be written.
-        """
+        """Write CSV; reading it gives every number back exactly. Raises RecordingError: the file cannot be written."""
         try:
             with file.open("w", encoding="utf-8", newline="\n") as out:
                 self.write_csv_to(out)

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from bodyschema.cli.terminal.progress import Say
+from bodyschema.cli.terminal.screen import Say
 from bodyschema.interfaces.records import FloatArray
 
 # Mean length of a noise vector with unit standard deviation per axis: 2 √(2/π).

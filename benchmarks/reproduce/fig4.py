@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from bodyschema.cli.terminal.progress import counted
+from bodyschema.cli.terminal.screen import counted
 
 from .arm import CRUDE, JOINTS, OTHER_SIX, arm, crude_estimate, uniform
 from .experiment import MEAN_NOISE, Column, Comparison, Curve, Experiment, Pairs, Panel, Reading, Run, Tests

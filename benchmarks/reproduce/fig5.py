@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodyschema.cli.terminal.progress import counted
+from bodyschema.cli.terminal.screen import counted
 from bodyschema.interfaces.records import FloatArray
 from kbmaps import RigidChain
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bodyschema.cli.terminal.progress import Say
+from bodyschema.cli.terminal.screen import Say
 from bodyschema.daemon.config import DaemonConfig
 from bodyschema.daemon.wiring.wiring import open_postures, open_sources, simulated_truth
 from bodyschema.interfaces.records import FloatArray

@@ -8,7 +8,7 @@ from math import inf
 
 import numpy as np
 
-from bodyschema.cli.terminal.progress import Say, counted, quiet
+from bodyschema.cli.terminal.screen import Say, counted, quiet
 from bodyschema.interfaces.records import FloatArray
 from kbmaps import (
     ChainTolerances,

@@ -9,7 +9,7 @@ from typing import Self
 
 import numpy as np
 
-from bodyschema.cli.terminal.progress import TELL_EVERY_S, Say
+from bodyschema.cli.terminal.screen import TELL_EVERY_S, Say
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.sampler.devices import session_of
 from bodyschema.daemon.sampler.sampler import Sampler

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyschema.cli.terminal.progress import Say, counted
+from bodyschema.cli.terminal.screen import Say, counted
 from bodyschema.interfaces.records import FloatArray, Pair, frozen_array
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.nominal import NominalModel

@@ -11,7 +11,7 @@ from typing import Self
 
 import numpy as np
 
-from bodyschema.cli.terminal.progress import Say, quiet
+from bodyschema.cli.terminal.screen import Say, quiet
 from bodyschema.daemon.config import DaemonConfig
 from bodyschema.daemon.sampler.sources import Sources
 from bodyschema.interfaces.clock import SystemClock

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import itertools
+import logging
 import math
+import threading
 from collections.abc import Callable
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Protocol, Self
+from typing import Any, Protocol, Self
 
 import cv2
 
+from bodyschema.daemon.service.local_web import HEADERS, LOOPBACK, host_refusal
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError, SourceEnded
 from bodyschema.interfaces.protocols import Clock, Source
@@ -96,3 +100,127 @@ def _write(file: Path, data: bytes) -> None:
         file.write_bytes(data)
     except OSError as error:
         raise ConfigError(f"cannot be written: {error.strerror}", file=file, remedy="Give another --out") from error
+
+
+log = logging.getLogger(__name__)
+
+BOUNDARY = "picture"
+# Each browser that shows the pictures has its own thread here.
+MOST_VIEWERS = 32
+_END_CHECK_S = 0.05
+PAGE = b"<!doctype html><title>bodyschema</title><body style='margin:0;background:#111'><img src=/stream width=100%>"
+POLICY = "default-src 'none'; img-src 'self'; style-src 'unsafe-inline'; frame-ancestors 'none'"
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+
+    def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ARG002
+        """Log why a request failed; a closed browser causes no traceback on the terminal."""
+        log.debug("a request for pictures failed", exc_info=True)
+
+
+class MjpegServer:
+    """Serves the newest picture to its viewers. A slow viewer misses pictures and delays no other."""
+
+    def __init__(self, port: int) -> None:
+        """Prepare without listening yet; port 0 takes a free one."""
+        self._port = port
+        self._newest: bytes | None = None
+        self._number = 0
+        self._changed = threading.Condition()
+        self._is_closing = False
+        self._viewers = threading.BoundedSemaphore(MOST_VIEWERS)
+        self._server: _Server | None = None
+
+    def __enter__(self) -> Self:
+        try:
+            self._server = _Server((LOOPBACK, self._port), self._handler())
+        except OSError as error:
+            remedy = "Give another --port, or --port 0 for one that is free"
+            raise ConfigError(f"port {self._port} cannot be used: {error.strerror}", remedy=remedy) from error
+        serve = self._server.serve_forever
+        threading.Thread(target=serve, args=(_END_CHECK_S,), name="pictures", daemon=True).start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with self._changed:
+            self._is_closing = True
+            self._changed.notify_all()
+        if self._server is not None:
+            self._server.shutdown()
+            self._server.server_close()
+            self._server = None
+
+    @property
+    def address(self) -> str:
+        """Address to open in the browser."""
+        port = self._port if self._server is None else self._server.server_address[1]
+        return f"http://{LOOPBACK}:{port}/"
+
+    def show(self, jpeg: bytes) -> None:
+        """Publish the newest picture."""
+        with self._changed:
+            self._newest, self._number = jpeg, self._number + 1
+            self._changed.notify_all()
+
+    def _after(self, number: int) -> tuple[int, bytes] | None:
+        """Return a picture newer than `number`, and its number; None when the server ends."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._is_closing or self._number > number)
+            if self._is_closing or self._newest is None:
+                return None
+            return self._number, self._newest
+
+    def _handler(self) -> type[BaseHTTPRequestHandler]:
+        server = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                said = host_refusal(self.headers.get_all("Host", []))
+                if said is not None:
+                    self._say(403, said)
+                elif self.path == "/":
+                    self._send(200, "text/html; charset=utf-8", PAGE)
+                elif self.path != "/stream":
+                    self._say(404, "there is nothing here. The pictures are at /")
+                elif not server._viewers.acquire(blocking=False):
+                    self._say(503, f"{MOST_VIEWERS} browsers look on already. Close one")
+                else:
+                    try:
+                        self._stream()
+                    finally:
+                        server._viewers.release()
+
+            def log_message(self, format: str, *args: object) -> None:
+                """Log nothing: there is a request for each browser."""
+
+            def end_headers(self) -> None:
+                for name, value in (HEADERS | {"Content-Security-Policy": POLICY}).items():
+                    self.send_header(name, value)
+                super().end_headers()
+
+            def _say(self, status: int, text: str) -> None:
+                self._send(status, "text/plain; charset=utf-8", f"{text}\n".encode())
+
+            def _send(self, status: int, kind: str, body: bytes) -> None:
+                self.send_response(status)
+                self.send_header("Content-Type", kind)
+                self.send_header("Content-Length", str(len(body)))
+                self.end_headers()
+                self.wfile.write(body)
+
+            def _stream(self) -> None:
+                self.send_response(200)
+                self.send_header("Content-Type", f"multipart/x-mixed-replace; boundary={BOUNDARY}")
+                self.end_headers()
+                number = 0
+                try:
+                    while (found := server._after(number)) is not None:
+                        number, jpeg = found
+                        head = f"--{BOUNDARY}\r\nContent-Type: image/jpeg\r\nContent-Length: {len(jpeg)}\r\n\r\n"
+                        self.wfile.write(head.encode() + jpeg + b"\r\n")
+                except OSError:
+                    return  # the browser has gone
+
+        return Handler

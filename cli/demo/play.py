@@ -2,73 +2,214 @@
 
 from __future__ import annotations
 
+import csv
 import json
-import os
+import math
 import queue
-import signal
 import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import IO, Literal
 
 import numpy as np
 
 from bodyschema.cli.demo.scene import Scene
-from bodyschema.cli.replay.processes import END_LIMIT_S, START_LIMIT_S
+from bodyschema.cli.replay.processes import Process, end, started
 from bodyschema.cli.terminal.screen import rejected
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.service.signals import with_parent
-from bodyschema.daemon.transport.bus import ZenohSession, is_alive
+from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
-from bodyschema.daemon.transport.wire import CommandRequest, decode, encode
+from bodyschema.daemon.transport.wire import CommandRequest, JointsRequest, PairsReply, PredictReply, decode, encode
+from bodyschema.diagnosis.report.plot import HEIGHT, WIDTH, Plot
 from bodyschema.interfaces.errors import BusError
 from bodyschema.interfaces.interpreter import module_command
+from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.status import Outlook
+from bodyschema.robot.description import RobotDescription
+from kbmaps import RigidChain, nearest_rotation, rotation_matrices, rotation_vectors
 
-from .judge import Judge, Verdict
-from .plot import CurveRow
-
-
-class Daemon:
-    """`bodyschema run --sim` with its output in the scene's log."""
-
-    def __init__(self, process: subprocess.Popen[bytes], scene: Scene) -> None:
-        self._process, self._scene = process, scene
-
-    def check(self) -> None:
-        """Raise BusError if it has ended."""
-        if self._process.poll() is not None:
-            raise BusError(
-                f"the daemon ended with exit code {self._process.returncode}; {self._scene.log_file} says why"
-            )
-
-    def wait_for(self, endpoint: str, alive: str) -> None:
-        """Return once the process that listens on `endpoint` is alive. BusError if it is not alive in time."""
-        limit = time.monotonic() + START_LIMIT_S
-        while not is_alive(endpoint, alive):
-            self.check()
-            if time.monotonic() > limit:
-                raise BusError(
-                    f"nothing runs on {endpoint} after {START_LIMIT_S:.0f} s; {self._scene.log_file} says why"
-                )
-            time.sleep(0.1)
+_HEADING = "Forward kinematics learnt while the arm is guided (simulation)"
+_TITLE, _LEGEND_LINE = 22, 14  # heights in the units of the plot, whose text is 10 to 11 high
+_STYLE = (
+    ".page{fill:#fff}text{font:10.5px system-ui,'DejaVu Sans',sans-serif;fill:#4d5662}"
+    ".title{font-size:11px;fill:#1d2127}text.label{fill:#1d2127}text.named{fill:#b3261e}.grid{stroke:#e5e3de}.line{fill:none;stroke-width:1.6}"
+    ".moment{stroke:#b3261e;stroke-dasharray:4 3}.nominal{stroke:#98a2af}.next{stroke:#e39a55;stroke-width:1}"
+    ".expected{stroke:#14804a;stroke-dasharray:5 3}.truth{stroke:#1f78c8;stroke-width:2.2}"
+)
 
 
-@contextmanager
-def started_daemon(scene: Scene) -> Iterator[Daemon]:
-    """Run sampler and learner until the end of the with statement."""
-    command = module_command("bodyschema", "run", "--sim", "--robot", str(scene.robot_file))
-    with scene.log_file.open("wb") as log:
-        environment = os.environ | with_parent()
-        process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment)
-        try:
-            yield Daemon(process, scene)
-        finally:
-            _end(process)
+@dataclass(frozen=True, slots=True)
+class CurveRow:
+    """One moment of the demo: mean errors against the simulator's ground truth [m].
+
+    `angle_rad` is the mean angle to the true orientation on held-out poses [rad]; None if none is learnt.
+    """
+
+    pairs: int
+    truth_m: float
+    claimed_m: float | None
+    prequential_m: float | None
+    nominal_m: float
+    angle_rad: float | None = None
+
+
+def write_curve(rows: Sequence[CurveRow], file: Path) -> None:
+    """Write the curve as CSV, in mm and degrees; angles only where orientations are learnt."""
+    turned = any(row.angle_rad is not None for row in rows)
+    with file.open("w", newline="", encoding="utf-8") as stream:
+        writer = csv.writer(stream)
+        heading = ["pairs", "held_out_error_mm", "claimed_error_mm", "prequential_error_mm", "nominal_error_mm"]
+        writer.writerow([*heading, "held_out_angle_deg"] if turned else heading)
+        for row in rows:
+            errors = (row.truth_m, row.claimed_m, row.prequential_m, row.nominal_m)
+            angle = "" if row.angle_rad is None else f"{math.degrees(row.angle_rad):.4f}"
+            cells = ["" if e is None else f"{1e3 * e:.3f}" for e in errors]
+            writer.writerow([row.pairs, *cells, angle] if turned else [row.pairs, *cells])
+
+
+def plot_curve(rows: Sequence[CurveRow], change_at: int | None, file: Path) -> None:
+    """Write the curve as an SVG file, with the moment of the tool change."""
+    curves = {
+        "nominal model": ("nominal", [row.nominal_m for row in rows]),
+        "error on each new sample before it is learnt": ("next", [row.prequential_m for row in rows]),
+        "error that the learner expects": ("expected", [row.claimed_m for row in rows]),
+        "ground truth: error on held-out poses": ("truth", [row.truth_m for row in rows]),
+    }
+    known = [1e3 * error for _, errors in curves.values() for error in errors if error]
+    pairs = np.array([row.pairs for row in rows], dtype=np.float64)
+    plot = Plot(
+        "accepted samples",
+        "mean error [mm]",
+        (float(pairs.min()), float(pairs.max()) + 1.0),
+        (0.8 * min(known), 1.25 * max(known)),
+        log_y=True,
+    )
+    marks = []
+    for look, errors in curves.values():
+        there = np.array([bool(error) for error in errors])
+        marks.append(plot.line(pairs[there], 1e3 * np.array([error for error in errors if error]), look))
+    if change_at is not None:
+        marks.append(plot.moment(float(change_at), "tool change"))
+    file.write_text(_page(plot.svg(*marks), {text: look for text, (look, _) in curves.items()}), encoding="utf-8")
+
+
+def _page(plot: str, legend: dict[str, str]) -> str:
+    """Return a standalone SVG: a title, the plot, and a legend below it."""
+    width, height = WIDTH, HEIGHT + _TITLE + _LEGEND_LINE * (len(legend) + 1)
+    title = f'<text class="title" x="{width / 2}" y="16" text-anchor="middle">{_HEADING}</text>'
+    entries = []
+    for number, (text, look) in enumerate(legend.items(), 1):
+        y = HEIGHT + _TITLE + _LEGEND_LINE * number
+        entries.append(f'<path class="line {look}" d="M60 {y - 4}h24"/><text x="92" y="{y}">{text}</text>')
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{2 * width}" '
+        f'height="{2 * height}"><style>{_STYLE}</style><rect class="page" width="{width}" height="{height}"/>{title}'
+        f'<svg y="{_TITLE}" width="{WIDTH}" height="{HEIGHT}">{plot}</svg>{"".join(entries)}</svg>\n'
+    )
+
+
+POSES = 300
+JITTER_DEG = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Result of the evaluation.
+
+    Attributes:
+        pairs: number of pairs that the answering model had learnt.
+        error_m: mean distance between prediction and ground truth on held-out poses [m].
+        nominal_m: the same for the nominal model [m].
+        within_sigma: share of coordinates within the predicted 1-sigma.
+        angle_rad: mean angle between predicted and true orientation there [rad]; None if none is learnt.
+        angles_within_sigma: share of the angles' components within the predicted 1-sigma.
+    """
+
+    pairs: int
+    error_m: float
+    nominal_m: float
+    within_sigma: float
+    angle_rad: float | None = None
+    angles_within_sigma: float | None = None
+
+
+class Judge:
+    """Compares the learner's answers with the simulated ground truth."""
+
+    def __init__(self, robot: RobotDescription, sampler: ZenohSession, learner: ZenohSession, seed: int) -> None:
+        self._robot, self._sampler, self._learner = robot, sampler, learner
+        self._keys = Keys(robot.name)
+        self._rng = np.random.default_rng(seed)
+        self._seen = np.empty((0, len(robot.joints)))
+        self._region_start = 0
+
+    @property
+    def seen(self) -> int:
+        """Number of accepted pairs fetched so far."""
+        return len(self._seen)
+
+    def follow(self) -> None:
+        """Fetch the joint angles of the pairs accepted since the last call."""
+        while True:
+            request = f"{self._keys.pairs}?from={len(self._seen) + 1}"
+            reply = decode(self._sampler.ask_one(request), PairsReply)
+            if reply.pairs:
+                self._seen = np.vstack([self._seen, [pair.q for pair in reply.pairs]])
+            if len(self._seen) >= reply.last_seq or not reply.pairs:
+                return
+
+    def new_region(self) -> None:
+        """Restart the region of the data: from now on only new pairs define it."""
+        self._region_start = len(self._seen)
+
+    def change_tool(self, marker_xyz: FloatArray) -> None:
+        """Change the tool in the robot's hand."""
+        self._sampler.ask_one(self._keys.simulation, json.dumps({"tool": marker_xyz.tolist()}).encode())
+
+    def truth(self) -> RigidChain:
+        """Return the true kinematics of the simulated robot, with the marker's rotation in its last frame."""
+        raw = json.loads(self._sampler.ask_one(self._keys.simulation))
+        fixed = np.array(raw["fixed"])
+        fixed[-1, :3, :3] = nearest_rotation(fixed[-1, :3, :3] @ np.array(raw["turn"]))
+        return RigidChain(fixed, axes=np.array(raw["axes"]), prismatic=np.array(raw["prismatic"], dtype=bool))
+
+    def verdict(self) -> Verdict | None:
+        """Evaluate the learner's current answers; return None before any pair."""
+        self.follow()
+        region = self._seen[self._region_start :]
+        if not len(region):
+            return None
+        poses = region[self._rng.integers(len(region), size=POSES)]
+        poses = poses + self._rng.normal(0.0, np.radians(JITTER_DEG), poses.shape)
+        poses = np.clip(poses, self._robot.lower, self._robot.upper)
+        truth = self.truth()
+        x_true = truth.positions(poses)
+        request = encode(JointsRequest(poses.tolist()))
+        answer = decode(self._learner.ask_one(self._keys.predict, request), PredictReply)
+        miss = np.array(answer.x) - x_true
+        return Verdict(
+            pairs=answer.pairs,
+            error_m=float(np.linalg.norm(miss, axis=1).mean()),
+            nominal_m=float(np.linalg.norm(self._robot.chain.positions(poses) - x_true, axis=1).mean()),
+            within_sigma=float((np.abs(miss) <= np.array(answer.sigma)).mean()),
+            **_turned(answer, truth.orientation(poses)),
+        )
+
+
+def _turned(answer: PredictReply, truth: FloatArray) -> dict[str, float]:
+    """Return the errors of predicted orientations against the true ones (n, 3, 3); empty if none are learnt."""
+    if answer.R is None or answer.sigma_R is None:
+        return {}
+    turns = rotation_vectors(rotation_matrices("R", answer.R) @ truth.swapaxes(1, 2))
+    return {
+        "angle_rad": float(np.linalg.norm(turns, axis=1).mean()),
+        "angles_within_sigma": float((np.abs(turns) <= np.array(answer.sigma_R)).mean()),
+    }
 
 
 class Asker:
@@ -102,7 +243,7 @@ def started_asker(scene: Scene, seed: int) -> Iterator[Asker]:
     try:
         yield Asker(lines)
     finally:
-        _end(process)
+        end(process)
         reader.join()
         process.stdout.close()
 
@@ -110,15 +251,6 @@ def started_asker(scene: Scene, seed: int) -> Iterator[Asker]:
 def _collect(stream: IO[bytes], lines: queue.SimpleQueue[bytes]) -> None:
     for line in stream:
         lines.put(line)
-
-
-def _end(process: subprocess.Popen[bytes]) -> None:
-    process.send_signal(signal.SIGTERM)
-    try:
-        process.wait(END_LIMIT_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
 
 
 STALL_LIMIT_S = 60.0
@@ -187,7 +319,7 @@ def play(scene: Scene, *, first: int, second: int, seed: int, show: Callable[[Sn
     config = Config.load(scene.robot_file)
     endpoints, keys = config.tables.zenoh, Keys(config.robot.name)
     with ExitStack() as stack:
-        daemon = stack.enter_context(started_daemon(scene))
+        daemon = stack.enter_context(started("daemon", ["--sim", "--robot", str(scene.robot_file)], {}, scene.log_file))
         daemon.wait_for(endpoints.sampler, keys.alive("sampler"))
         daemon.wait_for(endpoints.learner, keys.alive("learner"))
         sampler = stack.enter_context(ZenohSession(connect=endpoints.sampler, client=True))
@@ -210,7 +342,7 @@ def stalled(sampler: SamplerStatus) -> str:
 @dataclass
 class _Stage:
     config: Config
-    daemon: Daemon
+    daemon: Process
     sampler: ZenohSession
     learner: ZenohSession
     asker: Asker

@@ -15,8 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from bodyschema.cli.terminal.findings_view import outlook_sentence
-from bodyschema.cli.terminal.progress import TELL_EVERY_S
-from bodyschema.cli.terminal.screen import coverage_table, degrees, mm, rejected, titled_table
+from bodyschema.cli.terminal.screen import TELL_EVERY_S, coverage_table, degrees, mm, rejected, titled_table
 from bodyschema.daemon.transport.status import SamplerStatus
 
 from .play import Outcome, Snapshot

@@ -41,7 +41,6 @@ from bodyschema.interfaces.extras import require_extra
 from bodyschema.recordings.store.file import LOW_DISK_BYTES
 from bodyschema.recordings.store.store import PairReader
 
-LITTLE_DISK_BYTES = 2**30
 TIME_ERROR = 5  # adjtimex(2): the clock is not synchronised
 TIMEX_BYTES = 512  # more than struct timex has
 CONNECT_S = 0.3
@@ -104,28 +103,31 @@ def _description(config: Config) -> Iterator[Check]:
         yield Check("camera", "ok", f"[camera] describes {what}")
 
 
-def _cameras(config: Config) -> Iterator[Check]:
-    """Yield checks of the camera images. A running sampler holds the cameras; then its status is checked instead."""
-    if not is_alive(config.route("sampler"), Keys(config.robot.name).alive("sampler"), open_timeout_s=OPEN_S):
-        require_extra("cameras", "looking at the cameras")
-        from bodyschema.daemon.wiring.cameras import camera_checks
+def _sampler_status(config: Config) -> SamplerStatus | None:
+    """Return the status of a running sampler, which holds ports and cameras; None if none answers."""
+    route, keys = config.route("sampler"), Keys(config.robot.name)
+    if not is_alive(route, keys.alive("sampler"), open_timeout_s=OPEN_S):
+        return None
+    with ZenohSession(connect=route, client=True) as bus:
+        return decode(bus.ask_one(keys.status("sampler")), SamplerStatus)
 
-        yield from camera_checks(config)
+
+def _cameras(config: Config) -> Iterator[Check]:
+    if (status := _sampler_status(config)) is not None:
+        yield Check("cameras", "ok", f"the running sampler takes {status.frames_per_s:.1f} stereo frames/s")
         return
-    with ZenohSession(connect=config.route("sampler"), client=True) as bus:
-        status = decode(bus.ask_one(Keys(config.robot.name).status("sampler")), SamplerStatus)
-    yield Check("cameras", "ok", f"the running sampler takes {status.frames_per_s:.1f} stereo frames/s")
+    require_extra("cameras", "looking at the cameras")
+    from bodyschema.daemon.wiring.cameras import camera_checks
+
+    yield from camera_checks(config)
 
 
 def _marker_sources(config: Config) -> Iterator[Check]:
-    """Yield checks of the marker sources. A running sampler reads them; then its status is checked instead."""
-    if not is_alive(config.route("sampler"), Keys(config.robot.name).alive("sampler"), open_timeout_s=OPEN_S):
+    if (status := _sampler_status(config)) is None:
         from bodyschema.daemon.wiring.wiring import marker_source_checks
 
         yield from marker_source_checks(config)
         return
-    with ZenohSession(connect=config.route("sampler"), client=True) as bus:
-        status = decode(bus.ask_one(Keys(config.robot.name).status("sampler")), SamplerStatus)
     yield Check("marker source", "ok", f"the running sampler takes {status.frames_per_s:.1f} positions/s")
     names = [table.label for table in config.tables.marker_source]
     for complaint in status.health:
@@ -153,12 +155,9 @@ def _samplers(config: Config) -> list[int]:
 
 
 def _of_the_sampler(config: Config) -> Iterator[Check]:
-    route, keys = config.route("sampler"), Keys(config.robot.name)
-    if not is_alive(route, keys.alive("sampler"), open_timeout_s=OPEN_S):
+    if (status := _sampler_status(config)) is None:
         yield Check("servos", "warning", "not looked at: another program has the port")
         return
-    with ZenohSession(connect=route, client=True) as bus:
-        status = decode(bus.ask_one(keys.status("sampler")), SamplerStatus)
     yield Check("rate", "ok", f"the running sampler takes {status.readings_per_s:.0f} readings/s")
     for complaint in status.health:
         yield Check("servos", "warning", complaint)
@@ -178,7 +177,7 @@ def disk_checks(folder: Path) -> Iterator[Check]:
         return
     free = shutil.disk_usage(there).free
     said = f"{free / 2**30:.1f} GiB are free for {folder}"
-    if free < LITTLE_DISK_BYTES:
+    if free < 5 * LOW_DISK_BYTES:
         state = "wrong" if free < LOW_DISK_BYTES else "warning"
         yield Check("disk", state, said, f"du -xh {there} | sort -h | tail    # what could go")
     else:
@@ -211,9 +210,8 @@ def clock_checks(is_synchronised: Callable[[], bool | None] | None = None) -> It
     elif known:
         yield Check("clock", "ok", "kept right by the network")
     else:
-        yield Check(
-            "clock", "warning", "the wall clock is not kept right by the network", "sudo timedatectl set-ntp true"
-        )
+        said = "the wall clock is not kept right by the network"
+        yield Check("clock", "warning", said, "sudo timedatectl set-ntp true")
 
 
 def unit_checks(root: Path = Path("/")) -> Iterator[Check]:

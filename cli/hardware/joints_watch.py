@@ -98,7 +98,6 @@ class JointsWatch:
     """Reads an arm, and keeps the ranges seen so far."""
 
     def __init__(self, config: Config, source: EncoderJoints, clock: Clock) -> None:
-        """Store the settings; nothing is opened yet."""
         self._robot, self._source, self._clock = config.robot, source, clock
         self._servos = source if isinstance(source, ServoJoints) else None
         drivers = config.tables.drivers
@@ -194,7 +193,6 @@ class Speeds:
     """
 
     def __init__(self, d: int) -> None:
-        """Start at rest."""
         self.v: FloatArray = np.zeros(d)
         self.are_known = False
         self._t, self._q = -math.inf, self.v
@@ -209,12 +207,6 @@ class Speeds:
         self._t, self._q = t, q
 
 
-@dataclass(frozen=True, slots=True)
-class _Rest:
-    t: float
-    q: FloatArray
-
-
 class SignCheck:
     """Predicts by the URDF where the marker went when one joint was moved, for the user to compare.
 
@@ -223,23 +215,22 @@ class SignCheck:
     """
 
     def __init__(self, robot: RobotDescription) -> None:
-        """Start at rest."""
         self._robot, self._chain = robot, _from_parent(robot)
         self._begin: FloatArray | None = None
-        self._rest: _Rest | None = None
+        self._rest: tuple[float, FloatArray] | None = None  # since when, and where
         self.said = ""
 
     def take(self, t: float, q: FloatArray) -> None:
         """Add the joint angles `q` (d,) [rad] at `t` [s]."""
         if self._begin is None:
             self._begin = q
-        if self._rest is None or np.abs(q - self._rest.q).max() > _SETTINGS.still_rad:
-            self._rest = _Rest(t, q)
+        if self._rest is None or np.abs(q - self._rest[1]).max() > _SETTINGS.still_rad:
+            self._rest = t, q
         moved = q - self._begin
         place = int(np.abs(moved).argmax())
         if abs(moved[place]) > _SETTINGS.moved_rad:
             self.said = self._sentence(place, self._begin, float(moved[place]))
-        if t - self._rest.t > _SETTINGS.still_s:  # at rest: what follows is another move
+        if t - self._rest[0] > _SETTINGS.still_s:  # at rest: what follows is another move
             self._begin = q
 
     def _sentence(self, place: int, begin: FloatArray, moved: float) -> str:

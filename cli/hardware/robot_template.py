@@ -6,10 +6,11 @@ import os
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
-if TYPE_CHECKING:
-    from bodyschema.robot.urdf import UrdfJoint, UrdfTree
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.robot.suggest import did_you_mean
+from bodyschema.robot.urdf import MOVING, UrdfJoint, UrdfTree
 
 
 class Guess(NamedTuple):
@@ -196,9 +197,6 @@ def guess_from(urdf: Path, robot: Path, *, marker_link: str | None = None, camer
         RobotError: the URDF cannot be read.
         ConfigError: it has no such link, or no joint moves between the two.
     """
-    from bodyschema.interfaces.errors import ConfigError
-    from bodyschema.robot.urdf import UrdfTree
-
     tree = UrdfTree.load(urdf)
     for link in (marker_link, camera_link):
         _require_link(tree, link, urdf)
@@ -222,22 +220,15 @@ def guess_of(tree: UrdfTree, urdf: str, end: str, root: str | None = None) -> Gu
 
 
 def _moving(path: Sequence[UrdfJoint]) -> list[str]:
-    from bodyschema.robot.urdf import MOVING
-
     return [joint.name for joint in path if joint.kind in MOVING]
 
 
 def _is_finger(joint: UrdfJoint) -> bool:
     """Return True for a joint that mimics another one, and for one of a gripper by its name."""
-    from bodyschema.robot.urdf import MOVING
-
     return joint.mimics or (joint.kind in MOVING and bool(_FINGER.search(joint.name)))
 
 
 def _require_link(tree: UrdfTree, link: str | None, urdf: Path) -> None:
-    from bodyschema.interfaces.errors import ConfigError
-    from bodyschema.robot.suggest import did_you_mean
-
     if link is not None and link not in tree.links:
         raise ConfigError(f"has no link {link!r}", file=urdf, remedy=did_you_mean(link, tree.links))
 

@@ -147,7 +147,6 @@ class Backup:
     """A backup that was opened and verified. Use as a context manager."""
 
     def __init__(self, file: Path) -> None:
-        """Prepare without opening anything."""
         self.file = file
         self._archive: zipfile.ZipFile | None = None
         self._manifest: Manifest | None = None

@@ -17,7 +17,7 @@ from bodyschema.daemon.learner.checkpoint import CheckpointError, read_checkpoin
 from bodyschema.daemon.transport.bus import is_alive
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.interfaces.errors import ConfigError, StoreError
-from bodyschema.recordings.kept_files import sync_folder, unused_name
+from bodyschema.interfaces.whole_files import sync_folder, unused_name
 from bodyschema.recordings.store import schema as store_schema
 from bodyschema.recordings.store.file import NOTHING_CHANGED, explained, lock
 from bodyschema.recordings.store.store import leave_out_damage

@@ -8,123 +8,65 @@ import re
 import shutil
 import subprocess
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from bodyschema.daemon.config import Config
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.description import NAME
 
-from .udev import ROOT, run_quietly
+from .machine_files import ROOT, Command, MachineFiles, run_quietly, writing
 from .units import FOLDER, LEARNER_OF, OWN, PROCESSES, ROUTER, Installed, of_host, of_robot, of_router, template
 
 if TYPE_CHECKING:
     from .router import RouterConfig
 
-Run = Callable[[Sequence[str]], None]
 OLDEST_SYSTEMD = 252  # assumed where the version is not queried
 
 
-@dataclass(frozen=True, slots=True)
-class UnitFolder:
-    """The folder of a machine's units.
+class UnitFiles(MachineFiles):
+    """The units of a service, by their names."""
 
-    Attributes:
-        root: root of the machine's file system.
-        run: runs a command; only if `root` is this machine's.
-    """
+    reload = (("systemctl", "daemon-reload"),)
 
-    root: Path = ROOT
-    run: Run = run_quietly
+    def __init__(self, units: Sequence[str], root: Path, run: Callable[[Command], None]) -> None:
+        super().__init__(root, run)
+        self.units, names = units, " ".join(units)
+        self.is_used = f"Start it, now and at every boot: sudo systemctl enable --now {names}"
+        self.before_removal = [f"To be stopped: {names}"]
 
-    @property
-    def path(self) -> Path:
-        return self.root / FOLDER
-
-    def write(self, texts: dict[Path, str], command: str) -> None:
-        """Write the files, and let systemd reload them.
-
-        Args:
-            command: the command line of `bodyschema` for the remedy in an error.
-
-        Raises:
-            ConfigError: a file cannot be written.
-        """
-        for file, text in texts.items():
-            try:
-                file.parent.mkdir(parents=True, exist_ok=True)
-                file.write_text(text, encoding="utf-8")
-            except OSError as error:
-                raise _refused(file, error, command) from error
-        self._systemctl("daemon-reload")
-
-    def remove(self, units: Sequence[str], files: Sequence[Path], command: str) -> None:
-        """Stop the units, and remove the files and the folders that become empty.
-
-        Raises:
-            ConfigError: a file cannot be removed.
-        """
-        if not files:
-            return
-        self._systemctl("disable", "--now", *units)
-        for file in files:
-            try:
-                file.unlink()
-                if file.name == OWN and not any(file.parent.iterdir()):  # `systemctl edit` puts the user's files there
-                    file.parent.rmdir()
-            except OSError as error:
-                raise _refused(file, error, f"{command} --uninstall") from error
-        self._systemctl("daemon-reload")
-
-    def _systemctl(self, *arguments: str) -> None:
-        if self.root == ROOT:
-            self.run(["systemctl", *arguments])
+    def uninstall(self) -> None:
+        """Stop the units, and remove their files. ConfigError: one cannot be removed."""
+        self._call([("systemctl", "disable", "--now", *self.units)])
+        super().uninstall()
 
 
-class UnitFiles(Protocol):
-    """The units of a service on a machine, written, shown and removed together."""
-
-    @property
-    def units(self) -> list[str]:
-        """Names of the units."""
-        ...
-
-    def install(self, texts: dict[Path, str]) -> None:
-        """Write the files, and let systemd reload them. ConfigError: a file cannot be written."""
-        ...
-
-    def uninstall(self) -> list[Path]:
-        """Stop and remove the units; return the removed files. ConfigError: a file cannot be removed."""
-        ...
-
-    def installed(self) -> list[Path]:
-        """Return the files that `uninstall` would remove."""
-        ...
-
-
-@dataclass(frozen=True, slots=True)
-class ServiceFiles:
+class ServiceFiles(UnitFiles):
     """The units of one robot, or of the learner of several.
 
-    Attributes:
+    Args:
         name: name of the robot, or of the learner of several.
         processes: sampler, learner or both.
-        folder: folder of the units.
+        root, run: as in `MachineFiles`.
+
+    Raises:
+        ConfigError: it is no name for a service.
     """
 
-    name: str
-    processes: Sequence[str] = PROCESSES
-    folder: UnitFolder = UnitFolder()
+    kind, stays = "service", "Pairs and checkpoints are where they were."
 
-    def __post_init__(self) -> None:
+    def __init__(
+        self,
+        name: str,
+        processes: Sequence[str] = PROCESSES,
+        root: Path = ROOT,
+        run: Callable[[Command], None] = run_quietly,
+    ) -> None:
+        super().__init__([f"bodyschema-{process}@{name}.service" for process in processes], root, run)
+        self.name, self.processes, self._folder = name, processes, root / FOLDER
         if not re.match(NAME, self.name):
             remedy = "Take letters, digits, _ . and -, and begin with a letter, a digit or _"
             raise ConfigError(f"{self.name!r} is no name for a service", remedy=remedy)
-
-    @property
-    def units(self) -> list[str]:
-        return [f"bodyschema-{process}@{self.name}.service" for process in self.processes]
 
     def texts(self, config: Config, user: str, installed: Installed) -> dict[Path, str]:
         """Return the contents of each file for one robot.
@@ -149,30 +91,19 @@ class ServiceFiles:
             self._refuse_second_learner(config)
         return self._texts({"learner": of_host(configs, user, installed)}, installed)
 
-    def install(self, texts: dict[Path, str]) -> None:
-        self.folder.write(texts, "install service")
-
-    def uninstall(self) -> list[Path]:
-        """Remove this robot's units, and with the last robot the templates."""
-        there = self.installed()
-        self.folder.remove(self.units, there, "install service")
-        return there
-
     def installed(self) -> list[Path]:
         found: list[Path] = []
         for process in self.processes:
             own, shared = self._own(process, self.name), self._template(process)
             others = [
-                file
-                for file in self.folder.path.glob(f"bodyschema-{process}@*.service.d/*")
-                if file.parent != own.parent
+                file for file in self._folder.glob(f"bodyschema-{process}@*.service.d/*") if file.parent != own.parent
             ]
             found += [file for file in (own, *([] if others else [shared])) if file.exists()]
         return found
 
     def _refuse_second_learner(self, config: Config) -> None:
         robot = config.robot.name
-        for file in self.folder.path.glob(f"bodyschema-learner@*.service.d/{OWN}"):
+        for file in self._folder.glob(f"bodyschema-learner@*.service.d/{OWN}"):
             name = file.parent.name.removeprefix("bodyschema-learner@").removesuffix(".service.d")
             first = file.read_text("utf-8").partition("\n")[0]
             learnt = first.removeprefix(LEARNER_OF).split() if first.startswith(LEARNER_OF) else [name]
@@ -190,36 +121,26 @@ class ServiceFiles:
         return texts
 
     def _template(self, process: str) -> Path:
-        return self.folder.path / f"bodyschema-{process}@.service"
+        return self._folder / f"bodyschema-{process}@.service"
 
     def _own(self, process: str, name: str) -> Path:
-        return self.folder.path / f"bodyschema-{process}@{name}.service.d" / OWN
+        return self._folder / f"bodyschema-{process}@{name}.service.d" / OWN
 
 
-@dataclass(frozen=True, slots=True)
-class RouterFiles:
+class RouterFiles(UnitFiles):
     """The unit of the router."""
 
-    folder: UnitFolder = UnitFolder()
+    kind, stays = "router", "router.toml and keys are where they were."
 
-    @property
-    def units(self) -> list[str]:
-        return [ROUTER]
+    def __init__(self, root: Path = ROOT, run: Callable[[Command], None] = run_quietly) -> None:
+        super().__init__([ROUTER], root, run)
 
     def texts(self, config: RouterConfig, user: str, installed: Installed) -> dict[Path, str]:
         """Return the contents of its file."""
-        return {self.folder.path / ROUTER: of_router(config, user, installed)}
-
-    def install(self, texts: dict[Path, str]) -> None:
-        self.folder.write(texts, "install router")
-
-    def uninstall(self) -> list[Path]:
-        there = self.installed()
-        self.folder.remove(self.units, there, "install router")
-        return there
+        return {self.root / FOLDER / ROUTER: of_router(config, user, installed)}
 
     def installed(self) -> list[Path]:
-        file = self.folder.path / ROUTER
+        file = self.root / FOLDER / ROUTER
         return [file] if file.exists() else []
 
 
@@ -234,24 +155,10 @@ def make_state_folders(configs: Sequence[Config], user: str, root: Path = ROOT) 
         if config.tables.daemon.state_dir is None or folder.exists():
             continue
         made = [path for path in (folder, *folder.parents) if not path.exists()]
-        try:
+        with writing(folder, "install service"):
             folder.mkdir(0o750, parents=True)
             for path in made if os.geteuid() == 0 else ():
                 shutil.chown(path, user)
-        except OSError as error:
-            raise _refused(folder, error, "install service") from error
-
-
-def missing(texts: dict[Path, str]) -> dict[Path, str]:
-    """Return those files that do not exist with these contents."""
-    return {file: text for file, text in texts.items() if not file.exists() or file.read_text("utf-8") != text}
-
-
-def _refused(file: Path, error: OSError, command: str) -> ConfigError:
-    remedy = f'Type: sudo "$(command -v bodyschema)" {command} --yes'
-    if os.geteuid() == 0:
-        remedy = "Look at the file system of that folder"
-    return ConfigError(f"cannot be changed: {error.strerror}", file=file, remedy=remedy)
 
 
 def user_for(given: str | None) -> str:

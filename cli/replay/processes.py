@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import socket
 import subprocess
 import time
@@ -50,35 +49,34 @@ class Process:
                 raise BusError(f"the {self.name} does not answer after {START_LIMIT_S:.0f} s; {self.log} may say why")
             time.sleep(0.1)
 
-    def end(self) -> None:
-        """Terminate the process; kill it after a time limit."""
-        if self.popen.poll() is None:
-            self.popen.send_signal(signal.SIGTERM)
-        try:
-            self.popen.wait(END_LIMIT_S)
-        except subprocess.TimeoutExpired:
-            self.popen.kill()
-            self.popen.wait()
+
+def end(process: subprocess.Popen[bytes]) -> None:
+    """Terminate a process; kill it after a time limit."""
+    process.terminate()
+    try:
+        process.wait(END_LIMIT_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
 
 
 @contextmanager
 def started(name: str, arguments: list[str], environment: Mapping[str, str], log: Path) -> Iterator[Process]:
-    """Run `bodyschema run NAME ARGUMENTS` for the duration of the with statement."""
+    """Run `bodyschema run ARGUMENTS` for the duration of the with statement."""
     with log.open("wb") as stream:
         # In a process group of its own: the parent handles Ctrl-C in a terminal.
         popen = subprocess.Popen(
-            module_command("bodyschema", "run", name, *arguments),
+            module_command("bodyschema", "run", *arguments),
             stdin=subprocess.DEVNULL,
             stdout=stream,
             stderr=stream,
             env=os.environ | environment | with_parent(),
             process_group=0,
         )
-        process = Process(name, log, popen)
         try:
-            yield process
+            yield Process(name, log, popen)
         finally:
-            process.end()
+            end(popen)
 
 
 def override(table: str, key: str, value: object) -> dict[str, str]:

@@ -12,25 +12,75 @@ from pathlib import Path
 import numpy as np
 
 from bodyschema.calibration.evaluate import ErrorFigures, Split, aligned_chain, coverage
-from bodyschema.daemon.config import Config
+from bodyschema.cli.replay.processes import Process, free_endpoint, override, started
+from bodyschema.cli.replay.report import AngleFigures, Figures, ReplayReport
+from bodyschema.daemon.config import Config, DaemonConfig
+from bodyschema.daemon.sampler.align import joint_difference
 from bodyschema.daemon.transport.bus import ZenohSession, client
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import JointsRequest, PredictReply, decode, encode
 from bodyschema.interfaces.errors import BusError, RecordingError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.recordings.recording import Recording
+from bodyschema.recordings.recording import ROW_INTERVAL_S, Recording
+from bodyschema.robot.description import RobotDescription
 from kbmaps import rotation_matrices, rotation_vectors
 
-from .processes import Process, free_endpoint, override, started
-from .report import AngleFigures, Figures, ReplayReport
-from .steps import Steps
+MOST = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Steps:
+    """Steps between neighbouring rows, by the sampler's rule.
+
+    Attributes:
+        count: their number.
+        too_far: number of steps larger than `max_step_deg`.
+        median_deg: their median.
+        max_step_deg: the sampler's limit.
+    """
+
+    count: int
+    too_far: int
+    median_deg: float
+    max_step_deg: float
+
+    @classmethod
+    def of(cls, recording: Recording, robot: RobotDescription, rules: DaemonConfig) -> Steps:
+        """Return the steps of a recording of at least two rows."""
+        prismatic = robot.chain.prismatic
+        units = np.where(prismatic, 1 / rules.metres_per_degree, 180 / np.pi)
+        steps_deg = np.linalg.norm(joint_difference(recording.q[1:], recording.q[:-1], prismatic) * units, axis=1)
+        too_far = int(np.count_nonzero(steps_deg > rules.max_step_deg))
+        return cls(len(steps_deg), too_far, float(np.median(steps_deg)), rules.max_step_deg)
+
+    @property
+    def is_path(self) -> bool:
+        """True if most rows follow from their predecessors."""
+        return self.too_far <= MOST * self.count
+
+    def __str__(self) -> str:
+        return (
+            f"{self.too_far} of {self.count} steps are larger than max_step_deg = {self.max_step_deg:g} "
+            f"(median {self.median_deg:.1f}°)"
+        )
+
+
+def require_path(steps: Steps, recording: Recording) -> None:
+    """Raise RecordingError if the rows are single poses far apart."""
+    if not steps.is_path:
+        raise RecordingError(
+            f"{steps}: these are single poses, not a guided path, and the sampler's step and speed rules do not "
+            "apply to them",
+            file=recording.file or "recording",
+            remedy="Give --any-step to relax these rules and accept every row, each as a segment of its own",
+        )
+
 
 GLANCE_S = 0.25
 STALL_LIMIT_S = 120.0
 BATCH = 2000
 # Live pairs come at most at the frame rate, and over some time: background learning is designed for that.
-LIVE_ROWS_PER_S = 30.0
 SHORTEST_S = 20.0
 
 
@@ -42,7 +92,7 @@ class Job:
         config: the robot's configuration.
         recording: the recording.
         split: its held-out rows.
-        speed: 1 as recorded, 0 as fast as the sampler takes it; None at `LIVE_ROWS_PER_S` on average,
+        speed: 1 as recorded, 0 as fast as the sampler takes it; None at the usual frame rate on average,
             but in `SHORTEST_S` at least.
         sigma_m: 1-sigma of the positions if the recording has none [m]; None as in robot.toml.
         any_step: relax the sampler's step and speed rules.
@@ -63,7 +113,7 @@ class Job:
     def drivers(self) -> dict[str, float]:
         """Keys of the table [drivers] for this job."""
         times = self.learnt_rows.play_times
-        live = float(times[-1] - times[0]) / max(len(times) / LIVE_ROWS_PER_S, SHORTEST_S)
+        live = float(times[-1] - times[0]) / max(len(times) * ROW_INTERVAL_S, SHORTEST_S)
         keys = {"speed": live if self.speed is None else self.speed}
         return keys if self.sigma_m is None else keys | {"recording_sigma_m": self.sigma_m}
 
@@ -242,9 +292,9 @@ def _running(job: Job) -> Iterator[_Live]:
     }
     arguments = ["--robot", os.fspath(job.config.file), "--state-dir", os.fspath(job.folder)]
     with (
-        started("learner", arguments, environment, job.folder / "learner.log") as learner,
+        started("learner", ["learner", *arguments], environment, job.folder / "learner.log") as learner,
         _connected(learner, learner_endpoint, keys.alive(learner.name)) as learner_bus,
-        started("sampler", arguments, environment, job.folder / "sampler.log") as sampler,
+        started("sampler", ["sampler", *arguments], environment, job.folder / "sampler.log") as sampler,
         _connected(sampler, sampler_endpoint, keys.alive(sampler.name)) as sampler_bus,
     ):
         yield _Live(job, (sampler, sampler_bus), (learner, learner_bus))

@@ -50,15 +50,10 @@ class ServoLog:
     """The log in a state directory; a missing file counts as empty."""
 
     def __init__(self, folder: Path) -> None:
-        """Set the folder; nothing is opened yet."""
         self.file = folder / FILE
 
     def append(self, entries: Sequence[LoggedWrite]) -> None:
-        """Append lines; they are on disk when this returns.
-
-        Raises:
-            ConfigError: the file cannot be written.
-        """
+        """Append lines; they are on disk when this returns. Raises ConfigError: the file cannot be written."""
         try:
             self.file.parent.mkdir(parents=True, exist_ok=True)
             with self.file.open("ab") as stream:

@@ -256,11 +256,7 @@ def require_writable(folder: Path) -> None:
 
 
 def written(found: Found, folder: Path) -> None:
-    """Write the files of DIR.
-
-    Raises:
-        ConfigError, RecordingError: they cannot be written.
-    """
+    """Write the files of DIR. Raises ConfigError, RecordingError: they cannot be written."""
     about = About(found.source.name, found.robot.name, version("bodyschema"))
     heading = f"Found by bodyschema {about.version} in {len(found.source.recording)} pairs of {about.recording}"
     extended = found.diagnosis.stored.written

@@ -10,6 +10,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
+from bodyschema.cli.terminal.screen import BAR_WIDTH
 from bodyschema.diagnosis.report.numbers import (
     chance,
     mm,
@@ -47,7 +48,6 @@ _ERRORS = (
 )
 # Rows that are omitted when equal to another row.
 _SAME_AS = {"aligned": "nominal", "extended": "aligned"}
-_BAR = 24
 
 
 def view(diagnosis: DiagnosisFile, remedies: Sequence[str], *, timed: bool) -> Group:
@@ -137,7 +137,7 @@ def _errors(diagnosis: DiagnosisFile) -> Table:
 
 
 def _bar(part: float) -> str:
-    return "█" * max(round(_BAR * min(part, 1.0)), 1) + ("…" if part > 1.001 else "")
+    return "█" * max(round(BAR_WIDTH * min(part, 1.0)), 1) + ("…" if part > 1.001 else "")
 
 
 def _of(errors: Errors, name: str) -> float | None:

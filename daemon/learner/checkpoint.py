@@ -30,10 +30,10 @@ import numpy as np
 
 from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.whole_files import sync_folder, unused_name
 from bodyschema.learning.online_learner import OnlineLearner
 from bodyschema.learning.state import LearningHeader, LearningState, StateError
 from bodyschema.recordings.files import StoredPairs
-from bodyschema.recordings.kept_files import sync_folder, unused_name
 from bodyschema.robot.limited import read_at_most
 from kbmaps import KBMapsError
 

@@ -27,7 +27,7 @@ _STEPS = 8
 # squares.
 _FREEDOM = 6.0
 # Lower bound of the noise of a measured orientation [rad]: below is rounding.
-_ROUNDING_RAD = 1e-8
+_ROUNDING_RAD = float(np.sqrt(np.finfo(np.float64).eps))
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,7 +25,7 @@ from kbmaps.chains.parameters import (
 from kbmaps.chains.report import ChainReport, Scatter, chain_report
 from kbmaps.chains.rigid_fit import RigidFit, fit_chain
 from kbmaps.errors import DegenerateDataError, ModelFormatError, SettingError
-from kbmaps.model import Estimate, near_data, widest
+from kbmaps.model import Estimate, Model, near_data, widest
 from kbmaps.packed import complete, named, pack, restoring, unpack
 from kbmaps.pairs import Pairs, checked_pairs, of_covariances, stored_pairs, with_units
 from kbmaps.robust import claimed_sigma, student
@@ -97,7 +97,7 @@ def _sides(belief: ChainBelief, pairs: Pairs, sigma: FloatArray) -> tuple[FloatA
 _KIND = "rigid chain, batch, 2"
 
 
-class RigidLearner:
+class RigidLearner(Model):
     """Fits a rigid chain to all pairs, around a nominal one whose tolerances are the prior.
 
     The result depends on the pairs only, not on their order or grouping. The fit runs on first use after `learn`
@@ -148,12 +148,10 @@ class RigidLearner:
 
     @property
     def joints(self) -> int:
-        """Number of joints d."""
         return self.nominal.joints
 
     @property
     def pairs(self) -> int:
-        """Number of learnt pairs."""
         return len(self._q)
 
     @property
@@ -223,14 +221,12 @@ class RigidLearner:
     def learn(
         self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None, *, cov: ArrayLike | None = None
     ) -> None:
-        """Learn pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,).
+        """Learn pairs, as every `Model` does.
 
         Args:
-            q: joint values.
-            x: measured positions.
-            sigma: 1-sigma of the positions [m], () or (n,); None where it is to be estimated. Once one pair came
-                without, the noise is estimated for all, and those told count relative to their median.
-            cov: in its place their covariances [m²], (3, 3) or (n, 3, 3), where some directions are surer than others:
+            q, x, sigma: once one pair came without its sigma, the noise is estimated for all, and those told count
+                relative to their median.
+            cov: in the place of sigma: covariances [m²], (3, 3) or (n, 3, 3), where some directions are surer:
                 one camera tells depth far worse than what is across.
 
         Raises:
@@ -249,19 +245,14 @@ class RigidLearner:
         self._fit = None
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Return positions (n, 3) [m] at q (n, d), or (3,) at q (d,)."""
         angles = rows_or_vector("q", q, self.joints)
         return self._parameters.positions(self.belief.mean, angles)
 
     def jacobian(self, q: ArrayLike) -> FloatArray:
-        """Return the derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d); exact."""
         return self._parameters.jacobian(self.belief.mean, q)
 
     def estimate(self, q: ArrayLike) -> Estimate:
-        """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and True where data is near.
-
-        Where the given noise does not explain the residuals, the excess is added to sigma everywhere.
-        """
+        """Return positions with their uncertainty; what the given noise does not explain is added to sigma."""
         angles = rows_or_vector("q", q, self.joints)
         fit = self._fitted()
         x, variance = self.belief.predict_with_variance(np.atleast_2d(angles))
@@ -305,7 +296,6 @@ class RigidLearner:
         return (after > _SETTINGS.hardly_narrower * before) & (before * lever > noise)
 
     def to_bytes(self) -> bytes:
-        """Return the learner with all its pairs; `from_bytes` restores the same predictions to the last bit."""
         arrays = chain_arrays(self.nominal) | {
             "q": self._q,
             "x": self._x,
@@ -319,7 +309,6 @@ class RigidLearner:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
-        """Return the learner in `data`. Raises ModelFormatError: wrong type of model, or damaged."""
         fields, arrays = unpack(data, _KIND)
         with restoring("a rigid learner"):
             tolerances = parse_tolerances(named(fields, "the fields", ("tolerances",))["tolerances"])

@@ -26,7 +26,7 @@ from kbmaps.chains.parameters import (
 from kbmaps.chains.rigid_filter import LEAST_NOISE_M, NOISE_COORDINATES, NOISE_MEMORY, RigidFilter
 from kbmaps.chains.rigid_fit import NOTHING_KNOWN, NoiseKnowledge, RigidFit, fit_chain, folded
 from kbmaps.errors import ModelFormatError, SettingError
-from kbmaps.model import Estimate, near_data, widest
+from kbmaps.model import Estimate, Model, near_data, widest
 from kbmaps.packed import complete, count, named, pack, restoring, unpack
 from kbmaps.pairs import checked_pairs, stored_pairs, with_units
 
@@ -190,7 +190,7 @@ _KIND = "rigid chain, recursive, 5"
 _COUNTS = ("pairs", "window", "due")
 
 
-class RecursiveRigidLearner:
+class RecursiveRigidLearner(Model):
     """Corrects a rigid chain with each pair at once, and keeps a bounded number of pairs for refits.
 
     The parameters and the prior are those of `RigidLearner`. A filter takes each pair as it comes. At growing intervals
@@ -238,12 +238,10 @@ class RecursiveRigidLearner:
 
     @property
     def joints(self) -> int:
-        """Number of joints d."""
         return self.nominal.joints
 
     @property
     def pairs(self) -> int:
-        """Number of learnt pairs."""
         return self._pairs
 
     @property
@@ -285,17 +283,7 @@ class RecursiveRigidLearner:
         return frozen(self._filter.covariance)
 
     def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
-        """Learn pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,), one after the other.
-
-        Args:
-            q: joint values.
-            x: measured positions.
-            sigma: 1-sigma of the positions [m], () or (n,); None where it is to be estimated. In a refit of pairs of
-                both kinds, given sigmas count relative to their median.
-
-        Raises:
-            ShapeError, NonFiniteError, SettingError (a sigma that is not positive): nothing has changed.
-        """
+        """Learn pairs one after the other. In a refit of pairs with and without sigma, sigmas count by their median."""
         self._widest = None
         if self._filter.learn_plain(q, x, sigma, self._window.next_row):
             self._window.next_row_filled()
@@ -328,15 +316,13 @@ class RecursiveRigidLearner:
         self._go_on_from(belief.with_other_tool(tolerance), fitted=False)
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Return positions (n, 3) [m] at q (n, d), or (3,) at q (d,)."""
         return self._parameters.positions(self._filter.change, rows_or_vector("q", q, self.joints))
 
     def jacobian(self, q: ArrayLike) -> FloatArray:
-        """Return the derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d); exact."""
         return self._parameters.jacobian(self._filter.change, q)
 
     def estimate(self, q: ArrayLike) -> Estimate:
-        """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and True where data is near.
+        """Return positions with their uncertainty.
 
         Where the given noise does not explain the residuals of a refit, the excess is added to sigma everywhere.
         Support is judged by the kept pairs, and by the most uncertain one of those before them. They are evaluated once
@@ -349,14 +335,12 @@ class RecursiveRigidLearner:
         return Estimate(x, np.sqrt(variance + self._window.excess), near_data(variance, self._widest)).like(angles)
 
     def to_bytes(self) -> bytes:
-        """Return the learner's state; a learner restored by `from_bytes` continues to the last bit as this one."""
         counts = {"pairs": self._pairs, "window": self._window.size, "due": self._due}
         arrays = chain_arrays(self.nominal) | self._filter.arrays() | self._window.arrays()
         return pack(_KIND, {"tolerances": describe_tolerances(self._tolerances), **counts}, arrays)
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
-        """Return the learner in `data`. Raises ModelFormatError: wrong type of model, or damaged."""
         fields, arrays = unpack(data, _KIND)
         with restoring("a recursive rigid learner"):
             settings = named(fields, "the fields", ("tolerances", *_COUNTS))

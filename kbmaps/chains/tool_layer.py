@@ -17,13 +17,12 @@ from kbmaps.chains.marker_fit import MarkerKnowledge, MarkerPosterior, Residuals
 from kbmaps.chains.rigid_filter import NOISE_COORDINATES
 from kbmaps.errors import DegenerateDataError, ModelFormatError, SettingError
 from kbmaps.maps.kbmap import POSITION_OUTPUTS, KBMap
-from kbmaps.model import Estimate, PoseModel
+from kbmaps.model import Estimate, Model, PoseModel
 from kbmaps.packed import complete, count, named, numbers, or_infinite, pack, restoring, unless_infinite, unpack
 from kbmaps.pairs import checked_pairs
 from kbmaps.robust import UNCALIBRATED_SIGMAS
 
 _KIND = "tool layer, 1"
-DEFAULT_OUTLIER_SIGMAS = 6.0
 # Finite stand-in for an infinite spread [m].
 _WIDE = 1e6
 # Number of pairs kept to judge outliers; older ones remain in sums.
@@ -42,8 +41,8 @@ class _Estimating(Protocol):
         ...
 
 
-class ToolLayer:
-    """Adds a marker offset to a fixed model: f(q) + R(q) δ, with δ in the marker's frame. A `Model`.
+class ToolLayer(Model):
+    """Adds a marker offset to a fixed model: f(q) + R(q) δ, with δ in the marker's frame.
 
     δ is learnt by least squares. The pairs enter through sums, at a constant cost and memory; outliers are judged among
     the last 128 or more. The result is the posterior of a Gaussian δ, with the noise that maximises the evidence where
@@ -67,7 +66,7 @@ class ToolLayer:
         *,
         spread: float = 1.0,
         noise: float = 0.01,
-        outlier_sigmas: float = DEFAULT_OUTLIER_SIGMAS,
+        outlier_sigmas: float = 6.0,
     ) -> None:
         if not (noise > 0.0 and math.isfinite(noise)):
             raise SettingError(f"noise must be finite and greater than 0 m, got {noise!r}")
@@ -84,7 +83,6 @@ class ToolLayer:
 
     @property
     def joints(self) -> int:
-        """Number of joints d."""
         return self._model.joints
 
     @property
@@ -113,7 +111,6 @@ class ToolLayer:
         return self._fitted()[2].copy()
 
     def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
-        """Learn pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,); see `Model.learn`."""
         angles, positions, sigmas = checked_pairs(q, x, sigma, self.joints)
         self._recent = self._recent.joined(self._residuals(angles, positions, sigmas))
         self._pairs += len(angles)
@@ -136,7 +133,6 @@ class ToolLayer:
         self._recent, self._fit = self._recent[:0], None
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Return positions (n, 3) [m] at q (n, d), or (3,) at q (d,)."""
         angles = rows_or_vector("q", q, self.joints)
         return self._model.predict(angles) + self._model.orientation(angles) @ self._posterior().shift
 

@@ -11,11 +11,9 @@ import numpy as np
 
 from kbmaps.arrays import FloatArray, IntArray
 from kbmaps.chains.belief import ChainBelief
-from kbmaps.changes.bending import MOST_PAIRS, log_evidence_of_bends, log_ratios_if_it_bends
-from kbmaps.changes.bends import NOTHING_SEEN
+from kbmaps.changes.bends import MOST_PAIRS, NOTHING_SEEN, log_evidence_of_bends, log_ratios_if_it_bends
 from kbmaps.changes.kinds import JOINT, SIZES, ChangeKind, change_kinds, log_ratios
-from kbmaps.changes.shared_noise import SharedNoise
-from kbmaps.changes.white_noise import inverse_roots
+from kbmaps.changes.white_noise import SharedNoise, inverse_roots
 from kbmaps.robust import CLIPPED_SIGMAS
 
 

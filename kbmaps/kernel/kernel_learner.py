@@ -6,7 +6,7 @@ Ulbrich et al. 2009, eqs. (16)-(18), in dual form.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Self
 
 import numpy as np
@@ -15,15 +15,95 @@ from numpy.typing import ArrayLike
 from kbmaps.arrays import FloatArray, rows_or_vector
 from kbmaps.chains.carried import Origin, Predictor, packable, unpacked
 from kbmaps.errors import DegenerateDataError, ModelFormatError, SettingError
-from kbmaps.kernel.kept_pairs import KeptPairs
-from kbmaps.kernel.kernel_fit import KernelFit, Precision
-from kbmaps.kernel.product_kernel import ProductKernel
+from kbmaps.kernel.kernel_fit import KernelFit, Observations, Precision, ProductKernel
 from kbmaps.maps.basis import JointBasis, check_net_size, describe_bases, parse_bases
 from kbmaps.maps.kbmap import POSITION_OUTPUTS, KBMap
 from kbmaps.maps.support import SUPPORT_LIMIT
 from kbmaps.memory import Memory, describe_memory, parse_memory
-from kbmaps.model import Estimate
+from kbmaps.model import Estimate, Model
 from kbmaps.packed import complete, count, named, number, pack, restoring, unpack
+from kbmaps.pairs import checked_pairs, stored_pairs, with_units
+
+
+class KeptPairs:
+    """Last pairs, with the predictions of the learner's prior model for them.
+
+    Attributes:
+        q, x, sigma, behind: configurations (n, d), positions (n, 3), their 1-sigma (n,), NaN where unknown, and the
+            prior model's positions (n, 3).
+        total: number of pairs so far.
+    """
+
+    STORED = ("q", "x", "sigma", "behind")
+
+    def __init__(self, joints: int, memory: Memory) -> None:
+        self._memory = memory
+        self.q, self.x = np.empty((0, joints)), np.empty((0, 3))
+        self.sigma, self.behind = np.empty(0), np.empty((0, 3))
+        self.total = 0
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    def checked(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return checked pairs for `add`. Raises ShapeError, NonFiniteError, SettingError."""
+        return checked_pairs(q, x, sigma, self.q.shape[1])
+
+    def add(self, q: FloatArray, x: FloatArray, sigma: FloatArray, model: Predictor) -> None:
+        """Add checked pairs; drop the oldest as the memory requires."""
+        behind = model.predict(q)
+        kept = self._memory.kept(len(self.q) + len(q))
+        self.q = _last(self.q, q, kept)
+        self.x = _last(self.x, x, kept)
+        self.sigma = _last(self.sigma, sigma, kept)
+        self.behind = _last(self.behind, behind, kept)
+        self.total += len(q)
+
+    def replace_model(self, model: Predictor) -> None:
+        """Replace the prior model behind the same pairs."""
+        self.behind = model.predict(self.q)
+
+    def observations(self, kernel: ProductKernel) -> Observations:
+        """Return the pairs, weighted by their sigma and their age."""
+        pairs = with_units(self.q, self.x, self.sigma)
+        shares = self._memory.weights(len(self.q))
+        weights = shares / np.square(pairs.unit)
+        scale = np.sqrt(weights)
+        return Observations(
+            weights=kernel.joint_weights(self.q),
+            scale=scale,
+            errors=(self.x - self.behind) * scale[:, None],
+            count=float(shares.sum()),
+            log_weights=-2.0 * float(shares @ np.log(pairs.unit)),
+            noise_known=pairs.known,
+        )
+
+    @property
+    def mean_unit(self) -> float:
+        """Root mean square of the pairs' units: with an estimated noise of 1, the noise of a coordinate [m]."""
+        return float(np.sqrt(np.square(with_units(self.q, self.x, self.sigma).unit).mean()))
+
+    def arrays(self) -> dict[str, FloatArray]:
+        """Return the state as arrays for `kbmaps.packed`."""
+        return {"q": self.q, "x": self.x, "sigma": self.sigma, "behind": self.behind}
+
+    def restore(self, arrays: Mapping[str, FloatArray], total: int) -> None:
+        """Restore the pairs from `arrays`.
+
+        Raises:
+            ModelFormatError: they do not fit each other.
+            KeyError: one is missing.
+        """
+        q, x, sigma = stored_pairs(arrays, self.q.shape[1])
+        behind = arrays["behind"]
+        if behind.shape != x.shape or not np.isfinite(behind).all() or total < len(q):
+            raise ModelFormatError("the stored pairs and what was predicted for them do not fit each other")
+        self.q, self.x, self.sigma, self.behind, self.total = q, x, sigma, behind, total
+
+
+def _last(old: FloatArray, new: FloatArray, kept: int) -> FloatArray:
+    return np.concatenate([old, new])[-kept:] if kept else old
+
 
 _KIND = "kernel learner, 1"
 # Rounding of positions, relative to the largest coordinate.
@@ -86,8 +166,8 @@ def slopes(model: Predictor, q: ArrayLike, bases: Sequence[JointBasis]) -> Float
     return columns.swapaxes(1, 2).reshape(*angles.shape[:-1], 3, len(bases))
 
 
-class KernelLearner:
-    """Learns a KB-Map around a prior from n pairs with n² numbers instead of 3^d control points. A `Model`.
+class KernelLearner(Model):
+    """Learns a KB-Map around a prior from n pairs with n² numbers instead of 3^d control points.
 
     Gives the same solution as `ExactLearner` where both can be computed. Use this one for fewer pairs than control
     points, and for more joints than a net has room for. The fit runs on first use after `learn`, at n³ / 3
@@ -127,7 +207,6 @@ class KernelLearner:
 
     @property
     def joints(self) -> int:
-        """Number of joints d."""
         return self._kernel.joints
 
     @property
@@ -159,7 +238,6 @@ class KernelLearner:
         return self._fitted().log_evidence
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Return positions (n, 3) [m] at q (n, d), or (3,) at q (d,)."""
         angles = rows_or_vector("q", q, self.joints)
         batch = np.atleast_2d(angles)
         x = self._prior.predict(batch)
@@ -184,11 +262,7 @@ class KernelLearner:
 
     @property
     def prior_precision(self) -> float:
-        """λ of the current fit; 0 for the exact one.
-
-        Raises:
-            DegenerateDataError: no pair has been learnt.
-        """
+        """λ of the current fit; 0 for the exact one. Raises DegenerateDataError: no pair has been learnt."""
         return self._fitted().precision
 
     @property
@@ -197,17 +271,7 @@ class KernelLearner:
         return math.sqrt(self._fitted().prior_variance)
 
     def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
-        """Learn pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,).
-
-        Args:
-            q: joint values.
-            x: measured positions.
-            sigma: 1-sigma of the positions [m], () or (n,); None where it is to be estimated.
-
-        Raises:
-            ShapeError, NonFiniteError, SettingError (a sigma that is not positive)
-            DegenerateDataError: more pairs than control points, and no precision to weigh them. Nothing has changed.
-        """
+        """Learn pairs; DegenerateDataError: more than control points, and no precision to weigh them."""
         angles, positions, sigmas = self._pairs.checked(q, x, sigma)
         kept = self._memory.kept(self.kept + len(angles))
         points = math.prod(basis.size for basis in self.bases)
@@ -245,7 +309,7 @@ class KernelLearner:
         return Estimate(self.predict(batch), sigma, fit.unexplained(weights) <= SUPPORT_LIMIT).like(angles)
 
     def to_bytes(self) -> bytes:
-        """Return the learner with the pairs that count; `from_bytes` restores the same predictions to the last bit.
+        """Return the learner with the pairs that count.
 
         A prior that is neither a `KBMap` nor a `RigidChain` is not stored. The one given in its place has to predict
         the same at the pairs, up to rounding; elsewhere predictions differ as the priors do.

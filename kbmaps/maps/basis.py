@@ -34,7 +34,7 @@ PARAMETER_NAMES: Mapping[BasisKind, tuple[str, ...]] = {
 
 SINGULAR_ALPHA = (math.radians(80.0), math.radians(100.0))
 # Rounding of degrees to radians must not let 80 or 100 degrees through.
-_ANGLE_ROUNDING = 1e-12
+_ANGLE_ROUNDING = math.ulp(math.pi)
 DEFAULT_SCALE = 0.7
 
 
@@ -289,11 +289,7 @@ def learning_bases(
 
 
 def check_bases(bases: Sequence[JointBasis], prismatic: Sequence[bool]) -> None:
-    """Check bases for joints of these kinds.
-
-    Raises:
-        BasisError: wrong number of bases, or one of the wrong kind.
-    """
+    """Check bases for joints of these kinds. Raises BasisError: wrong number of bases, or one of the wrong kind."""
     if len(bases) != len(prismatic):
         raise BasisError(f"need {len(prismatic)} bases, one a joint; got {len(bases)}")
     for k, (basis, slides) in enumerate(zip(bases, prismatic, strict=True)):

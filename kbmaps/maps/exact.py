@@ -17,8 +17,7 @@ from kbmaps.maps.basis import JointBasis
 from kbmaps.maps.design import Design
 from kbmaps.maps.evidence import most_evident
 from kbmaps.maps.factor import ShiftedGram
-from kbmaps.maps.kbmap import POSE_OUTPUTS, POSITION_OUTPUTS, KBMap
-from kbmaps.maps.targets import pose_targets
+from kbmaps.maps.kbmap import POSE_OUTPUTS, POSITION_OUTPUTS, KBMap, pose_targets
 from kbmaps.memory import Memory
 from kbmaps.robust import VARIANCE_FLOOR
 

@@ -7,8 +7,6 @@ import numpy as np
 from kbmaps import lapack
 from kbmaps.arrays import FloatArray
 
-_NOTHING = 1e-150
-
 
 class RowFactor:
     """Rows A (k, m) and targets (k, outputs) of a least-squares problem, never more of them than unknowns.

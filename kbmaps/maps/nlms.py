@@ -13,13 +13,10 @@ from numpy.typing import ArrayLike
 from kbmaps.arrays import FloatArray, IntArray, rows, rows_or_vector, vector
 from kbmaps.errors import ModelFormatError, SettingError, ShapeError
 from kbmaps.maps.basis import describe_bases, parse_bases
-from kbmaps.maps.kbmap import POSITION_OUTPUTS, KBMap
+from kbmaps.maps.kbmap import POSITION_OUTPUTS, KBMap, pose_targets
 from kbmaps.maps.kernels import net_kernel
 from kbmaps.maps.stack import BasisStack
-from kbmaps.maps.targets import pose_targets
 from kbmaps.packed import complete, count, named, number, or_infinite, pack, restoring, unless_infinite, unpack
-
-DEFAULT_MU0 = 0.5
 
 
 @dataclass(frozen=True)
@@ -38,7 +35,7 @@ class StepSize:
         SettingError: mu0 is not between 0 and 2, decay not above 0, or floor not within 0..mu0.
     """
 
-    mu0: float = DEFAULT_MU0
+    mu0: float = 0.5
     decay: float = math.inf
     floor: float = 0.0
 
@@ -89,7 +86,7 @@ class NLMS:
         array([0.5, 0. , 0. ])
     """
 
-    def __init__(self, kbmap: KBMap, mu0: float | StepSize = DEFAULT_MU0) -> None:
+    def __init__(self, kbmap: KBMap, mu0: float | StepSize = StepSize.mu0) -> None:
         self._bases = kbmap.bases
         self._step_size = mu0 if isinstance(mu0, StepSize) else StepSize(mu0)
         self._pairs = 0

@@ -12,23 +12,19 @@ Layout, all little-endian:
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
-import struct
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
 
 from kbmaps.arrays import FloatArray
-from kbmaps.errors import BasisError, ModelFormatError
-from kbmaps.maps.basis import PARAMETER_NAMES, BasisKind, JointBasis
+from kbmaps.errors import ModelFormatError
+from kbmaps.maps.basis import PARAMETER_NAMES, BasisKind, JointBasis, parse_bases
+from kbmaps.packed import framed, named, unframed
 
 MAGIC = b"KBMAP\r\n\0"
-VERSION = 1
-_PREFIX = struct.Struct("<8sII")
-_CHECKSUM_BYTES = 16
 # Far above any net that fits into memory, and low enough that 3^d stays a small integer.
 _MAX_JOINTS = 32
 _ALLOWED_OUTPUTS = (3, 12)
@@ -42,8 +38,7 @@ def encode(bases: Sequence[JointBasis], net: FloatArray, metadata: Mapping[str, 
     ]
     content = {"bases": described, "outputs": net.shape[0], "metadata": dict(metadata)}
     header = json.dumps(content, sort_keys=True, separators=(",", ":")).encode()
-    body = _PREFIX.pack(MAGIC, VERSION, len(header)) + header + net.astype("<f8", copy=False).tobytes()
-    return body + _checksum(body)
+    return framed(MAGIC, header, net.astype("<f8", copy=False).tobytes())
 
 
 def decode(data: bytes) -> tuple[tuple[JointBasis, ...], FloatArray, dict[str, str]]:
@@ -52,10 +47,7 @@ def decode(data: bytes) -> tuple[tuple[JointBasis, ...], FloatArray, dict[str, s
     Raises:
         ModelFormatError: the bytes are damaged, truncated, or of another format.
     """
-    if not isinstance(data, bytes | bytearray | memoryview):  # pyright: ignore[reportUnnecessaryIsInstance]
-        raise ModelFormatError(f"a stored map is bytes, as to_bytes gives them; got {type(data).__name__}")
-    view = memoryview(data)
-    header, payload = _split(view)
+    header, payload = unframed(data, MAGIC)
     bases, outputs, metadata = _parse_header(header)
     shape = (outputs, *(basis.size for basis in bases))
     expected = 8 * math.prod(shape)
@@ -67,30 +59,12 @@ def decode(data: bytes) -> tuple[tuple[JointBasis, ...], FloatArray, dict[str, s
     return bases, net, metadata
 
 
-def _split(view: memoryview) -> tuple[bytes, memoryview]:
-    """Return header and net, after checking magic, version, lengths and checksum."""
-    if len(view) < _PREFIX.size + _CHECKSUM_BYTES:
-        raise ModelFormatError(f"{len(view)} bytes are too few for a stored map")
-    magic, version, header_length = cast(tuple[bytes, int, int], _PREFIX.unpack_from(view))
-    if magic != MAGIC:
-        raise ModelFormatError("not a stored map: the first eight bytes are not its signature")
-    if version != VERSION:
-        raise ModelFormatError(f"format version {version} is not known here (this code reads {VERSION})")
-    body, checksum = view[:-_CHECKSUM_BYTES], bytes(view[-_CHECKSUM_BYTES:])
-    if _checksum(body) != checksum:
-        raise ModelFormatError("the checksum does not match: the bytes are damaged or truncated")
-    if header_length > len(body) - _PREFIX.size:
-        raise ModelFormatError(f"the header claims {header_length} bytes, more than there are")
-    end = _PREFIX.size + header_length
-    return bytes(body[_PREFIX.size : end]), body[end:]
-
-
 def _parse_header(header: bytes) -> tuple[tuple[JointBasis, ...], int, dict[str, str]]:
     try:
         content: Any = json.loads(header)
     except (ValueError, RecursionError) as error:
         raise ModelFormatError(f"the header is not JSON: {error}") from error
-    fields = _object(content, "the header", ("bases", "outputs", "metadata"))
+    fields = named(content, "the header", ("bases", "outputs", "metadata"))
     described, outputs = fields["bases"], fields["outputs"]
     if not isinstance(described, list):
         raise ModelFormatError("the header's bases are not a list")
@@ -99,23 +73,18 @@ def _parse_header(header: bytes) -> tuple[tuple[JointBasis, ...], int, dict[str,
         raise ModelFormatError(f"the header describes {len(entries)} joints; 1 to {_MAX_JOINTS} are possible")
     if type(outputs) is not int or outputs not in _ALLOWED_OUTPUTS:
         raise ModelFormatError(f"outputs must be one of {_ALLOWED_OUTPUTS}")
-    return tuple(_parse_basis(entry) for entry in entries), outputs, _parse_metadata(fields["metadata"])
+    return parse_bases([_listed(entry) for entry in entries]), outputs, _parse_metadata(fields["metadata"])
 
 
-def _parse_basis(entry: Any) -> JointBasis:
-    fields = _object(entry, "a basis", ("kind", "parameters"))
+def _listed(entry: Any) -> list[Any]:
+    """Return a basis of the header as `parse_bases` reads it."""
+    fields = named(entry, "a basis", ("kind", "parameters"))
     kind = fields["kind"]
     if not isinstance(kind, str) or kind not in PARAMETER_NAMES:
         raise ModelFormatError("a basis is of no known kind")
-    known = cast(BasisKind, kind)
-    values = _object(fields["parameters"], f"the parameters of a {known} basis", PARAMETER_NAMES[known])
-    numbers = [values[name] for name in PARAMETER_NAMES[known]]
-    if not all(isinstance(number, float) for number in numbers):
-        raise ModelFormatError(f"the parameters of a {known} basis are not all floating-point numbers")
-    try:
-        return JointBasis(known, tuple(numbers))
-    except BasisError as error:
-        raise ModelFormatError(f"the header describes an impossible basis: {error}") from error
+    names = PARAMETER_NAMES[cast(BasisKind, kind)]
+    values = named(fields["parameters"], f"the parameters of a {kind} basis", names)
+    return [kind, *(values[name] for name in names)]
 
 
 def _parse_metadata(entry: Any) -> dict[str, str]:
@@ -125,13 +94,3 @@ def _parse_metadata(entry: Any) -> dict[str, str]:
     if not all(isinstance(text, str) for text in texts.values()):
         raise ModelFormatError("the metadata holds something else than texts")
     return dict(texts)
-
-
-def _object(value: Any, what: str, keys: tuple[str, ...]) -> dict[str, Any]:
-    if not isinstance(value, dict) or set(cast(dict[str, Any], value)) != set(keys):
-        raise ModelFormatError(f"{what} must be an object with the keys {', '.join(keys) or '(none)'}")
-    return cast(dict[str, Any], value)
-
-
-def _checksum(body: bytes | memoryview) -> bytes:
-    return hashlib.blake2b(body, digest_size=_CHECKSUM_BYTES).digest()

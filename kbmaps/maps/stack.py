@@ -12,8 +12,7 @@ from kbmaps.arrays import FloatArray, IntArray
 from kbmaps.maps.basis import JointBasis
 
 # The three products of the two sines of a joint: first², first · second, second².
-_FIRST = np.array([0, 0, 1])
-_SECOND = np.array([0, 1, 1])
+_FIRST, _SECOND = np.array([[0, 0, 1], [0, 1, 1]])
 
 
 class BasisStack:

@@ -20,7 +20,7 @@ from kbmaps.chains.parameters import (
     parse_tolerances,
 )
 from kbmaps.chains.rigid_learner import RigidLearner
-from kbmaps.model import Estimate, near_data, widest
+from kbmaps.model import Estimate, Model, near_data, widest
 from kbmaps.packed import complete, named, pack, restoring, unpack
 from kbmaps.pairs import checked_pairs, runs, stored_pairs, with_units
 from kbmaps.residual.features import ResidualScaling
@@ -32,7 +32,7 @@ _KIND = "rigid chain with residual, batch, 2"
 _LEAST_FREEDOM = 10.0
 
 
-class ResidualLearner:
+class ResidualLearner(Model):
     """Fits a rigid chain around a nominal one, and smooth deviations from it where the pairs support them.
 
     Deviations come in groups: eccentric encoders, gear gains, compliant joints, a distorting camera, and smooth
@@ -66,12 +66,10 @@ class ResidualLearner:
 
     @property
     def joints(self) -> int:
-        """Number of joints d."""
         return self._rigid.joints
 
     @property
     def pairs(self) -> int:
-        """Number of learnt pairs."""
         return len(self._q)
 
     @property
@@ -108,7 +106,6 @@ class ResidualLearner:
         return self._rigid.inliers if fit is None else fit.inliers.copy()
 
     def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
-        """Learn pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,); see `Model.learn`."""
         angles, positions, sigmas = checked_pairs(q, x, sigma, self.joints)
         self._rigid.learn(q, x, sigma)
         self._q = np.concatenate([self._q, angles])
@@ -117,7 +114,6 @@ class ResidualLearner:
         self._model = self._fit = None
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Return positions (n, 3) [m] at q (n, d), or (3,) at q (d,)."""
         return self._rigid.predict(q) if self._is_rigid else self.model.predict(q)
 
     def jacobian(self, q: ArrayLike) -> FloatArray:
@@ -125,10 +121,7 @@ class ResidualLearner:
         return self._rigid.jacobian(q) if self._is_rigid else self.model.jacobian(q)
 
     def estimate(self, q: ArrayLike) -> Estimate:
-        """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and True where data is near.
-
-        Where the given noise does not explain the residuals, the excess is added to sigma everywhere.
-        """
+        """Return positions with their uncertainty; what the given noise does not explain is added to sigma."""
         if self._is_rigid:
             return self._rigid.estimate(q)
         angles, fit = rows_or_vector("q", q, self.joints), self._fitted()
@@ -139,7 +132,6 @@ class ResidualLearner:
         return Estimate(x, sigma, near_data(variance, self._widest)).like(angles)
 
     def to_bytes(self) -> bytes:
-        """Return the learner with all its pairs; `from_bytes` restores the same predictions to the last bit."""
         arrays = chain_arrays(self._rigid.nominal) | {"q": self._q, "x": self._x, "sigma": self._sigma}
         prior, belief = self._prior, self._belief
         known = {"model": prior.to_bytes().hex()} if prior else belief and {"belief": belief.to_bytes().hex()}
@@ -147,7 +139,6 @@ class ResidualLearner:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
-        """Return the learner in `data`. Raises ModelFormatError: wrong type of model, or damaged."""
         fields, arrays = unpack(data, _KIND)
         with restoring("a rigid chain with residual"):
             named(fields, "the fields", ("tolerances", "prior"))

@@ -10,19 +10,103 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from kbmaps import lapack
 from kbmaps.arrays import BoolArray, FloatArray, rows, rows_or_vector, vector
 from kbmaps.chains.chain import RigidChain
 from kbmaps.errors import DegenerateDataError, ModelFormatError, SettingError, ShapeError
 from kbmaps.maps.basis import JointBasis, describe_bases, parse_bases
 from kbmaps.maps.stack import BasisStack
-from kbmaps.model import Estimate, near_data
+from kbmaps.model import Estimate, Model, near_data
 from kbmaps.packed import complete, count, flag, named, number, pack, restoring, unpack
 from kbmaps.pairs import checked_pairs, stored_pairs
-from kbmaps.trains.core_evidence import USUAL_ELLIPSE_STD, core_equations, likely_ellipse_std
 from kbmaps.trains.core_prior import CORE_NUMBERS, CoreFamily, CorePrior
+from kbmaps.trains.fit import TensorProblem, whitened_jacobian
 from kbmaps.trains.posterior import TensorPosterior, misfit_sizes
 from kbmaps.trains.search import PLAUSIBLE, Fit, Pairs, information, refine, search
 from kbmaps.trains.train import TensorSettings, TensorTrain, parse_settings
+
+# Candidates, and the centre of the prior over them: a few parts in a thousand, within about a decade.
+ELLIPSE_STDS = tuple(float(std) for std in np.geomspace(1e-4, 3e-2, 11))
+USUAL_ELLIPSE_STD = 0.003
+_DECADE = math.log(10.0)
+
+
+def core_equations(problem: TensorProblem, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return J (3 n, 36 d) and y (3 n,) of a problem linearised at z.
+
+    y = J c + e for cores c (36 d,), with e ~ N(0, I).
+    """
+    prior = problem.prior
+    plain = CorePrior(prior.mean, np.tile(np.eye(CORE_NUMBERS), (prior.joints, 1, 1)))
+    jacobian = whitened_jacobian(problem.weights, problem.maps(z), plain) / np.repeat(problem.std, 3)[:, None]
+    residuals = (problem.residuals(z) / problem.std[:, None]).ravel()
+    return jacobian, residuals + jacobian @ prior.cores(z).ravel()
+
+
+def likely_ellipse_std(family: CoreFamily, jacobian: FloatArray, positions: FloatArray) -> float:
+    """Return the most probable of `ELLIPSE_STDS`, for pairs linearised at a fit to them.
+
+    With c = m + S z, z ~ N(0, I), y - J m = r and z marginalised,
+
+        2 log p = - rᵀ (I + J S Sᵀ Jᵀ)⁻¹ r - log |I + J S Sᵀ Jᵀ| + terms without S,
+
+    or, where there are fewer cores' numbers than coordinates,
+
+        2 log p = rᵀ J S (I + Sᵀ Jᵀ J S)⁻¹ Sᵀ Jᵀ r - log |I + Sᵀ Jᵀ J S| + terms without S.
+
+    Args:
+        family: the priors to choose from.
+        jacobian, positions: J (3 n, 36 d) and y (3 n,) of `core_equations`.
+    """
+    residuals = positions - jacobian @ family.mean.ravel()
+    few = len(jacobian) < jacobian.shape[1]
+    evidences = _by_coordinates(family, jacobian, residuals) if few else _by_cores(family, jacobian, residuals)
+    scores = [
+        evidence - 0.5 * (math.log(std / USUAL_ELLIPSE_STD) / _DECADE) ** 2
+        for std, evidence in zip(ELLIPSE_STDS, evidences, strict=True)
+    ]
+    return ELLIPSE_STDS[int(np.argmax(scores))]
+
+
+def _by_coordinates(family: CoreFamily, jacobian: FloatArray, residuals: FloatArray) -> list[float]:
+    """Return the log evidence of each of `ELLIPSE_STDS`, from matrices of the size of the coordinates.
+
+    S Sᵀ is the rigid part plus the square of each standard deviation times the rest.
+    """
+    joints = len(family.mean)
+    blocks = jacobian.reshape(-1, joints, CORE_NUMBERS).swapaxes(0, 1)
+    moved = (blocks @ family.motions).swapaxes(0, 1).reshape(len(jacobian), -1)
+    own = jacobian * np.tile(family.sizes, joints)
+    rigid, rest = np.eye(len(jacobian)) + moved @ moved.T, own @ own.T
+    evidences: list[float] = []
+    for std in ELLIPSE_STDS:
+        square, log_determinant = _inverse_square(rigid + std**2 * rest, residuals)
+        evidences.append(-0.5 * (square + log_determinant))
+    return evidences
+
+
+def _by_cores(family: CoreFamily, jacobian: FloatArray, residuals: FloatArray) -> list[float]:
+    """Return the log evidence of each of `ELLIPSE_STDS`."""
+    joints, size = len(family.mean), jacobian.shape[1]
+    blocks = (jacobian.T @ jacobian).reshape(joints, CORE_NUMBERS, joints, CORE_NUMBERS)
+    slope = (jacobian.T @ residuals).reshape(joints, CORE_NUMBERS, 1)
+    evidences: list[float] = []
+    for std in ELLIPSE_STDS:
+        spread = family.prior(std).spread
+        whitened = np.einsum("aij,aibk,bkl->ajbl", spread, blocks, spread, optimize=True).reshape(size, size)
+        pull = (spread.swapaxes(1, 2) @ slope).ravel()
+        square, log_determinant = _inverse_square(whitened + np.eye(size), pull)
+        evidences.append(0.5 * (square - log_determinant))
+    return evidences
+
+
+def _inverse_square(matrix: FloatArray, vector: FloatArray) -> tuple[float, float]:
+    """Return vᵀ M⁻¹ v and log |M|, which is infinite where M is not positive definite up to rounding."""
+    factor, positive = lapack.cholesky_lower(np.asfortranarray(matrix))
+    if not positive:
+        return 0.0, math.inf
+    return float(vector @ lapack.cholesky_solve(factor, vector)), 2.0 * float(np.log(np.diag(factor)).sum())
+
 
 KIND = "tensor learner, 3"
 _FIELDS = ("bases", "settings", "pairs", "waiting", "searches", "length")
@@ -46,8 +130,8 @@ class _Settings:
 _SETTINGS = _Settings()
 
 
-class TensorLearner:
-    """Learns a TensorTrain. A `kbmaps.model.Model`.
+class TensorLearner(Model):
+    """Learns a TensorTrain.
 
     With a prior, every fit is the most likely train under it (`TensorLearner.around` makes one from a nominal chain).
     Without, the first fits search from random chains once there are `pairs_needed`; later ones continue from the one
@@ -135,12 +219,10 @@ class TensorLearner:
 
     @property
     def joints(self) -> int:
-        """Number of joints d."""
         return len(self.bases)
 
     @property
     def pairs(self) -> int:
-        """Number of learnt pairs."""
         return self._pairs
 
     @property
@@ -184,7 +266,6 @@ class TensorLearner:
         return np.zeros(0, dtype=np.bool_) if self._fit is None else ~self._fit.used
 
     def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
-        """Learn pairs q (n, d) [rad, m] and x (n, 3) [m], or one, (d,) and (3,); see `Model.learn`."""
         angles, positions, sigmas = checked_pairs(q, x, sigma, self.joints)
         self._q = np.concatenate([self._q, angles])
         self._x = np.concatenate([self._x, positions])
@@ -198,11 +279,7 @@ class TensorLearner:
             self.refit()
 
     def forget(self, keep: int) -> None:
-        """Drop all but the last `keep` pairs. The train stays until the next fit.
-
-        Raises:
-            SettingError: keep below 0.
-        """
+        """Drop all but the last `keep` pairs. The train stays until the next fit. Raises SettingError: keep below 0."""
         if keep < 0:
             raise SettingError(f"keep must be at least 0, got {keep}")
         self._keep(keep)
@@ -265,29 +342,15 @@ class TensorLearner:
         return self._posterior
 
     def predict(self, q: ArrayLike) -> FloatArray:
-        """Return positions (n, 3) [m] at q (n, d), or (3,) at q (d,).
-
-        Raises:
-            DegenerateDataError: there is neither a prior nor enough pairs.
-        """
         return self.train.predict(q)
 
     def jacobian(self, q: ArrayLike) -> FloatArray:
-        """Return the derivative (3, d) of the position [m/rad, or m/m], or (n, 3, d) for q (n, d); exact.
-
-        Raises:
-            DegenerateDataError: there is neither a prior nor enough pairs.
-        """
         return self.train.jacobian(q)
 
     def estimate(self, q: ArrayLike) -> Estimate:
-        """Return positions at q (n, d), or (d,), with the standard deviation of the Gauss-Newton posterior.
+        """Return positions with the standard deviation of the Gauss-Newton posterior.
 
-        Where residuals show joint or instrument errors that no train can follow, their uncertainty is added
-        (`kbmaps.trains.misfit`).
-
-        Raises:
-            DegenerateDataError: there is neither a prior nor enough pairs.
+        Where residuals show joint or instrument errors that no train can follow, their uncertainty is added.
         """
         angles = rows_or_vector("q", q, self.joints)
         batch = np.atleast_2d(angles)
@@ -296,7 +359,6 @@ class TensorLearner:
         return Estimate(self.predict(batch), np.sqrt(variance), inside).like(angles)
 
     def to_bytes(self) -> bytes:
-        """Return the train, its prior, the kept pairs and the settings as one self-describing byte string."""
         arrays = {"q": self._q, "x": self._x, "sigma": self._sigma}
         if self._prior is not None:
             arrays |= {"mean": self._prior.mean, "spread": self._prior.spread}
@@ -320,7 +382,6 @@ class TensorLearner:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
-        """Return the learner in the bytes of `to_bytes`."""
         content, arrays = unpack(data, KIND)
         with restoring("a tensor learner"):
             named(content, "the fields", _FIELDS)

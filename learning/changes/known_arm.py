@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray
-from kbmaps import ChainBelief, ChainTolerances, ResidualModel
+from bodyschema.learning.changes.monitor import DetectedChange
+from bodyschema.learning.changes.record import NAMED, TOOL
+from bodyschema.learning.solvers.solver import fitted_belief
+from kbmaps import ChainBelief, ChainTolerances, ChangeKind, Explanation, KBMap, ResidualModel, any_change, explanations
 
 # 1-sigma of each coordinate [m] of the marker's displacement by another tool, and of an unknown marker position about
 # the nominal one.
@@ -53,3 +57,118 @@ class KnownArm:
         """
         residual = None if self.residual is None else self.residual.widened(columns, std)
         return KnownArm(self.chain.widened(columns, std), self.tolerances, residual)
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the adaptation to a change."""
+
+    # An unnamed change widens every kind at least this probable.
+    improbable: float = 0.02
+    # 1-sigma of the changed part: this multiple of its most probable change, and at least this many noises.
+    wider: float = 3.0
+    least_noises: float = 3.0
+    # Number of runs of neighbours left out in turn to compare the new model with the old one.
+    folds: int = 4
+    # Pairs farther from a prediction than this many sigmas are clipped.
+    clipped: float = 5.0
+    # Minimum number of pairs before the change that update the previous posterior.
+    fewest_before: int = 10
+
+
+_SETTINGS = _Settings()
+
+
+@dataclass(frozen=True, eq=False)
+class Adapted:
+    """State from which learning continues.
+
+    Attributes:
+        prior: the map to learn on top of.
+        arm: prior of the arm before the first pair since the change.
+        belief: posterior of the chain after these pairs.
+    """
+
+    prior: KBMap
+    arm: KnownArm
+    belief: ChainBelief
+
+
+class Origin:
+    """Knowledge of the arm before a change, with the evidence of the pairs since.
+
+    Args:
+        noticed: the change.
+        arm: prior of the arm before the first pair of its regime; it supplies the tolerances.
+    """
+
+    def __init__(self, noticed: DetectedChange, arm: KnownArm) -> None:
+        self._noticed, self._reference = noticed, noticed.reference
+        quiet = [k for k in range(min(noticed.earliest, noticed.first)) if noticed.kept[k]]
+        q, x = noticed.q[quiet], noticed.x[quiet]
+        wide = self._reference.wide
+        if len(quiet) >= _SETTINGS.fewest_before:
+            wide = fitted_belief(wide, q, self._of_chain(q, x))
+        self._before = arm.updated(wide, self._reference.residual)
+
+    def explain(self, q: FloatArray, x: FloatArray) -> list[Explanation]:
+        """Return the probability of each kind of change after the pairs since then, q (n, d) [rad] and x (n, 3) [m].
+
+        The first pairs may be from before the change. They are left out once as many others are available.
+        """
+        noticed, belief = self._noticed, self._before.chain
+        doubtful = max(noticed.latest - noticed.first, 0)
+        if len(q) >= 2 * doubtful:
+            q, x = q[doubtful:], x[doubtful:]
+        kinds = (*noticed.kinds, any_change(belief.parameters))
+        return explanations(belief, kinds, q, self._of_chain(q, x), noticed.noise_m, noticed.shared)
+
+    def adapt(self, found: Sequence[Explanation], q: FloatArray, x: FloatArray) -> Adapted:
+        """Widen what may have changed, and relearn it from the pairs since, q (n, d) [rad] and x (n, 3) [m].
+
+        Args:
+            found: probability of each kind of change, the most probable first.
+            q: joint values since the change.
+            x: positions since the change.
+        """
+        arm = self._forgetful(found)
+        belief = fitted_belief(arm.chain, q, self._of_chain(q, x))
+        bases, known = self._reference.map.bases, self._reference.belief.chain
+        net = self._reference.map.net[:3] + belief.chain.to_kbmap(bases).net - known.to_kbmap(bases).net
+        return Adapted(KBMap(bases, net), arm, belief)
+
+    def is_better(self, found: Sequence[Explanation], q: FloatArray, x: FloatArray) -> bool:
+        """Return True if an adapted model predicts held-out pairs since the change better than the old one.
+
+        Runs of q (n, d) [rad] and x (n, 3) [m], n at least 2, are left out in turn.
+        """
+        arm, y = self._forgetful(found), self._of_chain(q, x)
+        limit = _SETTINGS.clipped * self._noticed.noise_m
+        old = np.minimum(np.linalg.norm(y - self._reference.belief.predict(q), axis=1), limit)
+        new = np.empty(len(q))
+        for left_out in np.array_split(np.arange(len(q)), min(_SETTINGS.folds, len(q))):
+            others = np.setdiff1d(np.arange(len(q)), left_out)
+            belief = fitted_belief(arm.chain, q[others], y[others])
+            new[left_out] = np.minimum(np.linalg.norm(y[left_out] - belief.predict(q[left_out]), axis=1), limit)
+        return float(np.square(new).sum()) < float(np.square(old).sum())
+
+    def _of_chain(self, q: FloatArray, x: FloatArray) -> FloatArray:
+        """Return the part of positions x (n, 3) [m] that the chain must explain: the model's other terms are kept."""
+        return x - self._reference.beyond_chain(q)
+
+    def _forgetful(self, found: Sequence[Explanation]) -> KnownArm:
+        arm = self._before
+        kinds = (
+            found[:1] if found[0].probability >= NAMED else [e for e in found if e.probability >= _SETTINGS.improbable]
+        )
+        for each in kinds:
+            if each.kind.name == TOOL:
+                arm = arm.with_other_tool()
+            else:
+                arm = arm.widened(each.kind.columns, self._widths(each.kind, each.change))
+        return arm
+
+    def _widths(self, kind: ChangeKind, change: FloatArray) -> FloatArray:
+        moves = change / kind.units
+        size = _SETTINGS.wider * float(np.sqrt(np.square(moves).mean()))
+        return kind.units * min(max(size, _SETTINGS.least_noises * self._noticed.noise_m), OTHER_TOOL_M)

@@ -14,7 +14,7 @@ from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
-from bodyschema.recordings.kept_files import sync_folder, unused_name
+from bodyschema.interfaces.whole_files import sync_folder, unused_name
 
 from . import schema as store_schema
 from .file import is_damage

@@ -32,7 +32,7 @@ from bodyschema.recordings.store.file import (
     lock,
     unwritable,
 )
-from bodyschema.recordings.store.retention import Keep, delete_until
+from bodyschema.recordings.store.retention import AT_ONCE, Keep, delete_until
 from bodyschema.recordings.store.rows import Checked, as_json, checked, decoded, pair_of, require_sound, row_of, sealed
 
 # Header of the file and of each frame: magic, version, page size, sequence, two salts, checksum; page, size, salts,
@@ -64,8 +64,6 @@ def commits(store: Path) -> list[bool]:
 
 
 log = logging.getLogger(__name__)
-
-AUDITED_AT_ONCE = 1000  # number of rows whose joint angles are compared at once
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,7 +235,7 @@ class PairReader:
             numbers: list[int] = []
             session, ends = 0, np.empty((0, len(self.joints)))
             rows = scan(connection, self._columns, self._check)
-            while some := list(islice(rows, AUDITED_AT_ONCE)):
+            while some := list(islice(rows, AT_ONCE)):
                 numbers += [pair.seq for pair in some]
                 session, angles = some[-1].session, np.vstack([ends, [pair.q for pair in some]])
                 ends = np.stack([angles.min(axis=0), angles.max(axis=0)])
@@ -371,11 +369,7 @@ class PairStore:
             connection.execute(store_schema.INSERT["devices"], sealed(told))
 
     def go_on_with(self, session: Session) -> None:
-        """Use this session from the next pair on.
-
-        Raises:
-            StoreError: the disk is full or broken.
-        """
+        """Use this session from the next pair on. Raises StoreError: the disk is full or broken."""
         connection = self._require_open()
         self._session = session
         with explained(self.file):

@@ -12,8 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning.changes.adaptation import Origin
-from bodyschema.learning.changes.known_arm import KnownArm
+from bodyschema.learning.changes.known_arm import KnownArm, Origin
 from bodyschema.learning.changes.monitor import DetectedChange, Reference
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.nominal import chain_tolerances

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bodyschema.cli.hardware.driver_snippets import write_snippets
+from bodyschema.cli.terminal.robot_export import write_snippets
 from bodyschema.effects import Effect, Simulation
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.rpy import rotation_of

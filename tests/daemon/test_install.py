@@ -7,8 +7,8 @@ import re
 
 import pytest
 
-from bodyschema.cli.install import udev
-from bodyschema.cli.install.udev import ADAPTERS, FILE, Rules, rules
+from bodyschema.cli.install import machine_files
+from bodyschema.cli.install.machine_files import ADAPTERS, FILE, UdevRules, rules
 from bodyschema.cli.main import command_line
 from bodyschema.interfaces.errors import ConfigError
 
@@ -54,14 +54,14 @@ def test_without_yes_it_asks(tmp_path, monkeypatch, answer, written) -> None:
 def test_rules_that_are_there_are_left_as_they_are(tmp_path, capsys) -> None:
     install("--yes", "--root", tmp_path)
     install("--root", tmp_path)
-    assert "It is there already" in capsys.readouterr().out
+    assert "there already" in capsys.readouterr().out
 
 
 def test_uninstall_removes_the_file(tmp_path, capsys) -> None:
     install("--yes", "--root", tmp_path)
     install("--uninstall", "--yes", "--root", tmp_path)
     assert not (tmp_path / FILE).exists()
-    assert "removed." in capsys.readouterr().out
+    assert "Removed." in capsys.readouterr().out
 
 
 def test_a_dry_run_of_uninstall_removes_nothing(tmp_path) -> None:
@@ -72,12 +72,13 @@ def test_a_dry_run_of_uninstall_removes_nothing(tmp_path) -> None:
 
 def test_udev_takes_the_rules_in_on_this_machine_alone(tmp_path) -> None:
     ran: list[object] = []
-    Rules(tmp_path, ran.append).install()
+    rules_file = UdevRules(tmp_path, ran.append)
+    rules_file.install(rules_file.texts())
     assert ran == []
 
 
 def test_a_file_that_cannot_be_written_names_the_command(tmp_path, monkeypatch) -> None:
     (tmp_path / "etc").write_text("no folder")
-    monkeypatch.setattr(udev.os, "geteuid", lambda: 1000)
+    monkeypatch.setattr(machine_files.os, "geteuid", lambda: 1000)
     with pytest.raises(ConfigError, match=r"sudo .* install udev --yes$"):
-        Rules(tmp_path).install()
+        UdevRules(tmp_path).install(UdevRules(tmp_path).texts())

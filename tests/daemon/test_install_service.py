@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from small_arm import write_small_arm
 
-from bodyschema.cli.install import service_files
-from bodyschema.cli.install.service_files import ServiceFiles, UnitFolder, user_for
+from bodyschema.cli.install import machine_files
+from bodyschema.cli.install.service_files import ServiceFiles, user_for
 from bodyschema.cli.install.units import FOLDER, PROCESSES, Installed, devices_of, hidden, of_robot, template
 from bodyschema.cli.main import command_line
 from bodyschema.daemon.config import Config
@@ -69,7 +69,7 @@ def install(*arguments: object) -> None:
 
 def written(folder: Path, config: Config) -> dict[Path, str]:
     """Install the units of `config` in `folder`, as on a machine."""
-    files = ServiceFiles(config.robot.name, folder=UnitFolder(folder))
+    files = ServiceFiles(config.robot.name, root=folder)
     texts = files.texts(config, "daemon", HERE)
     files.install(texts)
     return texts
@@ -195,7 +195,7 @@ def test_documented_patterns_of_units_end_in_service() -> None:
 
 def test_yes_writes_the_units_and_says_how_to_start_them(tmp_path, robot, capsys) -> None:
     install("--robot", robot, "--user", "daemon", "--yes", "--root", tmp_path)
-    assert len(ServiceFiles("arm", folder=UnitFolder(tmp_path)).installed()) == 4
+    assert len(ServiceFiles("arm", root=tmp_path).installed()) == 4
     enable = "sudo systemctl enable --now bodyschema-sampler@arm.service bodyschema-learner@arm.service"
     assert enable in capsys.readouterr().out
 
@@ -245,13 +245,13 @@ def test_uninstall_leaves_what_other_robots_need(tmp_path, robot, config) -> Non
 def test_a_dry_run_of_uninstall_removes_nothing(tmp_path, robot) -> None:
     install("--robot", robot, "--user", "daemon", "--yes", "--root", tmp_path)
     install("--robot", robot, "--uninstall", "--dry-run", "--root", tmp_path)
-    assert len(ServiceFiles("arm", folder=UnitFolder(tmp_path)).installed()) == 4
+    assert len(ServiceFiles("arm", root=tmp_path).installed()) == 4
 
 
 def test_a_learner_alone_needs_no_hardware(tmp_path) -> None:
     robot = write_small_arm(tmp_path)
     install("--robot", robot, "--only", "learner", "--user", "daemon", "--yes", "--root", tmp_path)
-    assert [path.parent.name for path in ServiceFiles("arm", folder=UnitFolder(tmp_path)).installed()] == [
+    assert [path.parent.name for path in ServiceFiles("arm", root=tmp_path).installed()] == [
         "bodyschema-learner@arm.service.d",
         "system",
     ]
@@ -279,13 +279,13 @@ def test_the_service_is_that_of_who_called_sudo(monkeypatch) -> None:
 
 def test_systemd_is_told_on_this_machine_alone(tmp_path, config) -> None:
     ran: list[object] = []
-    ServiceFiles("arm", folder=UnitFolder(tmp_path, ran.append)).install({})
-    ServiceFiles("arm", folder=UnitFolder(run=ran.append)).install({})
-    assert ran == [["systemctl", "daemon-reload"]]
+    ServiceFiles("arm", root=tmp_path, run=ran.append).install({})
+    ServiceFiles("arm", run=ran.append).install({})
+    assert ran == [("systemctl", "daemon-reload")]
 
 
 def test_a_folder_that_cannot_be_written_names_the_command(tmp_path, config, monkeypatch) -> None:
     (tmp_path / "etc").write_text("no folder")
-    monkeypatch.setattr(service_files.os, "geteuid", lambda: 1000)
+    monkeypatch.setattr(machine_files.os, "geteuid", lambda: 1000)
     with pytest.raises(ConfigError, match=r"sudo .* install service --yes$"):
         written(tmp_path, config)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from bodyschema.cli.commands.options import LeRobotOptions
-from bodyschema.cli.hardware.lerobot_offsets import CorrectedCalibration
+from bodyschema.cli.hardware.lerobot_robot import CorrectedCalibration
 from bodyschema.cli.main import command_line
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.sampler.reconnect import ReconnectingSource

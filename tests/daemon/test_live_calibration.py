@@ -15,9 +15,9 @@ from rich.console import Console
 from shown_board import BOARD, SIZE, KnownCorners, corner_views, known_rig, photographed, shot
 from small_arm import write_small_arm
 
-from bodyschema.cli.cameras.calibration import CheckFile, Wanted, kept_in, of_cameras
-from bodyschema.cli.cameras.live_calibration import LiveCalibration, Shown, checked_live
-from bodyschema.cli.cameras.live_calibration_view import Lines, guidance_on, screen
+from bodyschema.cli.cameras.calibration import CheckFile, calibrated, kept_in
+from bodyschema.cli.cameras.live_calibration import Lines, LiveCalibration, Shown, checked_live, guidance_on, screen
+from bodyschema.cli.commands.calibrate.calibrate_cameras import KnownCameras
 from bodyschema.cli.main import app
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError, SourceEnded, SourceLost
@@ -78,7 +78,7 @@ def held(views: list[View], places: Iterable[int] | None = None) -> tuple[LiveVi
 
 
 def fitted(found: Gathered, serials: tuple[str, str], tell: Callable[[str], None]) -> Calibrated:
-    return of_cameras(Wanted(model="pinhole"))(found, serials, tell)
+    return calibrated(found, KnownCameras(lens="pinhole"), tell, serials)
 
 
 def live(eyes: PluggedEyes, views: LiveViews, made=fitted, show=lambda _: None, **given) -> LiveCalibration:
@@ -98,7 +98,10 @@ def test_it_ends_by_itself_when_nothing_is_missing(views) -> None:
 def test_serials_that_are_given_come_before_those_of_the_cameras(views) -> None:
     seen, frames = held(views)
     found, _ = live(PluggedEyes(frames), seen).run()
-    assert of_cameras(Wanted(("L", ""), "pinhole"))(found, RIGHT, lambda _: None).rig.serials == ("L", "B2")
+    assert calibrated(found, KnownCameras(left_serial="L", lens="pinhole"), lambda _: None, RIGHT).rig.serials == (
+        "L",
+        "B2",
+    )
 
 
 def test_a_refusal_is_shown_and_views_are_taken_on(views) -> None:

@@ -15,8 +15,7 @@ from small_arm import JOINTS, write_small_arm
 from bodyschema.calibration.evaluate import EvaluationError, split_blocks
 from bodyschema.cli.main import app
 from bodyschema.cli.replay.report import AngleFigures, Figures, ReplayReport, as_text
-from bodyschema.cli.replay.run import Job
-from bodyschema.cli.replay.steps import Steps, require_path
+from bodyschema.cli.replay.run import Job, Steps, require_path
 from bodyschema.daemon.config import Config, DaemonConfig
 from bodyschema.interfaces.errors import ConfigError, RecordingError
 from bodyschema.recordings.recording import Recording

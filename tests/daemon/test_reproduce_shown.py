@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from bodyschema.cli.terminal import progress
+from bodyschema.cli.terminal import screen
 from bodyschema.reproduce import Column, Comparison, Curve, Experiment, Panel, Reading, plot
 from bodyschema.reproduce.show import show
 
@@ -45,21 +45,21 @@ def test_a_model_has_a_row_for_each_test_and_a_column_for_each_number_of_pairs()
 
 
 def test_a_long_step_says_how_far_it_is(monkeypatch) -> None:
-    monkeypatch.setattr(progress, "TELL_EVERY_S", 0.0)
+    monkeypatch.setattr(screen, "TELL_EVERY_S", 0.0)
     said: list[str] = []
-    assert list(progress.counted(said.append, "fits", [4, 5])) == [4, 5]
+    assert list(screen.counted(said.append, "fits", [4, 5])) == [4, 5]
     assert said == ["fits", "fits: 0 of 2", "fits: 1 of 2"]
 
 
 def test_a_short_step_says_only_what_it_is() -> None:
     said: list[str] = []
-    assert len(list(progress.counted(said.append, "fits", range(100)))) == 100
+    assert len(list(screen.counted(said.append, "fits", range(100)))) == 100
     assert said == ["fits"]
 
 
 def test_without_a_terminal_each_step_is_a_line() -> None:
     console = Console(file=io.StringIO(), record=True)
-    with progress.shown_on(console, "fig4") as say:
+    with screen.shown_on(console, "fig4") as say:
         say("one")
         say("two")
     assert console.export_text().splitlines() == ["fig4: one", "fig4: two"]
@@ -68,7 +68,7 @@ def test_without_a_terminal_each_step_is_a_line() -> None:
 def test_on_a_terminal_a_step_takes_the_place_of_the_last_one() -> None:
     stream = io.StringIO()
     console = Console(file=stream, force_terminal=True, width=60)
-    with progress.shown_on(console, "fig4") as say:
+    with screen.shown_on(console, "fig4") as say:
         say("one")
         say("x" * 100)
     assert stream.getvalue().count("\n") == 1

@@ -11,8 +11,7 @@ import pytest
 from rich.console import Console
 
 from bodyschema.cli.hardware.bench_run import BenchRun
-from bodyschema.cli.hardware.scan_report import ScanReport, as_json, report_of
-from bodyschema.cli.hardware.scan_view import show
+from bodyschema.cli.hardware.scan_report import ScanReport, as_json, report_of, show
 from bodyschema.cli.main import app
 from bodyschema.daemon.config import Config
 from bodyschema.interfaces.errors import ConfigError

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 from small_arm import write_small_arm
 
+from bodyschema.cli.commands.run.view import shown
 from bodyschema.cli.main import app
-from bodyschema.cli.terminal.view_process import shown
 from bodyschema.interfaces import extras
 from bodyschema.interfaces.errors import ConfigError
 

@@ -13,7 +13,7 @@ from board_renderer import webcams
 from shown_board import known_rig
 from small_arm import write_small_arm
 
-from bodyschema.cli.cameras.mjpeg import MOST_VIEWERS, MjpegServer
+from bodyschema.cli.cameras.watching import MOST_VIEWERS, MjpegServer
 from bodyschema.cli.hardware.robot_template import EXAMPLE, Seen, robot_toml
 from bodyschema.cli.main import app
 from bodyschema.daemon.config import Config

@@ -21,7 +21,7 @@ from kbmaps import (
     SettingError,
     ShapeError,
 )
-from kbmaps.kernel.product_kernel import ProductKernel
+from kbmaps.kernel.kernel_fit import ProductKernel
 
 seeds = st.integers(0, 2**32 - 1)
 kinds = st.text("RP", min_size=1, max_size=4)

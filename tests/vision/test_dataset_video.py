@@ -12,7 +12,7 @@ import pytest
 from ball_renderer import SMALL
 from scenes import Ball, stage
 
-from bodyschema.cli.recordings.dataset_video import markers_in_images, markers_in_video
+from bodyschema.cli.recordings.foreign import markers_in_images, markers_in_video
 from bodyschema.daemon.config import Config
 from bodyschema.interfaces.errors import ConfigError, RecordingError
 from bodyschema.vision.cameras import videos

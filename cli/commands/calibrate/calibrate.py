@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import cyclopts
 from cyclopts import Parameter
 from cyclopts.validators import Number
+from rich.console import Console
 
 from bodyschema.cli.commands.calibrate.calibrate_cameras import cameras
 from bodyschema.cli.commands.calibrate.latency import latency
@@ -22,7 +24,9 @@ from bodyschema.cli.commands.options import (
     flag,
     print_json,
     robot_file,
+    say,
 )
+from bodyschema.interfaces.errors import RequestError
 
 if TYPE_CHECKING:
     from bodyschema.calibration.report import CalibrationReport
@@ -64,8 +68,6 @@ class FitOptions:
 
     def trusted(self) -> Trusted:
         """Return what of the URDF is right."""
-        from bodyschema.interfaces.errors import RequestError
-
         if self.trust_urdf and self.only is not None:
             raise RequestError("--trust-urdf has no offsets to find. Give it, or --only offsets")
         return "urdf" if self.trust_urdf else "nothing" if self.only is None else "links"
@@ -175,8 +177,6 @@ def arm(
     Next: `bodyschema run --robot OUT/robot.toml` starts from what was learnt. With --lerobot the joint offsets go into
     the servos instead, by LeRobot's own calibration file.
     """
-    import sys
-
     from bodyschema.calibration.next_poses import check_target
     from bodyschema.calibration.plausibility.check import plausibility, told_sigma
     from bodyschema.calibration.plausibility.limits import require_units
@@ -213,8 +213,6 @@ def arm(
 
 
 def _require_one_target(servos: LeRobotOptions, out: Path | None) -> None:
-    from bodyschema.interfaces.errors import RequestError
-
     if servos.write and (servos.lerobot is None or out is not None):
         raise RequestError(
             "--write is for --lerobot FILE, and without --out: offsets belong into the servos or into a URDF, not both"
@@ -225,6 +223,7 @@ def _rows(
     config: Config, source: Path, taken: SourceOptions, lerobot: Path | None, between: tuple[int | None, int | None]
 ) -> tuple[Recording, int]:
     """Return the rows to learn, and the number of the first; of a store, those with the present tool."""
+    from bodyschema.cli.recordings.foreign import opened
     from bodyschema.daemon.learner.checkpoint import first_pair
     from bodyschema.recordings import files as recordings
 
@@ -234,7 +233,7 @@ def _rows(
         recording = recordings.of_robot(stored.recording, config.robot.joints, source)
         first = first or first_pair(stored, source.with_name(config.checkpoint_file.name), config.robot.name)
     else:
-        recording = taken.opened(config, source, lerobot)
+        recording = opened(config, source, taken, lerobot)
     first = first or 1
     return recordings.between(recording, first, last, source), first
 
@@ -265,13 +264,8 @@ def _written(config: Config, found: Calibration, report: CalibrationReport, out:
 
 
 def _show(report: CalibrationReport, lines: list[str], written: list[str]) -> None:
-    from rich.console import Console
-
     from bodyschema.cli.terminal.calibration_view import view
     from bodyschema.robot.hand_eye import in_shell_lines
 
-    console = Console(highlight=False)
-    console.print(view(report))
-    in_ros = f"\nIn ROS 2:\n{in_shell_lines(report.hand_eye)}"
-    for line in [*(["", *lines] if lines else []), in_ros, *written]:
-        console.print(line, markup=False, soft_wrap=True)
+    Console(highlight=False).print(view(report))
+    say(*(["", *lines] if lines else []), f"\nIn ROS 2:\n{in_shell_lines(report.hand_eye)}", *written)

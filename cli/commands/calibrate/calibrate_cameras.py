@@ -4,17 +4,31 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
+from rich.console import Console
 
-from bodyschema.cli.commands.board_options import AS_PRINTED, BY_NAME, EyeFiles, EyeImages, PrintedBoard
-from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json
+from bodyschema.cli.commands.options import (
+    AS_PRINTED,
+    BY_NAME,
+    HERE,
+    EyeFiles,
+    EyeImages,
+    PrintedBoard,
+    RobotFile,
+    flag,
+    print_json,
+    say,
+)
+from bodyschema.daemon.service.signals import on_termination
+from bodyschema.interfaces.clock import SystemClock
 
 if TYPE_CHECKING:
-    from bodyschema.cli.cameras.calibration import Board, Calibrated, CheckFile, Gathered, Wanted
+    from bodyschema.cli.cameras.calibration import Board, Calibrated, CheckFile, Gathered
     from bodyschema.daemon.config import Config
 
 CAMERAS, BOARD = Path("cameras.toml"), Path("board.pdf")
@@ -40,13 +54,6 @@ class KnownCameras:
         Parameter(help="Serial number of the left camera, kept in the file; live, it is known.", show_default=False),
     ] = ""
     right_serial: Annotated[str, Parameter(help="Serial number of the right camera.", show_default=False)] = ""
-
-    def wanted(self) -> Wanted:
-        """Return the settings of the calibration."""
-        from bodyschema.cli.cameras.calibration import Wanted
-
-        serials = (self.left_serial, self.right_serial)
-        return Wanted(serials, self.lens, 0.01 * self.scale_sigma_percent, self.baseline_mm)
 
 
 @Parameter(name="*")
@@ -130,20 +137,17 @@ def _calibrate(
     *,
     as_json: bool,
 ) -> None:
-    from rich.console import Console
-
-    from bodyschema.cli.cameras.calibration import figures, write_calibrated_cameras
-    from bodyschema.cli.cameras.calibration_view import cameras_view
+    from bodyschema.cli.cameras.calibration import cameras_view, figures, write_calibrated_cameras
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.wiring.cameras import calibration_file, names_calibration
 
-    board, wanted, named, autofocus = printed.board(), known.wanted(), True, ()
+    board, named, autofocus = printed.board(), True, ()
     if images is not None:
-        found, result = _of_images(images, files, board, wanted)
+        found, result = _of_images(images, files, board, known)
         out = out or CAMERAS
     else:
         config = Config.load(robot)
-        found, result, autofocus = _live(config, board, wanted, save)
+        found, result, autofocus = _live(config, board, known, save)
         out, named = out or calibration_file(config), names_calibration(config)
     report = write_calibrated_cameras(result, found, out)
     measured = printed.ruler_mm is not None or known.baseline_mm is not None
@@ -151,11 +155,10 @@ def _calibrate(
     if as_json:
         print_json(told)
         return
-    console = Console(highlight=False)
-    console.print(cameras_view(told))
-    console.print(f"\n{out} written. Open {report}.", markup=False, soft_wrap=True)
+    Console(highlight=False).print(cameras_view(told))
+    say(f"\n{out} written. Open {report}.")
     if not named:
-        console.print(f'In [vision.cameras] write\ncalibration = "{out.name}"', markup=False, soft_wrap=True)
+        say(f'In [vision.cameras] write\ncalibration = "{out.name}"')
 
 
 def _check(
@@ -167,10 +170,7 @@ def _check(
     *,
     as_json: bool,
 ) -> None:
-    from rich.console import Console
-
-    from bodyschema.cli.cameras.calibration import checked
-    from bodyschema.cli.cameras.calibration_view import check_view
+    from bodyschema.cli.cameras.calibration import check_view, checked
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.wiring.cameras import calibration_file
 
@@ -189,64 +189,52 @@ def _check(
 
 
 def _print_board(made: Board, paper: str, out: Path) -> None:
-    from rich.console import Console
-
     from bodyschema.cli.cameras.calibration import write_board
 
     across, upright = write_board(made, paper, out)
-    Console(highlight=False).print(
+    say(
         f"{out} written: {made.name}. Print it at 100 %, then measure both rulers: {across:g} mm below, {upright:g} mm "
-        "beside the board.",
-        markup=False,
-        soft_wrap=True,
+        "beside the board."
     )
 
 
-def _of_images(images: Path, files: EyeFiles, board: Board, wanted: Wanted) -> tuple[Gathered, Calibrated]:
-    from rich.console import Console
-
+def _of_images(images: Path, files: EyeFiles, board: Board, known: KnownCameras) -> tuple[Gathered, Calibrated]:
     from bodyschema.cli.cameras.calibration import calibrated, from_images
 
-    progress = Console(stderr=True, highlight=False)
-
-    def tell(text: str) -> None:
-        progress.print(text, soft_wrap=True, markup=False)
-
+    tell = partial(say, stderr=True)
     found = from_images(files.of(images), board, tell)
-    return found, calibrated(found, wanted, tell)
+    return found, calibrated(found, known, tell)
 
 
 def _live(
-    config: Config, board: Board, wanted: Wanted, save: Path | None
+    config: Config, board: Board, known: KnownCameras, save: Path | None
 ) -> tuple[Gathered, Calibrated, tuple[str, ...]]:
     """Return the views, their calibration, and what the cameras reported of their focus."""
-    from rich.console import Console
-
-    from bodyschema.cli.cameras.calibration import kept_in, live_views, of_cameras
-    from bodyschema.cli.cameras.live_calibration import LiveCalibration
-    from bodyschema.cli.cameras.live_calibration_view import guidance_on
-    from bodyschema.daemon.service.signals import on_termination
+    from bodyschema.cli.cameras.calibration import calibrated, kept_in, live_views
+    from bodyschema.cli.cameras.live_calibration import LiveCalibration, guidance_on
     from bodyschema.daemon.wiring.cameras import focus_complaints, open_eyes, require_cameras
-    from bodyschema.interfaces.clock import SystemClock
 
     clock = SystemClock()
     eyes = open_eyes(config, clock)
     views = live_views(board, require_cameras(config).eyes)
     with guidance_on(Console(stderr=True, highlight=False), board.name, clock) as show:
-        calibration = LiveCalibration(eyes, views, of_cameras(wanted), show, clock, keep=kept_in(save))
+        calibration = LiveCalibration(
+            eyes,
+            views,
+            lambda found, serials, tell: calibrated(found, known, tell, serials),
+            show,
+            clock,
+            keep=kept_in(save),
+        )
         with on_termination(calibration.stop):
             found, result = calibration.run()
     return found, result, focus_complaints(eyes)
 
 
 def _checked_live(config: Config, file: Path, board: Board, seconds: float) -> tuple[CheckFile, str]:
-    from rich.console import Console
-
     from bodyschema.cli.cameras.calibration import check_figures
-    from bodyschema.cli.cameras.live_calibration import LiveViews, checked_live
-    from bodyschema.cli.cameras.live_calibration_view import guidance_on
+    from bodyschema.cli.cameras.live_calibration import LiveViews, checked_live, guidance_on
     from bodyschema.daemon.wiring.cameras import open_eyes
-    from bodyschema.interfaces.clock import SystemClock
 
     clock = SystemClock()
     with guidance_on(Console(stderr=True, highlight=False), board.name, clock) as show:

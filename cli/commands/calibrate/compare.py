@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
+from rich import box
+from rich.console import Console, Group
+from rich.padding import Padding
+from rich.table import Table
+from rich.text import Text
 
+from bodyschema.calibration.comparison import ComparisonReport, Distances, LeftOut
 from bodyschema.cli.commands.options import flag, print_json
+from bodyschema.cli.terminal.screen import mm
 
 
 def compare(
@@ -29,11 +37,8 @@ def compare(
 
     Next: `bodyschema simulate` with another robot.toml; `bodyschema calibrate`.
     """
-
-    from rich.console import Console
-
     from bodyschema.calibration.comparison import compared
-    from bodyschema.cli.terminal.comparison_view import view
+    from bodyschema.cli.commands.calibrate.compare import view
     from bodyschema.recordings import files as recordings
     from bodyschema.robot.description import RobotDescription
 
@@ -44,3 +49,72 @@ def compare(
         print_json(report)
         return
     Console(highlight=False).print(view(report))
+
+
+def view(report: ComparisonReport) -> Group:
+    """Return a view of what was compared, the figures and the worst rows."""
+    figures = _table("", "mean", "RMS", "median", "max")
+    figures.add_row(Text("distance [mm]"), *_row(report.distances))
+    if report.aligned is not None:
+        figures.add_row(Text("after best rigid alignment [mm]"), *_row(report.aligned.distances))
+    axes = _table(f"{report.second} minus {report.first}", "x", "y", "z")
+    axes.add_row(Text("mean [mm]"), *map(_number, report.axis_mean_mm))
+    axes.add_row(Text("RMS [mm]"), *map(_number, report.axis_rms_mm))
+    worst = _table("worst rows", "row", "[mm]", "x", "y", "z")
+    for row in report.worst:
+        number = f"{row.row}" if row.row == row.other_row else f"{row.row}, {row.other_row}"
+        worst.add_row("", number, _number(row.distance_mm), *map(_number, row.apart_mm))
+    parts = [figures, axes, worst]
+    return Group(*(Text(sentence) for sentence in sentences(report)), *(Padding(part, (1, 0, 0, 0)) for part in parts))
+
+
+def sentences(report: ComparisonReport) -> list[str]:
+    """Return the comparison as sentences, the result first."""
+    distances, left = report.distances, report.left_out
+    said = [
+        f"{report.second} is {mm(distances.mean_mm / 1e3)} from {report.first} on average, "
+        f"{mm(distances.max_mm / 1e3)} at most, over {report.compared} rows of the same joint angles."
+    ]
+    if report.rows != report.other_rows:
+        said.append(
+            f"{report.first} has {report.rows} rows, {report.second} {report.other_rows}: rows of the same joint "
+            "angles were compared."
+        )
+    if left.first or left.second:
+        said.append(_not_compared(report, left))
+    if report.aligned is not None:
+        moved = mm(sum(part**2 for part in report.aligned.shift_mm) ** 0.5 / 1e3)
+        said.append(
+            f"A turn of {report.aligned.turn_deg:.3g}° and a shift of {moved} as a whole leave "
+            f"{mm(report.aligned.distances.mean_mm / 1e3)}."
+        )
+    return said
+
+
+def _not_compared(report: ComparisonReport, left: LeftOut) -> str:
+    parts = [
+        f"{count} of {name} (the first is number {number})"
+        for count, name, number in (
+            (left.first, report.first, left.first_row),
+            (left.second, report.second, left.second_row),
+        )
+        if count
+    ]
+    why = "" if left.joint is None else f" In row {left.first_row} {left.joint} differs by {left.by:.4g} rad or m."
+    return f"Not compared, since the other has no row at their joint angles: {' and '.join(parts)}.{why}"
+
+
+def _table(title: str, *columns: str) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
+    table.add_column(Text(title), overflow="fold")
+    for name in columns:
+        table.add_column(Text(name), justify="right", no_wrap=True)
+    return table
+
+
+def _row(distances: Distances) -> Sequence[str]:
+    return [_number(value) for value in (distances.mean_mm, distances.rms_mm, distances.median_mm, distances.max_mm)]
+
+
+def _number(value_mm: float) -> str:
+    return f"{value_mm:.3f}"

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
+from rich.console import Console
 
 from bodyschema.cli.commands.options import (
     ANYTHING,
@@ -19,11 +21,11 @@ from bodyschema.cli.commands.options import (
     SourceRobotFile,
     flag,
     robot_file,
+    say,
 )
+from bodyschema.interfaces.errors import RequestError
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from bodyschema.cli.terminal.diagnosis_run import Found
 
 
@@ -62,28 +64,22 @@ def diagnose(
     Next: open OUT/report.html; give OUT/extended.toml to any command as --robot, and
     `bodyschema export` turns it into models for MuJoCo, controllers and drivers.
     """
-    import sys
-
-    from rich.console import Console
-
+    from bodyschema.cli.recordings.foreign import opened
     from bodyschema.cli.terminal.diagnosis_run import measured, results_in, run, written
     from bodyschema.daemon.config import Config
-    from bodyschema.interfaces.errors import RequestError
 
     if servos.write and servos.lerobot is None:
         raise RequestError("--write is for --lerobot FILE. Give LeRobot's calibration file")
     config = Config.load(robot_file(robot, recording))
     servos.require(config)
     asked = search.asked()
-    source = measured(config, recording, lambda file: taken.opened(config, file, servos.lerobot), live=live)
-    told = Console(stderr=True, highlight=False)
-    with results_in(out), _progress(told) as tell:
+    source = measured(config, recording, lambda file: opened(config, file, taken, servos.lerobot), live=live)
+    with results_in(out), _progress(Console(stderr=True, highlight=False)) as tell:
         found = run(config, source, asked, tell, force=force)
         if out is not None:
             tell("writing the report")
             written(found, out)
-    for warning in found.warnings:
-        told.print(f"Warning: {warning}", markup=False, soft_wrap=True)
+    say(*(f"Warning: {warning}" for warning in found.warnings), stderr=True)
     lines = servos.lines(config, _joint_offsets(found), recording)
     if as_json:
         sys.stdout.write(found.json + "\n")
@@ -102,20 +98,14 @@ def _joint_offsets(found: Found) -> dict[str, float]:
 
 
 def _show(found: Found, lines: list[str], out: Path | None) -> None:
-    from rich.console import Console
-
     from bodyschema.cli.terminal.diagnosis_view import view
 
-    console = Console(highlight=False)
-    console.print(view(found.file, found.remedies, timed=found.timed))
-    for line in ["", *lines] if lines else []:
-        console.print(line, markup=False, soft_wrap=True)
+    Console(highlight=False).print(view(found.file, found.remedies, timed=found.timed))
+    say(*(["", *lines] if lines else []))
     if out is not None:
-        console.print(
+        say(
             f"\nOpen {out / 'report.html'}. Beside it are diagnosis.json and extended.toml, the simulation with what "
-            f"was found: give it to any command as --robot {out / 'extended.toml'}; robot.toml is unchanged.",
-            markup=False,
-            soft_wrap=True,
+            f"was found: give it to any command as --robot {out / 'extended.toml'}; robot.toml is unchanged."
         )
 
 

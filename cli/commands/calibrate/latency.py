@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
+from rich.console import Console
 
-from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json
+from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json, say
+from bodyschema.interfaces.errors import BodyschemaError, ConfigError
 
 if TYPE_CHECKING:
     from bodyschema.calibration.latency import Wiggle
     from bodyschema.daemon.config import Config
-
-SECONDS = 5.0
 
 
 def latency(
@@ -24,9 +24,7 @@ def latency(
     /,
     *,
     robot: RobotFile = HERE,
-    seconds: Annotated[
-        float, Parameter(help="How long the arm is moved [s].", validator=Number(gte=3, lte=120))
-    ] = SECONDS,
+    seconds: Annotated[float, Parameter(help="How long the arm is moved [s].", validator=Number(gte=3, lte=120))] = 5.0,
     sim: Annotated[bool, flag("The simulated robot in the place of the hardware: to see it done.")] = False,
     save: Annotated[Path | None, Parameter(help="Keep readings and positions in this CSV file.")] = None,
     write: Annotated[bool, flag("Put the latency into robot.toml; without it the change is shown.")] = False,
@@ -43,18 +41,14 @@ def latency(
     Next: the same with --write, which puts latency_s and latency_sigma_s into [vision.cameras], or [marker_source]. The
     old file is kept as robot.toml.before.
     """
-    from rich.console import Console
-
     from bodyschema.calibration.latency import latency_of
     from bodyschema.cli.hardware.wiggling import write_wiggle
     from bodyschema.daemon.config import Config
-    from bodyschema.interfaces.errors import ConfigError
     from bodyschema.robot.toml_text import difference, with_values, write_edited
 
     config = Config.load(robot)
     is_sent = not sim and config.tables.vision.cameras is None and bool(config.tables.marker_source)
     table = "marker_source" if is_sent else "vision.cameras"
-    console = Console(highlight=False, soft_wrap=True)
     wiggle = _wiggle(config, recording, seconds, sim=sim)
     if save is not None:
         write_wiggle(wiggle, config.robot.joints, save)
@@ -63,36 +57,31 @@ def latency(
     if as_json:
         print_json(found)
     else:
-        console.print(
+        say(
             f"{found.fixes} fixes at {found.speed_m_s:.2f} m/s, {1e3 * found.residual_m:.1f} mm from where the angles "
             f"bring the marker: images are taken {1e3 * found.latency_s:.1f} ± {1e3 * found.sigma_s:.1f} ms before "
-            "their time stamps.",
-            markup=False,
+            "their time stamps."
         )
     if sim or (as_json and not write):
         return
     if not as_json:
-        console.print("\n".join(f"{key} = {value}" for key, value in values.items()), markup=False)
+        say(*(f"{key} = {value}" for key, value in values.items()))
     try:
         edited = with_values(config.robot.file, table, values)
     except ConfigError as error:
         if write:
             raise
-        console.print(str(error), markup=False)
+        say(str(error))
         return
     changed = difference(config.robot.file, edited)
     backup = write_edited(config.robot.file, edited) if write else None
     if not as_json:
-        console.print("\n".join(changed), markup=False)
-        console.print(f"Written; the old file is {backup}" if write else "Nothing is written without --write.")
+        say(*changed, f"Written; the old file is {backup}" if write else "Nothing is written without --write.")
 
 
 def _wiggle(config: Config, recording: Path | None, seconds: float, *, sim: bool) -> Wiggle:
-    from rich.console import Console
-
     from bodyschema.cli.hardware.wiggling import collected, read_wiggle
     from bodyschema.daemon.wiring.wiring import open_sources
-    from bodyschema.interfaces.errors import BodyschemaError
 
     if recording is not None and sim:
         raise BodyschemaError("give a recording or --sim, not both")
@@ -103,7 +92,5 @@ def _wiggle(config: Config, recording: Path | None, seconds: float, *, sim: bool
     known_s = 0.0 if sim or seen is None else seen.latency_s
     with open_sources(config, sim=sim) as sources, console.status("move the arm to and fro, unevenly") as status:
         seen = collected(sources, seconds, lambda t: status.update(f"go on moving: {max(seconds - t, 0):.0f} s"))
-    for text in (*seen.health, seen.said):
-        if text:
-            console.print(text, markup=False, soft_wrap=True)
+    say(*filter(None, (*seen.health, seen.said)), stderr=True)
     return seen.wiggle.with_stamps_later(known_s)  # as the camera sent them, before robot.toml's latency was subtracted

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -10,8 +11,9 @@ import cyclopts
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from bodyschema.cli.commands.board_options import BY_NAME, EyeFiles
-from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json
+from bodyschema.cli.commands.options import BY_NAME, HERE, EyeFiles, RobotFile, flag, print_json, say
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import RequestError
 
 if TYPE_CHECKING:
     from bodyschema.cli.cameras.calibration import Images
@@ -75,8 +77,6 @@ def print_tags(
 
     Next: put the printed tables into robot.toml; `bodyschema marker learn` for tags glued by hand.
     """
-    from rich.console import Console
-
     from bodyschema.cli.cameras.tag_pages import Tags, as_printed, face_mm, tables, write_tags
 
     drawn = Tags(shape, ids, family, side_mm, columns, rows, fold_deg)
@@ -86,7 +86,7 @@ def print_tags(
     said = f"{out} written. Print it at 100 %, then measure both rulers: {rulers}."
     if drawn.body is not None:
         said += f" Each face is {face_mm(tags):.1f} mm wide."
-    Console(stderr=True, highlight=False).print(said, markup=False, soft_wrap=True)
+    say(said, stderr=True)
     sys.stdout.write(tables(tags))
 
 
@@ -140,7 +140,6 @@ def learn(
     Next: put the printed tables into robot.toml, a colour in place of `colour = ...`; `bodyschema watch cameras`.
     """
     from bodyschema.daemon.wiring.markers import learnt_colour_table
-    from bodyschema.interfaces.errors import RequestError
 
     if side_mm is not None:
         if auto or at is not None or len(images) != 1:
@@ -161,27 +160,21 @@ def learn(
 
 
 def _measure_cluster(images: Images, calibration: Path, wanted: Wanted, *, as_json: bool) -> None:
-    from rich.console import Console
-
     from bodyschema.daemon.wiring.markers import figures, measured, said, tables
 
-    progress = Console(stderr=True, highlight=False, soft_wrap=True)
-    found = measured(images, calibration, wanted, lambda text: progress.print(text, markup=False))
+    found = measured(images, calibration, wanted, partial(say, stderr=True))
     if as_json:
         print_json(figures(found))
         return
-    progress.print(said(found), markup=False)
+    say(said(found), stderr=True)
     sys.stdout.write(tables(found, wanted))
 
 
 def _learnt_live(robot: Path, seconds: float) -> str:
-    from rich.console import Console
-
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.wiring.cameras import open_eyes
     from bodyschema.daemon.wiring.markers import moving_colour_table
-    from bodyschema.interfaces.clock import SystemClock
 
-    clock, console = SystemClock(), Console(stderr=True, highlight=False, soft_wrap=True)
+    clock = SystemClock()
     eyes = open_eyes(Config.load(robot), clock)
-    return moving_colour_table(eyes, clock, seconds, lambda text: console.print(text, markup=False))
+    return moving_colour_table(eyes, clock, seconds, partial(say, stderr=True))

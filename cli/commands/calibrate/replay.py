@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import signal
 import sys
+import tempfile
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
+from rich.console import Console
 
 from bodyschema.cli.commands.options import (
     AS_THEY_ARE,
@@ -20,11 +23,10 @@ from bodyschema.cli.commands.options import (
     flag,
     robot_file,
 )
+from bodyschema.interfaces.errors import RecordingError
 from bodyschema.interfaces.waits import LINE_EVERY_S
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 
 
@@ -62,24 +64,20 @@ def replay(
 
     Next: `bodyschema run` with the arm.
     """
-    import tempfile
-
-    from rich.console import Console
-
     from bodyschema.calibration.evaluate import split_blocks
     from bodyschema.calibration.plausibility.check import plausibility, told_sigma
     from bodyschema.calibration.plausibility.limits import require_units
+    from bodyschema.cli.recordings.foreign import opened
     from bodyschema.cli.replay.report import as_text
-    from bodyschema.cli.replay.run import Job
+    from bodyschema.cli.replay.run import Job, Steps, require_path
     from bodyschema.cli.replay.run import replay as run_replay
-    from bodyschema.cli.replay.steps import Steps, require_path
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.transport.wire import encode
     from bodyschema.learning.nominal import NominalModel
 
     config = Config.load(robot_file(robot, recording))
     config.require_learnable()
-    rows = taken.opened(config, recording, lerobot)
+    rows = opened(config, recording, taken, lerobot)
     require_units(config.robot, rows, recording)
     split = split_blocks(len(rows), held_out)
     any_step |= config.tables.daemon.any_step
@@ -109,8 +107,6 @@ def _ending_on_sigterm() -> Iterator[None]:
 
 
 def _make_folder(folder: Path) -> None:
-    from bodyschema.interfaces.errors import RecordingError
-
     try:
         folder.mkdir(parents=True)
     except FileExistsError as error:
@@ -126,8 +122,6 @@ def _progress(console: Console) -> Iterator[Callable[[SamplerStatus, LearnerStat
         with console.status("starting sampler and learner") as status:
             yield lambda sampler, learner: status.update(_line(sampler, learner))
         return
-    import time
-
     last = -LINE_EVERY_S
 
     def show(sampler: SamplerStatus, learner: LearnerStatus) -> None:

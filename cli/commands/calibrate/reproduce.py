@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Iterator
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Literal
 
 from cyclopts import Parameter
+from rich.console import Console
 
 from bodyschema.cli.commands.options import flag
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.extras import require_extra
 
 Name = Literal["fig4", "fig5", "fig6", "fig7", "exactness", "all"]
 
@@ -43,12 +48,7 @@ def reproduce(
 
     Next: docs/results/paper.md describes what the paper leaves open, how it was interpreted, and what --json prints.
     """
-    from importlib.metadata import version
-
     import msgspec
-
-    from bodyschema.interfaces.errors import ConfigError
-    from bodyschema.interfaces.extras import require_extra
 
     require_extra("plots", "a figure")
     if seed < 0:
@@ -67,13 +67,10 @@ def reproduce(
 
 def _experiments(name: Name, out: Path, seed: int, *, real: bool, quiet: bool) -> Iterator[dict[str, object]]:
     """Run the experiments and plot each into `out`; yield curves and figures, which are shown unless `quiet`."""
-    import time
-
     import msgspec
     import numpy as np
-    from rich.console import Console
 
-    from bodyschema.cli.terminal.progress import shown_on
+    from bodyschema.cli.terminal.screen import shown_on
     from bodyschema.reproduce import EXPERIMENTS, Run
     from bodyschema.reproduce.plot import plot
     from bodyschema.reproduce.show import show

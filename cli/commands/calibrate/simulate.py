@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
+from rich.console import Console
 
-from bodyschema.cli.commands.options import SourceRobotFile, flag, robot_file
+from bodyschema.cli.commands.options import SourceRobotFile, flag, robot_file, say
 
 
 def simulate(
@@ -32,10 +34,7 @@ def simulate(
 
     Next: `bodyschema compare LIKE OUT`.
     """
-    import sys
-
     import numpy as np
-    from rich.console import Console
 
     from bodyschema.calibration.plausibility.limits import require_units
     from bodyschema.cli.recordings.rerun_scene import scene_for
@@ -52,15 +51,12 @@ def simulate(
     result = simulated(simulation, recording)
     if noise:
         result = with_noise(simulation, result, recording, np.random.default_rng(seed))
-    told = Console(stderr=True, highlight=False, soft_wrap=True)
     for sentence in without_consequence(simulation, recording):
-        told.print(sentence, style="yellow", markup=False)
+        Console(stderr=True, highlight=False, soft_wrap=True).print(sentence, style="yellow", markup=False)
     if out is None:
         result.write_csv_to(sys.stdout)
         return
     recordings.write(result, out, scene=scene_for(out, robot, result))
     count = len(simulation.effects)
     effects = "without effects" if not count else f"with {count} effect{'s' if count > 1 else ''}"
-    Console(highlight=False, soft_wrap=True).print(
-        f"{len(result)} rows of {simulation.robot.name}, {effects}, written to {out}", markup=False
-    )
+    say(f"{len(result)} rows of {simulation.robot.name}, {effects}, written to {out}")

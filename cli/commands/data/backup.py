@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
 
-from bodyschema.cli.commands.options import HERE, VARIABLE, flag, print_json
+from bodyschema.cli.commands.options import HERE, VARIABLE, flag, print_json, say
+from bodyschema.interfaces.clock import SystemClock
 
 
 def backup(
@@ -49,13 +51,8 @@ def backup(
 
 
 def _write(file: Path, robot: Path, state_dir: Path | None, *, force: bool, as_json: bool) -> None:
-    from importlib.metadata import version
-
-    from rich.console import Console
-
     from bodyschema.cli.install.backup import write_backup
     from bodyschema.daemon.config import Config
-    from bodyschema.interfaces.clock import SystemClock
 
     config = Config.load(robot)
     if state_dir is not None:
@@ -68,27 +65,19 @@ def _write(file: Path, robot: Path, state_dir: Path | None, *, force: bool, as_j
         )
         return
     learnt = "" if any(name.endswith(".ckpt") for name in made.files) else ", no checkpoint yet"
-    console = Console(highlight=False, soft_wrap=True)
-    console.print(
-        f"{file}: {made.robot}, {made.pairs} pairs to number {made.last_seq}{learnt}, "
-        f"{file.stat().st_size / 1e6:.1f} MB",
-        markup=False,
-    )
+    size = file.stat().st_size / 1e6
+    say(f"{file}: {made.robot}, {made.pairs} pairs to number {made.last_seq}{learnt}, {size:.1f} MB")
     if made.unreadable:
-        console.print(
+        say(
             f"{made.unreadable} pairs cannot be read and are not in it: the disk changed what was written. Check the "
-            "disk; `bodyschema doctor` lists their numbers",
-            markup=False,
+            "disk; `bodyschema doctor` lists their numbers"
         )
 
 
 def _restore(file: Path, robot: Path, state_dir: Path | None, *, force: bool, as_json: bool) -> None:
-    from rich.console import Console
-
     from bodyschema.cli.install.backup import Backup
     from bodyschema.cli.install.restore import restore
 
-    console = Console(highlight=False, soft_wrap=True)
     with Backup(file) as opened:
         made = opened.manifest
         done = restore(opened, robot, state_dir, force=force)
@@ -96,17 +85,18 @@ def _restore(file: Path, robot: Path, state_dir: Path | None, *, force: bool, as
         aside = {"aside": list(map(str, done.aside)), "elsewhere": {str(a): str(b) for a, b in done.elsewhere.items()}}
         print_json({"robot": made.robot, "pairs": made.pairs, "written": list(map(str, done.written)), **aside})
         return
-    text = f"{made.robot} as it was at {made.written_utc}: {made.pairs} pairs to number {made.last_seq}"
-    console.print(text, markup=False)
+    say(f"{made.robot} as it was at {made.written_utc}: {made.pairs} pairs to number {made.last_seq}")
     if done.unreadable:
-        console.print(f"  {done.unreadable} pairs between could not be read when it was written", markup=False)
-    for written in done.written:
-        console.print(f"  {written}", markup=False)
-    for aside in done.aside:
-        console.print(f"  what was there before is {aside}", markup=False)
-    for origin, target in done.elsewhere.items():
-        console.print(f"  robot.toml names {origin}: put {target} there, or fix robot.toml", markup=False)
-    console.print(
+        say(f"  {done.unreadable} pairs between could not be read when it was written")
+    say(*(f"  {written}" for written in done.written))
+    say(*(f"  what was there before is {aside}" for aside in done.aside))
+    say(
+        *(
+            f"  robot.toml names {origin}: put {target} there, or fix robot.toml"
+            for origin, target in done.elsewhere.items()
+        )
+    )
+    say(
         "A learner on another machine takes the pairs as those of another store: send it `bodyschema command "
         "reset_to_prior`."
     )

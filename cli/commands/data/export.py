@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from cyclopts import Parameter
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
-from bodyschema.cli.commands.options import AS_THEY_ARE, HERE, DatasetCalibration, RobotFile, SourceOptions, flag
-
-if TYPE_CHECKING:
-    from rich.console import Console
+from bodyschema.cli.commands.options import AS_THEY_ARE, HERE, DatasetCalibration, RobotFile, SourceOptions, flag, say
+from bodyschema.interfaces.errors import RequestError
 
 
 def export(
@@ -52,16 +53,13 @@ def export(
 
     Next: `bodyschema replay` on a CSV or Parquet file; `python -m mujoco.viewer --mjcf=OUT` on an MJCF file.
     """
-    from rich.console import Console
-
+    from bodyschema.cli.recordings.foreign import opened
     from bodyschema.cli.recordings.rerun_scene import scene_for
     from bodyschema.daemon.config import Config
-    from bodyschema.interfaces.errors import RequestError
     from bodyschema.recordings import files as recordings
 
-    console = Console(highlight=False, soft_wrap=True)
     if source.suffix.lower() == ".toml":
-        _export_robot(source, out, measured, console, force=force)
+        _export_robot(source, out, measured, force=force)
         return
     if measured is not None:
         raise RequestError("--measured goes with a robot: give an extended.toml in the place of SOURCE")
@@ -69,18 +67,15 @@ def export(
     if source.suffix.lower() in recordings.STORE_ENDINGS:
         recording, devices = recordings.from_store(source), recordings.devices_of(source)
     else:
-        recording, devices = taken.opened(Config.load(robot), source, lerobot), []
+        recording, devices = opened(Config.load(robot), source, taken, lerobot), []
     scene = scene_for(out, robot, recording) if robot.exists() else None
     if scene is None and out.suffix.lower() == recordings.RERUN:
-        console.print(f"Without robot and cameras: there is no {robot}. Give --robot", markup=False)
+        say(f"Without robot and cameras: there is no {robot}. Give --robot")
     recordings.write(recording, out, devices, scene)
-    console.print(f"{len(recording)} pairs written to {out}", markup=False)
+    say(f"{len(recording)} pairs written to {out}")
 
 
-def _export_robot(source: Path, out: Path, measured: Path | None, console: Console, *, force: bool) -> None:
-    from rich.table import Table
-    from rich.text import Text
-
+def _export_robot(source: Path, out: Path, measured: Path | None, *, force: bool) -> None:
     from bodyschema.calibration.plausibility.limits import require_units
     from bodyschema.cli.terminal import robot_export
     from bodyschema.effects import load_simulation
@@ -92,9 +87,8 @@ def _export_robot(source: Path, out: Path, measured: Path | None, console: Conso
     if measured is not None:
         recording = recordings.opened(measured, simulation.robot.joints)
         require_units(simulation.robot, recording, measured)
-    for sentence in robot_export.write(simulation, out):
-        console.print(sentence, markup=False)
-    console.print(f"{simulation.robot.name} {robot_export.effects_of(simulation)} written to {out}", markup=False)
+    say(*robot_export.write(simulation, out))
+    say(f"{simulation.robot.name} {robot_export.effects_of(simulation)} written to {out}")
     if recording is None:
         return
     rows, why_not = robot_export.compared(simulation, recording, out)
@@ -104,6 +98,6 @@ def _export_robot(source: Path, out: Path, measured: Path | None, console: Conso
     for row in rows:
         gain = "" if row.gain_percent is None else f"{row.gain_percent:.1f}"
         table.add_row(row.model, f"{row.rms_mm:.3f}", f"{row.mean_mm:.3f}", gain)
-    console.print(table)
+    Console(highlight=False, soft_wrap=True).print(table)
     if why_not is not None:
-        console.print(why_not, markup=False)
+        say(why_not)

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import sys
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
+from rich.console import Console
+from rich.live import Live
 
-from bodyschema.cli.commands.options import ANYTHING, HERE, VARIABLE, SearchOptions, flag, print_json, several
+from bodyschema.cli.commands.options import ANYTHING, HERE, VARIABLE, SearchOptions, flag, print_json, say, several
+from bodyschema.interfaces.errors import BusError, RequestError
+from bodyschema.interfaces.waits import STATUS_EVERY_S
 
 if TYPE_CHECKING:
     from bodyschema.cli.terminal.diagnosis_run import Asked
@@ -67,8 +73,6 @@ def fleet(
 
     Next: `bodyschema fleet --compare`; `bodyschema status --robot` for one of them; open OUT/NAME/report.html.
     """
-    from bodyschema.interfaces.errors import RequestError
-
     if recordings or folder is not None:
         if connect or compare or watch:
             raise RequestError("recordings do not go with --connect, --compare or --watch")
@@ -89,13 +93,7 @@ def fleet(
 
 
 def _list(looked_at: list[Place], *, watch: bool, json: bool) -> None:
-    import time
-
-    from rich.console import Console
-    from rich.live import Live
-
     from bodyschema.fleet.roster import Fleet, as_json, screen
-    from bodyschema.interfaces.waits import STATUS_EVERY_S
 
     console = Console(highlight=False)
     with Fleet(looked_at) as robots:
@@ -119,11 +117,8 @@ def _list(looked_at: list[Place], *, watch: bool, json: bool) -> None:
 
 
 def _compare(looked_at: list[Place], *, as_json: bool) -> None:
-    from rich.console import Console
-
     from bodyschema.fleet.comparison import compare_types, view
     from bodyschema.fleet.roster import Fleet
-    from bodyschema.interfaces.errors import RequestError
 
     with Fleet(looked_at) as robots:
         members = robots.look()
@@ -147,8 +142,6 @@ def _diagnose(
     *,
     as_json: bool,
 ) -> None:
-    from rich.console import Console
-
     from bodyschema.fleet.diagnosing import diagnose_all
     from bodyschema.fleet.diagnosing import workers as cluster
     from bodyschema.fleet.summary import summary
@@ -163,17 +156,14 @@ def _diagnose(
     if as_json:
         print_json(found)
     else:
-        console = Console(highlight=False)
-        console.print(view(found))
+        Console(highlight=False).print(view(found))
         if out is not None:
-            console.print(f"\nEach report is {out}/NAME/report.html.", markup=False)
+            say(f"\nEach report is {out}/NAME/report.html.")
     if all(row.error is not None for row in found.rows):
         sys.exit(1)
 
 
 def _places(connect: tuple[str, ...], robot: tuple[Path, ...]) -> list[Place]:
-    import os
-
     from bodyschema.fleet.roster import places
 
     described = robot or (() if connect else (Path(os.environ.get(VARIABLE, HERE)),))
@@ -181,8 +171,6 @@ def _places(connect: tuple[str, ...], robot: tuple[Path, ...]) -> list[Place]:
 
 
 def _nobody(places: list[Place]) -> None:
-    from bodyschema.interfaces.errors import BusError
-
     where = ", ".join(str(place.route) for place in places)
     raise BusError(
         f"no robot is alive on {where}. Start one with `bodyschema run`; at a router with TLS, your name needs the "

@@ -8,7 +8,8 @@ from typing import Annotated
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json
+from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json, say
+from bodyschema.daemon.service.signals import SignalFlags, on_termination
 
 
 def record(
@@ -31,24 +32,20 @@ def record(
 
     Next: `bodyschema replay` on a CSV or Parquet file.
     """
-    from rich.console import Console
-
     from bodyschema.cli.recordings.recorder import History, copy_history, follow_history
     from bodyschema.daemon.config import Config
-    from bodyschema.daemon.service.signals import SignalFlags, on_termination
     from bodyschema.daemon.transport.bus import client
     from bodyschema.recordings import files as recordings
 
     recordings.check_target(out, force=force)
     config = Config.load(robot)
-    console = Console(highlight=False, soft_wrap=True)
     with client(config.route("sampler")) as bus:
         history = History(bus, config.robot, from_seq)
         if follow:
             wishes = SignalFlags()
             with on_termination(wishes.end):
                 if not as_json:
-                    console.print(f"writing pairs to {out} as they come; Ctrl-C ends it", markup=False)
+                    say(f"writing pairs to {out} as they come; Ctrl-C ends it")
                 count = follow_history(history, config.robot, out, lambda: wishes.ending)
         else:
             count = copy_history(history, config.robot, out)
@@ -58,12 +55,11 @@ def record(
         )
         return
     last = f", the last has the number {history.next_seq - 1}" if count else "; no file was left"
-    console.print(f"{count} pairs written to {out}{last}", markup=False)
+    say(f"{count} pairs written to {out}{last}")
     if history.missing.count:
         one = history.missing.count == 1
-        console.print(
+        say(
             f"{history.missing.count} pair{'' if one else 's'} between them {'is' if one else 'are'} missing "
             f"(number{'' if one else 's'} {history.missing}): the sampler's disk changed them, or they were deleted "
-            "([daemon] keep_days, keep_mb); `bodyschema status` shows which",
-            markup=False,
+            "([daemon] keep_days, keep_mb); `bodyschema status` shows which"
         )

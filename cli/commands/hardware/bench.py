@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
+from rich.console import Console
 
-from bodyschema.cli.commands.options import HERE, RobotFile, flag, several
+from bodyschema.cli.commands.options import HERE, RobotFile, flag, say, several
+from bodyschema.daemon.service.signals import on_termination
 from bodyschema.interfaces.waits import POLL_S
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from bodyschema.cli.hardware.bench_run import BenchRun
 
 PORT = Path("bus")
@@ -45,22 +45,17 @@ def bench(
 
     Next: in another terminal `bodyschema scan`, `doctor` or `watch joints`, each with --robot PORT.toml.
     """
-    from rich.console import Console
-
     from bodyschema.cli.hardware.bench_run import FAULTS, BenchRun
     from bodyschema.daemon.config import Config
-    from bodyschema.daemon.service.signals import on_termination
 
     console = Console(highlight=False, soft_wrap=True)
     if list_faults:
-        for kind, meaning in FAULTS.items():
-            console.print(f"{kind:12} {meaning}", markup=False)
+        say(*(f"{kind:12} {meaning}" for kind, meaning in FAULTS.items()))
         return
     config = Config.load(robot)
     run = BenchRun(config, port, faults=fault, return_delay_s=return_delay_us * 1e-6, seed=seed)
     with on_termination(run.stop), _made(run, console) as opened:
-        for line in opened.introduction():
-            console.print(line, markup=False)
+        say(*opened.introduction())
         _look_on(opened, console)
 
 

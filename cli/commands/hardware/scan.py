@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
+from rich.console import Console
 
 from bodyschema.cli.commands.options import flag, several
+from bodyschema.interfaces.errors import ConfigError
 
 
 def scan(
@@ -32,14 +34,10 @@ def scan(
 
     Next: `bodyschema init --urdf YOUR.urdf --from scan`; `bodyschema doctor`.
     """
-    from rich.console import Console
-
-    from bodyschema.cli.hardware.scan_report import as_json, report_of
-    from bodyschema.cli.hardware.scan_view import show
-    from bodyschema.cli.terminal.progress import shown_on
+    from bodyschema.cli.hardware.scan_report import as_json, report_of, show
+    from bodyschema.cli.terminal.screen import shown_on
     from bodyschema.daemon.wiring import servos as servo_wiring
     from bodyschema.daemon.wiring import wiring
-    from bodyschema.interfaces.errors import ConfigError
 
     unknown = [rate for rate in baud if rate not in servo_wiring.scanned_bauds()]
     if unknown:

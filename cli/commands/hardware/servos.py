@@ -8,13 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
+from rich.console import Console
+from rich.prompt import Confirm
 
-from bodyschema.cli.commands.options import HERE, RobotFile, flag, several
+from bodyschema.cli.commands.options import HERE, RobotFile, flag, say, several
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import ConfigError, RequestError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-
-    from rich.console import Console
 
     from bodyschema.cli.servos.changes import Planned
     from bodyschema.cli.servos.log import ServoLog
@@ -64,7 +66,6 @@ def servos(
     Next: the changes to robot.toml that it prints; `bodyschema watch joints` shows the angles.
     """
     from bodyschema.cli.servos.changes import assignments
-    from bodyschema.interfaces.errors import ConfigError, RequestError
 
     if bool(settings) + zero + undo > 1:
         raise RequestError("give NAME=VALUE, --zero or --undo, one of them")
@@ -87,9 +88,7 @@ def servos(
 
 
 def _show(wanted: Sequence[Wanted], *, as_json: bool) -> None:
-    from rich.console import Console
-
-    from bodyschema.cli.servos.changes_view import settings_json, settings_table
+    from bodyschema.cli.servos.changes import settings_json, settings_table
     from bodyschema.daemon.wiring.eeprom import settings_by_name
 
     found = []
@@ -115,11 +114,7 @@ def _set(
 
 
 def _zero(robot: Path, joint: tuple[str, ...], *, in_servo: bool, dry_run: bool, yes: bool) -> None:
-    from rich.console import Console
-
-    from bodyschema.cli.servos.changes import plan_zeros, zero_ticks
-    from bodyschema.cli.servos.changes_view import zero_lines
-    from bodyschema.interfaces.errors import ConfigError
+    from bodyschema.cli.servos.changes import plan_zeros, zero_lines, zero_ticks
 
     if not joint:
         raise ConfigError("no joint is named", remedy="Name it with --joint")
@@ -128,18 +123,13 @@ def _zero(robot: Path, joint: tuple[str, ...], *, in_servo: bool, dry_run: bool,
         if in_servo:
             _carry_out(workbench, plan_zeros(workbench, wanted), _log(robot, None), dry_run=dry_run, yes=yes)
             return
-        console = Console(highlight=False, soft_wrap=True)
-        for line in zero_lines(zero_ticks(workbench, wanted)):
-            console.print(line, markup=False)
-        console.print(f"Put it into the entry of the joint in {robot}. Nothing was written.", markup=False)
+        say(*zero_lines(zero_ticks(workbench, wanted)))
+        say(f"Put it into the entry of the joint in {robot}. Nothing was written.")
 
 
 def _undo(robot: Path, port: str | None, *, dry_run: bool, yes: bool) -> None:
-    from rich.console import Console
-
     from bodyschema.cli.servos.changes import plan_undo
     from bodyschema.daemon.wiring.eeprom import workbench_of
-    from bodyschema.interfaces.errors import ConfigError
 
     log = _log(robot, port)
     entries = log.to_undo()
@@ -149,9 +139,7 @@ def _undo(robot: Path, port: str | None, *, dry_run: bool, yes: bool) -> None:
         )
     with workbench_of(entries[0].table) as workbench:
         planned, left = plan_undo(workbench, entries)
-        console = Console(highlight=False, soft_wrap=True)
-        for line in left:
-            console.print(f"left alone: {line}", markup=False)
+        say(*(f"left alone: {line}" for line in left))
         _carry_out(workbench, planned, log, dry_run=dry_run, yes=yes, undoes=entries[0].batch)
 
 
@@ -160,7 +148,6 @@ def _wanted(
 ) -> list[Wanted]:
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.wiring.eeprom import configured, stranger
-    from bodyschema.interfaces.errors import ConfigError
 
     if (port is None) != (id is None):
         raise ConfigError("--port and --id belong together", remedy="Give both, or --joint for a servo of robot.toml")
@@ -194,33 +181,20 @@ def _carry_out(
     yes: bool,
     undoes: int | None = None,
 ) -> None:
-    from rich.console import Console
-
-    from bodyschema.cli.servos.changes import carry_out, is_well
-    from bodyschema.cli.servos.changes_view import done_table, planned_table
-    from bodyschema.interfaces.clock import SystemClock
+    from bodyschema.cli.servos.changes import carry_out, done_table, is_well, planned_table
 
     console = Console(highlight=False)
     if planned:
         console.print(planned_table(planned))
     if not any(each.is_needed for each in planned):
-        console.print("Nothing is to be written.")
+        say("Nothing is to be written.")
         return
-    if dry_run:
-        console.print("Nothing was written, and torque is as it was.")
-        return
-    if not yes and not _agreed(console):
-        console.print("Nothing was written, and torque is as it was.")
+    asked = "Write it? Torque is switched off first: hold the arm"
+    if dry_run or not (yes or Confirm.ask(asked, console=console, default=False)):
+        say("Nothing was written, and torque is as it was.")
         return
     done = carry_out(workbench, planned, log, SystemClock(), undoes=undoes)
     console.print(done_table(done))
-    console.print(f"Kept in {log.file}.", markup=False, soft_wrap=True)
+    say(f"Kept in {log.file}.")
     if not is_well(done):
         sys.exit(1)
-
-
-def _agreed(console: Console) -> bool:
-    from rich.prompt import Confirm
-
-    asked = "Write it? Torque is switched off first: hold the arm"
-    return Confirm.ask(asked, console=console, default=False)

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import sys
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
+from rich.console import Console
+from rich.live import Live
 
-from bodyschema.cli.commands.options import HERE, RobotFile, flag
+from bodyschema.cli.commands.options import HERE, RobotFile, flag, say
+from bodyschema.daemon.service.signals import SignalFlags, on_termination
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.waits import LINE_EVERY_S, POLL_S, STATUS_EVERY_S
 
 if TYPE_CHECKING:
@@ -81,25 +87,20 @@ def watch(
 
 
 def _joints(robot: Path, *, once: bool, json: bool, zero_force: bool) -> None:
-    from rich.console import Console
-    from rich.live import Live
-
     from bodyschema.cli.hardware.joints_watch import JointsWatch, as_json, screen
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.sampler.powered import find_powered
-    from bodyschema.daemon.service.signals import on_termination
     from bodyschema.daemon.wiring.wiring import open_joints
-    from bodyschema.interfaces.clock import SystemClock
     from bodyschema.interfaces.servos import ServoJoints
 
     clock = SystemClock()
     config = Config.load(robot)
     console = Console(highlight=False)
-    ending = _Ending()
+    flags = SignalFlags()
     source = open_joints(config, clock)
     drives = source.drives if isinstance(source, ServoJoints) else ()
     force = find_powered(drives, "zero_force", config.file) if zero_force else None
-    with on_termination(ending.end), JointsWatch(config, source, clock) as watch:
+    with on_termination(flags.end), JointsWatch(config, source, clock) as watch:
         seen = _first(watch)
         if force is not None:
             _begin(watch, force)
@@ -107,59 +108,43 @@ def _joints(robot: Path, *, once: bool, json: bool, zero_force: bool) -> None:
             console.file.write(as_json(seen) + "\n") if json else console.print(screen(seen))
         elif json or not console.is_terminal:
             _follow(
-                watch, ending, PRINT_EVERY_S, lambda now: _line(as_json(now)) if json else console.print(screen(now))
+                watch, flags, PRINT_EVERY_S, lambda now: _line(as_json(now)) if json else console.print(screen(now))
             )
         else:
             with Live(screen(seen), console=console, auto_refresh=False, screen=True) as live:
-                _follow(watch, ending, POLL_S, lambda now: live.update(screen(now), refresh=True))
+                _follow(watch, flags, POLL_S, lambda now: live.update(screen(now), refresh=True))
 
 
 def _cameras(robot: Path, out: Path | None, port: int, every: float, count: int | None) -> None:
-    from contextlib import ExitStack
-
-    from rich.console import Console
-
-    from bodyschema.cli.cameras.mjpeg import MjpegServer
-    from bodyschema.cli.cameras.watching import Watching
+    from bodyschema.cli.cameras.watching import MjpegServer, Watching
     from bodyschema.daemon.config import Config
-    from bodyschema.daemon.service.signals import on_termination
     from bodyschema.daemon.wiring.cameras import open_watched
 
-    console = Console(highlight=False, soft_wrap=True)
     watched = open_watched(Config.load(robot))
     with ExitStack() as stack:
         if out is None:
             server = stack.enter_context(MjpegServer(port))
             watching = Watching(watched.camera, server.show, count=count)
-            console.print(f"look at {server.address}")
+            say(f"look at {server.address}")
         else:
             watching = Watching.into(out, watched.camera, every_s=every, count=count)
         if not watched.is_calibrated:
-            console.print("nothing says how the cameras see: the images as they come. `bodyschema calibrate cameras`")
+            say("nothing says how the cameras see: the images as they come. `bodyschema calibrate cameras`")
         stack.enter_context(watched.camera)
         stack.enter_context(on_termination(watching.stop))
         tell_at = time.monotonic() + LINE_EVERY_S
         while watching.step(READ_S):
             if time.monotonic() >= tell_at:
                 tell_at = time.monotonic() + LINE_EVERY_S
-                for line in (watching.said, *watched.eyes.health):
-                    console.print(line, markup=False)
-    for line in (watching.said, *watched.eyes.health):
-        console.print(line, markup=False)
+                say(watching.said, *watched.eyes.health)
+    say(watching.said, *watched.eyes.health)
 
 
 def _marker(robot: Path, seconds: float | None) -> None:
-    from contextlib import ExitStack
-
-    from rich.console import Console
-
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.marker_watch import MarkerWatch
-    from bodyschema.daemon.service.signals import on_termination
     from bodyschema.daemon.wiring.wiring import open_streams
-    from bodyschema.interfaces.clock import SystemClock
 
-    console = Console(highlight=False, soft_wrap=True)
     clock = SystemClock()
     with ExitStack() as stack:
         watches = [
@@ -167,27 +152,16 @@ def _marker(robot: Path, seconds: float | None) -> None:
         ]
         for each in watches:
             stack.enter_context(each)
-        stopping: list[bool] = []
-        stack.enter_context(on_termination(lambda: stopping.append(True)))
+        flags = SignalFlags()
+        stack.enter_context(on_termination(flags.end))
         end = clock.now() + (float("inf") if seconds is None else seconds)
-        while not stopping and clock.now() < end:
+        while not flags.ending and clock.now() < end:
             tell_at = min(clock.now() + STATUS_EVERY_S, end)
-            while clock.now() < tell_at and not stopping:
+            while clock.now() < tell_at and not flags.ending:
                 for each in watches:
                     each.read(READ_S / 10)
             for each in watches:
-                for line in each.lines():
-                    console.print(line, markup=False)
-
-
-class _Ending:
-    """Flag for a requested end."""
-
-    def __init__(self) -> None:
-        self.asked = False
-
-    def end(self) -> None:
-        self.asked = True
+                say(*each.lines())
 
 
 def _line(text: str) -> None:
@@ -197,8 +171,6 @@ def _line(text: str) -> None:
 
 def _first(watch: JointsWatch) -> Seen:
     """Return the first complete state. SourceError if there is none in time."""
-    from bodyschema.interfaces.errors import SourceError
-
     end = time.monotonic() + FIRST_READING_S
     while time.monotonic() < end:
         if watch.look() is not None:
@@ -217,9 +189,9 @@ def _begin(watch: JointsWatch, force: Powered) -> None:
     sys.stderr.write(answer.result() + "\n")
 
 
-def _follow(watch: JointsWatch, ending: _Ending, every_s: float, show: Callable[[Seen], None]) -> None:
+def _follow(watch: JointsWatch, flags: SignalFlags, every_s: float, show: Callable[[Seen], None]) -> None:
     shown_at = 0.0
-    while not ending.asked:
+    while not flags.ending:
         seen = watch.look()
         if seen is not None and time.monotonic() - shown_at >= every_s:
             shown_at = time.monotonic()

@@ -6,8 +6,9 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 
-from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json
+from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json, say
 from bodyschema.daemon.transport.keys import BOTHS, SAMPLERS, CommandName
+from bodyschema.interfaces.errors import RequestError
 
 Process = Literal["sampler", "learner"]
 
@@ -36,13 +37,10 @@ def command(
 
     Next: `bodyschema status`.
     """
-    from rich.console import Console
-
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.transport.bus import client
     from bodyschema.daemon.transport.keys import Keys
     from bodyschema.daemon.transport.wire import CommandReply, CommandRequest, decode, encode
-    from bodyschema.interfaces.errors import RequestError
 
     process: Process = to or ("sampler" if name in SAMPLERS else "learner")
     if process == "sampler" and name not in SAMPLERS:
@@ -56,4 +54,4 @@ def command(
     if as_json:
         print_json(done)
         return
-    Console(highlight=False, soft_wrap=True).print(f"{process}: {done.message}", markup=False)
+    say(f"{process}: {done.message}")

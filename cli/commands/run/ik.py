@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
 from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json
+from bodyschema.interfaces.errors import RequestError
 
 if TYPE_CHECKING:
     from bodyschema.daemon.client_config import ClientConfig
@@ -42,13 +47,10 @@ def ik(
 
     Next: the same from your own program, starting at your arm's current angles: docs/zenoh.md.
     """
-    import math
-
     from bodyschema.daemon.client_config import ClientConfig
     from bodyschema.daemon.transport.bus import client
     from bodyschema.daemon.transport.keys import Keys
     from bodyschema.daemon.transport.wire import IkReply, IkRequest, decode, encode
-    from bodyschema.interfaces.errors import RequestError
 
     config = ClientConfig.load(robot)
     if not all(map(math.isfinite, (x, y, z))):
@@ -64,12 +66,6 @@ def ik(
 
 
 def _show(reply: IkReply, config: ClientConfig, deg: bool) -> None:
-    import math
-
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
     from bodyschema.cli.terminal.screen import two_digits
 
     table = Table(box=None, pad_edge=False, header_style="bold", show_header=False)

@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
+from rich.prompt import Confirm
 
-from bodyschema.cli.commands.options import HERE, VARIABLE, flag, several
+from bodyschema.cli.commands.options import HERE, VARIABLE, flag, say, several
+from bodyschema.interfaces.errors import ConfigError
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
-    from bodyschema.cli.install.service_files import UnitFiles
-    from bodyschema.cli.install.udev import Rules
+    from bodyschema.cli.install.machine_files import MachineFiles
 
 Root = Annotated[Path, Parameter(help="Of the file system, for images of other machines.")]
 
@@ -62,37 +61,17 @@ def install(
     docs/operation.md describes logs, upgrades and backups.
     """
     if what == "udev":
-        _udev(root, uninstall=uninstall, yes=yes, dry_run=dry_run)
+        from bodyschema.cli.install.machine_files import UdevRules
+
+        rules = UdevRules(root)
+        if uninstall:
+            _remove(rules, yes=yes, dry_run=dry_run)
+        else:
+            _written(rules, rules.texts(), yes=yes, dry_run=dry_run)
     elif what == "router":
         _router(file, user, root, uninstall=uninstall, yes=yes, dry_run=dry_run)
     else:
         _service(robot, user, only, name, root, uninstall=uninstall, yes=yes, dry_run=dry_run)
-
-
-def _udev(root: Path, *, uninstall: bool, yes: bool, dry_run: bool) -> None:
-    from rich.console import Console
-    from rich.prompt import Confirm
-
-    from bodyschema.cli.install.udev import Rules, rules
-
-    console = Console(highlight=False, soft_wrap=True)
-    of_machine = Rules(root)
-    if uninstall:
-        _uninstall(console, of_machine, yes=yes, dry_run=dry_run)
-        return
-    console.print(f"{of_machine.file}:", markup=False)
-    console.print(rules(), markup=False)
-    if of_machine.is_current:
-        console.print("It is there already, as above.")
-        return
-    if dry_run:
-        console.print("Nothing was changed.")
-        return
-    if not yes and not Confirm.ask("Write it?", console=console, default=False):
-        console.print("Nothing was changed.")
-        return
-    of_machine.install()
-    console.print("Written. Plug the adapter in again; `bodyschema doctor` checks it.")
 
 
 def _service(
@@ -106,32 +85,25 @@ def _service(
     yes: bool,
     dry_run: bool,
 ) -> None:
-    from bodyschema.cli.install.service_files import (
-        ServiceFiles,
-        UnitFolder,
-        make_state_folders,
-        systemd_version,
-        user_for,
-    )
+    from bodyschema.cli.install.service_files import ServiceFiles, make_state_folders, systemd_version, user_for
     from bodyschema.cli.install.units import PROCESSES, Installed
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.learner.host import session_settings
     from bodyschema.daemon.wiring.wiring import check_sources
     from bodyschema.fleet.hosting import configs_of, descriptions
-    from bodyschema.interfaces.errors import ConfigError
 
-    files, folder = descriptions(robot or (Path(os.environ.get(VARIABLE, HERE)),)), UnitFolder(root)
+    files = descriptions(robot or (Path(os.environ.get(VARIABLE, HERE)),))
     several_robots = len(files) > 1
     if several_robots and only == "sampler":
         raise ConfigError(
             "each robot has a sampler of its own", remedy="Install them one by one, each with its --robot"
         )
     if several_robots:
-        units = ServiceFiles(name, ("learner",), folder)
+        units = ServiceFiles(name, ("learner",), root)
     else:
-        units = ServiceFiles(Config.load(files[0]).robot.name, PROCESSES if only is None else (only,), folder)
+        units = ServiceFiles(Config.load(files[0]).robot.name, PROCESSES if only is None else (only,), root)
     if uninstall:
-        _uninstall_units(units, "Removed. Pairs and checkpoints are where they were.", yes=yes, dry_run=dry_run)
+        _remove(units, yes=yes, dry_run=dry_run)
         return
     installed = Installed.here(systemd_version())
     if several_robots:
@@ -145,71 +117,50 @@ def _service(
         if only != "sampler":
             config.require_learnable()
         texts = units.texts(config, user_for(user), installed)
-    if _install_units(units, texts, yes=yes, dry_run=dry_run):
+    if _written(units, texts, yes=yes, dry_run=dry_run):
         make_state_folders(configs, user_for(user), root)
 
 
 def _router(file: Path, user: str | None, root: Path, *, uninstall: bool, yes: bool, dry_run: bool) -> None:
     from bodyschema.cli.install.router import RouterConfig
-    from bodyschema.cli.install.service_files import RouterFiles, UnitFolder, systemd_version, user_for
+    from bodyschema.cli.install.service_files import RouterFiles, systemd_version, user_for
     from bodyschema.cli.install.units import Installed
 
-    units = RouterFiles(UnitFolder(root))
+    units = RouterFiles(root)
     if uninstall:
-        _uninstall_units(units, "Removed. router.toml and keys are where they were.", yes=yes, dry_run=dry_run)
+        _remove(units, yes=yes, dry_run=dry_run)
         return
     texts = units.texts(RouterConfig.load(file), user_for(user), Installed.here(systemd_version()))
-    _install_units(units, texts, yes=yes, dry_run=dry_run)
+    _written(units, texts, yes=yes, dry_run=dry_run)
 
 
-def _install_units(units: UnitFiles, texts: dict[Path, str], *, yes: bool, dry_run: bool) -> bool:
-    """Return True if they are installed now."""
-    from rich.console import Console
-    from rich.prompt import Confirm
+def _written(files: MachineFiles, texts: dict[Path, str], *, yes: bool, dry_run: bool) -> bool:
+    """Show the files, and write them if that is confirmed; return True if they are installed now."""
+    from bodyschema.cli.install.machine_files import missing
 
-    from bodyschema.cli.install.service_files import missing
-
-    console = Console(highlight=False, soft_wrap=True)
     changes = missing(texts)
     for file, text in texts.items():
-        console.print(f"{file}:{'' if file in changes else ' (there already)'}\n\n{text}", markup=False)
+        say(f"{file}:{'' if file in changes else ' (there already)'}\n\n{text}")
     if not changes:
-        console.print("All of it is there already, as above.")
+        say("All of it is there already, as above.")
         return not dry_run
-    if dry_run or not (yes or Confirm.ask("Write it?", console=console, default=False)):
-        console.print("Nothing was changed.")
+    if dry_run or not (yes or Confirm.ask("Write it?", default=False)):
+        say("Nothing was changed.")
         return False
-    units.install(changes)
-    console.print(f"Written. Start it, now and at every boot: sudo systemctl enable --now {' '.join(units.units)}")
+    files.install(changes)
+    say(f"Written. {files.is_used}")
     return True
 
 
-def _uninstall_units(units: UnitFiles, removed: str, *, yes: bool, dry_run: bool) -> None:
-    from rich.console import Console
-    from rich.prompt import Confirm
-
-    console = Console(highlight=False, soft_wrap=True)
-    there = "\n".join(map(str, units.installed()))
+def _remove(files: MachineFiles, *, yes: bool, dry_run: bool) -> None:
+    """Show the files and what runs by them, and remove them if that is confirmed."""
+    there = files.installed()
     if not there:
-        console.print(f"There is no {' '.join(units.units)}. Nothing was changed.", markup=False)
+        say(f"`bodyschema install {files.kind}` has installed nothing here. Nothing was changed.")
         return
-    console.print(f"To be stopped: {' '.join(units.units)}\nTo be removed:\n{there}", markup=False)
-    if dry_run or not (yes or Confirm.ask("Go on?", console=console, default=False)):
-        console.print("Nothing was changed.")
+    say(*files.before_removal, "To be removed:", *map(str, there))
+    if dry_run or not (yes or Confirm.ask("Go on?", default=False)):
+        say("Nothing was changed.")
         return
-    units.uninstall()
-    console.print(removed)
-
-
-def _uninstall(console: Console, of_machine: Rules, *, yes: bool, dry_run: bool) -> None:
-    from rich.prompt import Confirm
-
-    if dry_run:
-        there = "would be removed" if of_machine.file.exists() else "is not there"
-        console.print(f"{of_machine.file} {there}. Nothing was changed.", markup=False)
-        return
-    if not yes and not Confirm.ask(f"Remove {of_machine.file}?", console=console, default=False):
-        console.print("Nothing was changed.")
-        return
-    removed = of_machine.uninstall()
-    console.print(f"{of_machine.file} {'removed' if removed else 'was not there'}.", markup=False)
+    files.uninstall()
+    say(f"Removed. {files.stays}".rstrip())

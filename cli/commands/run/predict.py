@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
 from bodyschema.cli.commands.options import HERE, RobotFile, flag, print_json
+from bodyschema.interfaces.errors import RequestError
 
 if TYPE_CHECKING:
     from bodyschema.daemon.client_config import ClientConfig
@@ -59,7 +64,6 @@ def predict(
 def _show_notes(config: ClientConfig, rows: list[list[float]], deg: bool) -> None:
     """Print remarks on joint values [rad, m] that the arm cannot have."""
     import numpy as np
-    from rich.console import Console
 
     from bodyschema.daemon.config import Config
 
@@ -87,10 +91,7 @@ def _notes(config: Config, q: FloatArray, deg: bool) -> Iterator[str]:
 
 def _rows(values: tuple[float, ...], config: ClientConfig, deg: bool) -> list[list[float]]:
     """Return the vectors of joint values [rad, m]. RequestError if the input is none."""
-    import math
-
     from bodyschema.daemon.transport.wire import JointsRequest, joint_angles, joint_rows
-    from bodyschema.interfaces.errors import RequestError
 
     if values:
         request = JointsRequest(list(values))
@@ -109,7 +110,6 @@ def _rows(values: tuple[float, ...], config: ClientConfig, deg: bool) -> list[li
 
 def _from_standard_input(config: ClientConfig) -> JointsRequest:
     from bodyschema.daemon.transport.wire import JointsRequest, decode
-    from bodyschema.interfaces.errors import RequestError
 
     text = sys.stdin.buffer.read()
     names = ", ".join(config.joints)
@@ -123,10 +123,6 @@ def _from_standard_input(config: ClientConfig) -> JointsRequest:
 
 
 def _show(reply: PredictReply) -> None:
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
     from bodyschema.cli.terminal.screen import two_digits
 
     table = Table(box=None, pad_edge=False, header_style="bold")

@@ -8,6 +8,8 @@ from typing import Annotated
 from cyclopts import Parameter
 
 from bodyschema.cli.commands.options import flag
+from bodyschema.daemon.service.signals import SignalFlags, on_termination
+from bodyschema.interfaces.clock import SystemClock
 
 
 def router(
@@ -29,8 +31,6 @@ def router(
     from bodyschema.cli.install.router import RouterConfig, run_router
     from bodyschema.daemon.service import logs
     from bodyschema.daemon.service.notify import Notifier
-    from bodyschema.daemon.service.signals import SignalFlags, on_termination
-    from bodyschema.interfaces.clock import SystemClock
 
     config = RouterConfig.load(file)
     if zenohd:

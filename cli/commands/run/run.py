@@ -11,6 +11,11 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from bodyschema.cli.commands.options import HERE, VARIABLE, flag, several
+from bodyschema.daemon.service.signals import SignalFlags, on_termination
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import RequestError
+from bodyschema.interfaces.extras import require_extra
+from bodyschema.interfaces.interpreter import module_command
 
 
 def run(
@@ -50,8 +55,6 @@ def run(
     Next: in another terminal, `bodyschema status --watch`, `bodyschema view` and `bodyschema predict`.
     """
     from bodyschema.daemon.service import logs
-    from bodyschema.interfaces.errors import RequestError
-    from bodyschema.interfaces.extras import require_extra
 
     misplaced = {
         "--sim": sim and process == "learner",
@@ -75,12 +78,10 @@ def run(
 
 
 def _both(robot: Path, state_dir: Path | None, *, sim: bool, view: bool, verbose: bool) -> None:
-    from bodyschema.cli.terminal.view_process import shown
+    from bodyschema.cli.commands.run.view import shown
     from bodyschema.daemon.config import Config
-    from bodyschema.daemon.service.signals import on_termination
     from bodyschema.daemon.service.supervise import Child, Supervisor
     from bodyschema.daemon.wiring.wiring import check_sources
-    from bodyschema.interfaces.interpreter import module_command
 
     config = Config.load(robot)
     config.require_learnable()
@@ -101,10 +102,8 @@ def _sampler(robot: Path, state_dir: Path | None, *, sim: bool, exit_at_end: boo
     from bodyschema.daemon.sampler.sampler import LOOPS, Sampler
     from bodyschema.daemon.service.notify import Notifier
     from bodyschema.daemon.service.service import Service
-    from bodyschema.daemon.service.signals import on_termination
     from bodyschema.daemon.transport.bus import ZenohSession
     from bodyschema.daemon.wiring.wiring import open_sources
-    from bodyschema.interfaces.clock import SystemClock
     from bodyschema.recordings.store.store import PairStore
 
     notifier = Notifier.of_environment()
@@ -124,12 +123,10 @@ def _sampler(robot: Path, state_dir: Path | None, *, sim: bool, exit_at_end: boo
 
 
 def _learner(robots: tuple[Path, ...], state_dir: Path | None, processes: int, *, view: bool, verbose: bool) -> None:
-    from bodyschema.cli.terminal.view_process import shown
+    from bodyschema.cli.commands.run.view import shown
     from bodyschema.daemon.learner.host import run_learners
     from bodyschema.daemon.service.notify import Notifier
-    from bodyschema.daemon.service.signals import SignalFlags, on_termination
     from bodyschema.fleet.hosting import configs_of, descriptions, spread
-    from bodyschema.interfaces.clock import SystemClock
 
     files = descriptions(robots)
     configs = configs_of(files, state_dir)

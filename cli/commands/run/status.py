@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 from typing import Annotated
 
+from rich.console import Console
+
 from bodyschema.cli.commands.options import HERE, RobotFile, flag
 
 
@@ -22,8 +24,6 @@ def status(
 
     Next: `bodyschema command` to pause, or to report a tool change; `bodyschema predict`.
     """
-    from rich.console import Console
-
     from bodyschema.cli.terminal.status_view import Watcher, as_json, screen
     from bodyschema.daemon.client_config import ClientConfig
 

@@ -2,13 +2,47 @@
 
 from __future__ import annotations
 
+import logging
+import os
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from bodyschema.cli.commands.options import HERE, RobotFile, flag
-from bodyschema.cli.terminal.view_process import PORT
+from bodyschema.cli.commands.options import HERE, RobotFile, flag, say
+from bodyschema.daemon.service.signals import with_parent
+from bodyschema.interfaces.extras import require_extra
+from bodyschema.interfaces.interpreter import module_command
+from bodyschema.interfaces.waits import END_LIMIT_S
+
+log = logging.getLogger(__name__)
+
+PORT = 8420
+
+
+@contextmanager
+def shown(robot_file: Path, port: int = PORT) -> Iterator[subprocess.Popen[bytes]]:
+    """Run the page as a separate process until the end of the with statement.
+
+    The page is not essential: a port that is taken is only logged.
+    """
+    command = module_command("bodyschema", "view", "--robot", str(robot_file), "--port", str(port))
+    process = subprocess.Popen(command, stdin=subprocess.DEVNULL, env=os.environ | with_parent(), process_group=0)
+    try:
+        yield process
+    finally:
+        process.terminate()
+        try:
+            code = process.wait(END_LIMIT_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            code = process.wait()
+        if code > 0:
+            log.warning("the page had ended with exit code %d; its message is above", code)
 
 
 def view(
@@ -29,15 +63,11 @@ def view(
 
     Next: open the address in a browser.
     """
-    from rich.console import Console
-
     from bodyschema.daemon.config import Config
     from bodyschema.daemon.service import logs
-    from bodyschema.interfaces.extras import require_extra
 
     require_extra("view", "the page")
     from bodyschema.dashboard.server import serve
 
     logs.set_up(verbose=verbose)
-    console = Console(highlight=False, soft_wrap=True)
-    serve(Config.load(robot), port, lambda address: console.print(f"look at {address}", markup=False))
+    serve(Config.load(robot), port, lambda address: say(f"look at {address}"))

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Annotated
 
-from bodyschema.cli.commands.options import HERE, RobotFile, flag
+from bodyschema.cli.commands.options import HERE, RobotFile, flag, say
 
 if TYPE_CHECKING:
     from bodyschema.daemon.config import Config
@@ -120,10 +120,3 @@ def _standing_still(description: RobotDescription) -> list[str]:
 
     path = description.tree.path(description.camera.parent_link, description.robot.marker_link)
     return [joint.name for joint, _ in path if joint.kind in MOVING and joint.name not in description.joints]
-
-
-def say(text: str) -> None:
-    """Print a line as it is."""
-    from rich.console import Console
-
-    Console(highlight=False, soft_wrap=True).print(text, markup=False)

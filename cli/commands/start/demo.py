@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
+from rich.console import Console
 
 OUT = Path("bodyschema-demo")
 WHAT = {
@@ -58,10 +59,8 @@ def demo(
     Next: `bodyschema replay` on the recording of the first tool; `bodyschema init` for a robot of your own.
     """
     import numpy as np
-    from rich.console import Console
 
-    from bodyschema.cli.demo.play import play
-    from bodyschema.cli.demo.plot import plot_curve, write_curve
+    from bodyschema.cli.demo.play import play, plot_curve, write_curve
     from bodyschema.cli.demo.scene import prepare
     from bodyschema.cli.demo.view import show_outcome, shown_on
     from bodyschema.daemon.wiring.wiring import require_simulation

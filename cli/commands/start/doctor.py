@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 from typing import Annotated
 
+from rich.console import Console
+
 from bodyschema.cli.commands.options import HERE, RobotFile, flag
 
 
@@ -18,8 +20,6 @@ def doctor(*, robot: RobotFile = HERE, json: Annotated[bool, flag("As JSON.")] =
 
     Next: the commands in the last column; `bodyschema scan` if a servo is missing.
     """
-    from rich.console import Console
-
     from bodyschema.cli.hardware.doctor import as_json, run, show
     from bodyschema.daemon.config import Config
 

@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
+from rich.console import Console
+from rich.prompt import Prompt
 
-from bodyschema.cli.commands.options import HERE, flag, several
-from bodyschema.cli.commands.start.config import say
+from bodyschema.cli.commands.options import HERE, flag, say, several
+from bodyschema.interfaces.errors import BodyschemaError, ConfigError
 
 if TYPE_CHECKING:
     from bodyschema.cli.hardware.robot_template import Guess, Seen
@@ -65,8 +67,6 @@ def init(
     Next: correct what is marked CHECK, then `bodyschema config`. With servos: `bodyschema watch joints`. With --sim
     nothing is left to correct: `bodyschema run --sim`.
     """
-    from bodyschema.interfaces.errors import ConfigError
-
     _require_one_way(sim=sim, lerobot=lerobot, source=source, urdf=urdf)
     if os.path.lexists(robot):
         raise ConfigError("is there already", file=robot, remedy="Give another --robot, or move it away")
@@ -91,8 +91,6 @@ def init(
 
 
 def _require_one_way(*, sim: bool, lerobot: str | None, source: str | None, urdf: Path | None) -> None:
-    from bodyschema.interfaces.errors import ConfigError
-
     ways = [name for name, given in (("--sim", sim), ("--lerobot", lerobot), ("--from", source)) if given]
     if len(ways) > 1:
         raise ConfigError(f"{' and '.join(ways)} exclude each other", remedy="Give one of them")
@@ -104,7 +102,6 @@ def _seen(webcam: str | None, tag_mm: float | None, ball_mm: float | None, *, pl
     """Return the cameras, those that are plugged in if `plugged_in`, and the marker."""
     from bodyschema.cli.hardware.robot_template import Seen
     from bodyschema.daemon.wiring.wiring import connected_cameras
-    from bodyschema.interfaces.errors import ConfigError
 
     if tag_mm is not None and ball_mm is not None:
         raise ConfigError("--tag-mm and --ball-mm exclude each other", remedy="Give the one that is on the hand")
@@ -128,7 +125,6 @@ def _with_servos(guess: Guess, robot: Path, candidates: Sequence[Candidate], see
     from bodyschema.cli.hardware.robot_template import robot_toml
     from bodyschema.cli.servos.fitting import first_of, fit, servo_tables
     from bodyschema.daemon.config import Config
-    from bodyschema.interfaces.errors import BodyschemaError
 
     fitting = fit(guess.joints, candidates, first_of if yes else _asked)
     text = robot_toml(guess._replace(joints=list(fitting.servos)), seen) + servo_tables(fitting)
@@ -148,7 +144,6 @@ def _of_lerobot(
     """Return a robot.toml for an arm of LeRobot."""
     from bodyschema.cli.hardware.lerobot_robot import lerobot_arm, lerobot_port, lerobot_robot_toml
     from bodyschema.daemon.wiring import servos as servo_wiring
-    from bodyschema.interfaces.errors import ConfigError
     from bodyschema.robot.lerobot import where_calibrations_are
 
     arm = lerobot_arm(name)
@@ -168,7 +163,6 @@ def _of_lerobot(
 
 def write_new(file: Path, text: str) -> None:
     """Write a new file. Raise ConfigError if it exists."""
-    from bodyschema.interfaces.errors import ConfigError
     from bodyschema.interfaces.whole_files import write_whole
 
     if os.path.lexists(file):
@@ -189,11 +183,9 @@ def _copy_model(robot: Path) -> None:
 
 
 def _candidates(source: str, ports: Sequence[str], bauds: Sequence[int]) -> list[Candidate]:
-    from rich.console import Console
-
     from bodyschema.cli.hardware.scan_report import as_json, report_of
     from bodyschema.cli.servos.fitting import candidates_in, read_scan
-    from bodyschema.cli.terminal.progress import shown_on
+    from bodyschema.cli.terminal.screen import shown_on
     from bodyschema.daemon.wiring import servos as servo_wiring
 
     if source != SCAN:
@@ -206,8 +198,6 @@ def _candidates(source: str, ports: Sequence[str], bauds: Sequence[int]) -> list
 
 def _asked(joint: str, left: Sequence[Candidate]) -> Candidate | None:
     """Ask the user which servo moves `joint`; return it, or None."""
-    from rich.prompt import Prompt
-
     if not left:
         return None
     names = {_name(servo, left): servo for servo in left}
