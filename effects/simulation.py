@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -81,6 +81,10 @@ class Simulation:
     def gravity(self) -> GravityLoad:
         """Torques of gravity about the joints."""
         return GravityLoad(self.robot)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the state to be pickled: weak references cannot be, and what they keep is computed again."""
+        return {name: value for name, value in self.__dict__.items() if name != "_beneath"}
 
     def with_effects(self, effects: Sequence[Effect]) -> Simulation:
         """Return the same robot and residual with other effects."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 from effect_arms import arm, everywhere, sized, walk
@@ -41,6 +43,12 @@ def shown(simulation: Simulation, postures, monkeypatch):
 
 def rows(postures) -> Motion:
     return Motion(postures, PERIOD_S * np.arange(1.0, len(postures) + 1), np.zeros(len(postures), dtype=np.int64))
+
+
+def test_a_simulation_that_has_run_can_be_pickled(robot) -> None:
+    simulation, motion = Simulation(robot), rows(walk(2).q[:20])
+    before = simulation.positions(motion)
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(simulation)).positions(motion), before)
 
 
 @pytest.mark.parametrize("name", [name for name in EFFECT_TYPES if name != "camera_latency"])
