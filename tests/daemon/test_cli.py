@@ -74,6 +74,12 @@ def test_help_loads_nothing_that_takes_long(tmp_path) -> None:
     assert len(loaded) < 100
 
 
+def test_no_command_loads_numpy_for_its_help(tmp_path) -> None:
+    loaded = loaded_by(*([*command.split(), "--help"] for command in COMMANDS), cwd=tmp_path)
+    assert {"cyclopts", "bodyschema.cli.commands.calibrate.compare"} <= loaded
+    assert loaded & {"numpy", "scipy", "kbmaps", "zenoh", "lxml"} == set()
+
+
 def test_status_and_predict_load_no_numpy(robot) -> None:
     loaded = loaded_by(["status"], ["predict", "0", "0"], cwd=robot.parent, first=AS_IF_ANSWERED)
     assert {"bodyschema.daemon.client_config", "zenoh"} <= loaded

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
 from rich import box
@@ -13,9 +13,10 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from bodyschema.calibration.comparison import ComparisonReport, Distances, LeftOut
 from bodyschema.cli.commands.options import flag, print_json
-from bodyschema.cli.terminal.screen import mm
+
+if TYPE_CHECKING:
+    from bodyschema.calibration.comparison import ComparisonReport, Distances, LeftOut
 
 
 def compare(
@@ -38,7 +39,6 @@ def compare(
     Next: `bodyschema simulate` with another robot.toml; `bodyschema calibrate`.
     """
     from bodyschema.calibration.comparison import compared
-    from bodyschema.cli.commands.calibrate.compare import view
     from bodyschema.recordings import files as recordings
     from bodyschema.robot.description import RobotDescription
 
@@ -70,6 +70,8 @@ def view(report: ComparisonReport) -> Group:
 
 def sentences(report: ComparisonReport) -> list[str]:
     """Return the comparison as sentences, the result first."""
+    from bodyschema.cli.terminal.screen import mm
+
     distances, left = report.distances, report.left_out
     said = [
         f"{report.second} is {mm(distances.mean_mm / 1e3)} from {report.first} on average, "
