@@ -178,7 +178,10 @@ class SolverProcess:
     def _require_progress(self, pid: int) -> None:
         if time.monotonic() - self._looked_at < HUNG_AFTER_S:
             return
-        used_s = time.clock_gettime(~pid << 3 | 2)  # as clock_getcpuclockid(3) has it
+        try:
+            used_s = time.clock_gettime(~pid << 3 | 2)  # as clock_getcpuclockid(3) has it
+        except OSError:  # it has ended, which the next look at its pipe shows, or this system has no such clock
+            return
         if used_s == self._moved_s:
             os.kill(pid, signal.SIGKILL)
             self._end()

@@ -117,3 +117,17 @@ def test_a_solver_that_hangs_is_replaced(monkeypatch) -> None:
         with pytest.raises(SolverLostError, match="started again"):
             list(iter(process.poll, ()))
         assert process.pid is None
+
+
+def test_a_solver_is_kept_where_its_clock_is_unknown(monkeypatch) -> None:
+    def unknown(clock: int) -> float:
+        raise OSError(22, "Invalid argument")
+
+    monkeypatch.setattr(solver_process, "module_command", lambda _: ("sleep", "60"))
+    monkeypatch.setattr(solver_process, "HUNG_AFTER_S", 0.0)
+    monkeypatch.setattr(solver_process.time, "clock_gettime", unknown)
+    with solver_process.SolverProcess() as process:
+        process.start(TASK)
+        process.solve()
+        assert [process.poll(), process.poll()] == [None, None]
+        assert process.pid is not None
