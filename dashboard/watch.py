@@ -33,12 +33,12 @@ S = TypeVar("S", SamplerStatus, LearnerStatus)
 
 
 class Heard(Generic[S]):
-    """Newest status of one process, and whether its liveliness token is there; any thread may use it."""
+    """Newest status of one process; any thread may use it."""
 
     def __init__(self, kind: type[S], endpoint: str, clock: Clock) -> None:
         self._kind, self._endpoint, self._clock = kind, endpoint, clock
         self._lock = threading.Lock()
-        self.alive = False
+        self._alive = False
         self._heard_at: float | None = None
         self._heard_utc: float | None = None
         self._status: S | None = None
@@ -68,6 +68,11 @@ class Heard(Generic[S]):
             if status is not None:
                 self._status, self._fields = status, fields
 
+    def note_alive(self, alive: bool) -> None:
+        """Record that its liveliness token came, or is gone."""
+        with self._lock:
+            self._alive = alive
+
     @property
     def document(self) -> ProcessDocument:
         """State for the page."""
@@ -76,7 +81,7 @@ class Heard(Generic[S]):
 
     def _is_there(self) -> bool:
         recent = self._heard_at is not None and self._clock.now() - self._heard_at < SILENT_AFTER_S
-        return self.alive and recent
+        return self._alive and recent
 
 
 log = logging.getLogger(__name__)
@@ -167,7 +172,7 @@ class Watch:
         for process, heard in heard_of.items():
             session = self._sessions[process]
             session.subscribe(self._keys.status(process), lambda payload, heard=heard: heard.take(payload, time.time()))
-            session.watch(self._keys.alive(process), lambda alive, heard=heard: setattr(heard, "alive", alive))
+            session.watch(self._keys.alive(process), heard.note_alive)
 
     def _work(self) -> None:
         while True:

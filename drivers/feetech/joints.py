@@ -78,9 +78,17 @@ class Channel(ServoChannel):
         if not self._is_steady(told("voltage"), told("temperature")):
             return None
         amperes = None if model.current_unit is None else told("current") * model.current_unit
-        alert = answer.status.error != 0
-        way = (self.question(answer), answer.earliest, answer.earliest, answer.latest)
-        return Sample(*way, position, told("velocity") * model.velocity_unit, amperes, bool(moving), alert)
+        return Sample(
+            question=self.question(answer),
+            expected=answer.earliest,
+            earliest=answer.earliest,
+            latest=answer.latest,
+            ticks=position,
+            velocity=told("velocity") * model.velocity_unit,
+            current=amperes,
+            moving=bool(moving),
+            alert=answer.status.error != 0,
+        )
 
     def _is_possible(self, position: int) -> bool:
         if self.servo.model.ticks_per_turn is None:
