@@ -58,11 +58,12 @@ class MachineFiles(ABC):
         self._call(self.reload)
 
     def uninstall(self) -> None:
-        """Remove the files, and the folders `NAME.d` that become empty. ConfigError: one cannot be removed."""
+        """Remove the files, and folders of drop-ins that become empty. ConfigError: one cannot be removed."""
         for file in self.installed():
             with writing(file, f"install {self.kind} --uninstall"):
                 file.unlink()
-                if file.parent.suffix == ".d" and not any(file.parent.iterdir()):
+                # `systemctl edit` puts the user's files there; other folders are the system's.
+                if file.parent.match("*.service.d") and not any(file.parent.iterdir()):
                     file.parent.rmdir()
         self._call(self.reload)
 

@@ -60,6 +60,7 @@ def test_rules_that_are_there_are_left_as_they_are(tmp_path, capsys) -> None:
 def test_uninstall_removes_the_file(tmp_path, capsys) -> None:
     install("--yes", "--root", tmp_path)
     install("--uninstall", "--yes", "--root", tmp_path)
+    assert (tmp_path / FILE.parent).is_dir()  # the system's, even if it is empty now
     assert not (tmp_path / FILE).exists()
     assert "Removed." in capsys.readouterr().out
 
