@@ -203,4 +203,4 @@ class DiagnosisFile(msgspec.Struct, frozen=True):
     tolerances: Tolerances | None = None
     seen_by: Literal["camera", "instrument"] = "camera"
     weighed: bool = True
-    schema: int = 1
+    schema: int = 2
