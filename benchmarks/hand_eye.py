@@ -24,8 +24,7 @@ from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.toml_file import read_toml
-from bodyschema.vision.one_eye import first_pose
-from bodyschema.vision.pose import Pose, PoseEstimator, Sighting, mirrored
+from bodyschema.vision.pose import Pose, PoseEstimator, Sighting, first_pose, mirrored
 from bodyschema.vision.tags.body import TAG_CORNERS
 from kbmaps import ChainTolerances, RigidChain, RigidLearner, align
 

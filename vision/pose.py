@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
@@ -190,3 +191,27 @@ def fitted_motion(body: FloatArray, seen: FloatArray) -> tuple[FloatArray, Float
     u, _, vt = np.linalg.svd((seen - middle_seen).T @ (body - middle_body))
     rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     return rotation, middle_seen - rotation @ middle_body
+
+
+def first_pose(
+    calibration: StereoCalibration, points: FloatArray, pixels: FloatArray
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Return the poses, as rotation (3, 3) and origin (3,) [m], with which `points` project near `pixels`.
+
+    Least squares of the points' distances from their rays in space, without an initial guess (SQPnP: Terzakis and
+    Lourakis 2020). The list is empty if there is no solution.
+
+    Args:
+        points: points of a body in its own frame (k, 3) [m].
+        pixels: their image coordinates (k, 2) [px].
+    """
+    rays = (pixels - np.array(calibration.principal_point_px)) / calibration.focal_px
+    found, turns, places, _ = cv2.solvePnPGeneric(
+        points, rays[:, None], np.eye(3), np.zeros(5), flags=cv2.SOLVEPNP_SQPNP
+    )
+    if not found:
+        return []
+    return [
+        (np.asarray(cv2.Rodrigues(turn)[0], np.float64), np.ravel(np.asarray(place, np.float64)))
+        for turn, place in zip(turns, places, strict=True)
+    ]

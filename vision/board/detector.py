@@ -12,11 +12,9 @@ from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray, ImageArray
 
-from .board import SIZES, Board, dictionary, smallest_size
-from .exposure import MOST_BLUR_PX, image_fault
+from .board import SIZES, Board, dictionary, smallest_size, squares_seen
 from .refine import refined
-from .sharpness import blur_px
-from .squares import squares_seen
+from .sharpness import MOST_BLUR_PX, blur_px, image_fault
 
 IntArray = NDArray[np.int64]
 Why = Literal[

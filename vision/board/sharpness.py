@@ -1,6 +1,8 @@
-"""Blur of edges, as the 1-sigma of the equivalent Gaussian."""
+"""Blur of edges, as the 1-sigma of the equivalent Gaussian, and the faults of images without a board."""
 
 from __future__ import annotations
+
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -8,11 +10,14 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from bodyschema.interfaces.records import FloatArray, ImageArray
+from bodyschema.vision.images import is_black, too_white
 
 from .board import Board
 
 _ALONG = 0.3  # of a square: where edges are sampled, away from corner and marker
 _STEEPEST = 0.999
+# Corner accuracy is a small share of the edge width; with more blur that share is too large.
+MOST_BLUR_PX = 2.5
 
 
 def blur_px(grey: ImageArray, board: Board, numbers: NDArray[np.int64], px: FloatArray) -> float:
@@ -76,3 +81,15 @@ def _levels(grey: ImageArray, px: FloatArray) -> tuple[float, float]:
     high = np.ceil(px.max(axis=0)).astype(int) + 1
     dark, bright = np.quantile(grey[low[1] : high[1], low[0] : high[0]], [0.1, 0.9])
     return float(dark), float(bright)
+
+
+def image_fault(grey: ImageArray) -> tuple[Literal["dark", "over_exposed", "blurred"], str] | None:
+    """Return kind and message of what is wrong with the whole image (height, width); None if nothing is."""
+    if is_black(grey):
+        return "dark", "the image is black. Take the lens cap off; longer exposure, more light"
+    if (white := too_white(grey)) is not None:
+        return "over_exposed", f"over-exposed: {white:.0%} of the image is white. Shorten the exposure, less light"
+    edge = sharpest_edge_px(np.asarray(grey, dtype=np.float64))
+    if edge > MOST_BLUR_PX:
+        return "blurred", f"blurred: the sharpest edge has a 1-sigma of {edge:.1f} px. Focus; hold the board still"
+    return None

@@ -22,8 +22,7 @@ from bodyschema.interfaces.records import (
 )
 from bodyschema.vision.config import LONGEST_PAUSE_S
 from bodyschema.vision.images import check_calibration, check_images
-from bodyschema.vision.one_eye import first_pose
-from bodyschema.vision.pose import Pose, PoseEstimator, Sighting, fitted_motion, mirrored
+from bodyschema.vision.pose import Pose, PoseEstimator, Sighting, first_pose, fitted_motion, mirrored
 from bodyschema.vision.triangulate import triangulate
 
 from .body import TagBody
