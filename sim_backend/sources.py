@@ -60,7 +60,10 @@ class SimJoints:
         self._world.open_joints(False)
 
     def read(self, timeout_s: float) -> JointReading | None:
-        """Return the next reading; None if the world waits longer for the camera to be read. Raise SourceEnded."""
+        """Return the next reading; None if the world waits longer for the camera to be read.
+
+        Raise SourceEnded if the world was closed.
+        """
         return self._world.next_reading(timeout_s)
 
 
@@ -78,7 +81,10 @@ class SimStereoCamera:
         self._world.open_camera(False)
 
     def read(self, timeout_s: float) -> StereoFrame | None:
-        """Return the next frame, or None. Raise SourceEnded, or SourceLost if the renderer's process died."""
+        """Return the next frame; None if none arrived within `timeout_s`.
+
+        Raise SourceEnded if the world was closed. Raise SourceLost if the renderer's process died.
+        """
         return self._world.next_frame(timeout_s)
 
 

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
@@ -16,6 +16,9 @@ from bodyschema.interfaces.errors import SourceEnded
 from bodyschema.interfaces.protocols import Clock, MarkerSource
 from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, frozen_array
 from bodyschema.robot.rpy import rpy_of
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 log = logging.getLogger(__name__)
 
@@ -81,7 +84,10 @@ class Member:
     """
 
     def __init__(self, name: str, source: MarkerSource, pose: FloatArray) -> None:
+        from scipy.spatial.transform import Rotation  # not while positions come: it takes half a second
+
         self.name, self.source, self.pose = name, source, pose
+        self._turn = Rotation.from_matrix(pose[:3, :3])
         self.common: deque[Common] = deque(maxlen=_SETTINGS.judged)
         self.forget()
 
@@ -95,7 +101,7 @@ class Member:
         """Store a position or a miss that arrived at `now` [s]."""
         self.newest_t = seen.t
         if isinstance(seen, MarkerFix):
-            fix = _moved(seen, self.pose)
+            fix = _moved(seen, self.pose, self._turn)
             self.fixes.append(fix)
             self.waiting.append((fix, now))
             self.fixed_at = now
@@ -288,19 +294,12 @@ def _rigid(points: FloatArray, targets: FloatArray) -> tuple[FloatArray, float]:
     return T, math.sqrt(s[1] / len(points))
 
 
-def _moved(fix: MarkerFix, pose: FloatArray) -> MarkerFix:
-    """Return the fix transformed by `pose` (4, 4), the pose of its frame in the target frame."""
+def _moved(fix: MarkerFix, pose: FloatArray, rotation: Rotation) -> MarkerFix:
+    """Return the fix transformed by `pose` (4, 4), the pose of its frame in the target frame, and its `rotation`."""
     if np.array_equal(pose, np.eye(4)):
         return fix
     R = pose[:3, :3]
     x, cov = frozen_array(R @ fix.x + pose[:3, 3]), frozen_array(R @ fix.cov @ R.T)
-    turn = None if fix.R is None else frozen_array(_turned(R, fix.R))
+    turn = None if fix.R is None else frozen_array((rotation * rotation.from_quat(fix.R)).as_quat())
     cov_turn = None if fix.cov_R is None else frozen_array(R @ fix.cov_R @ R.T)
     return replace(fix, x=x, cov=cov, R=turn, cov_R=cov_turn, centres_px=None)
-
-
-def _turned(R: FloatArray, q: FloatArray) -> FloatArray:
-    """Return the quaternion (x, y, z, w) of R (3, 3) after that of `q`."""
-    from scipy.spatial.transform import Rotation  # only few sources measure orientations, and it takes a while
-
-    return (Rotation.from_matrix(R) * Rotation.from_quat(q)).as_quat()

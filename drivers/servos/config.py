@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, ClassVar, Generic, Literal, TypeVar
+from typing import Annotated, ClassVar, Generic, Literal, Protocol, TypeVar
 
 import msgspec
 from msgspec import Meta
@@ -15,7 +15,19 @@ from bodyschema.robot.toml_file import Positive, line_in_entry, line_of
 
 from .model import Model, no_driver
 
-BusT = TypeVar("BusT")
+
+class AnyBus(Protocol):
+    """Settings that every table of a bus has."""
+
+    @property
+    def port(self) -> str: ...
+    @property
+    def baud(self) -> int: ...
+    @property
+    def latency_ms(self) -> float | None: ...
+
+
+BusT = TypeVar("BusT", bound=AnyBus)
 
 
 def require_each(joints: Sequence[str], given: Sequence[str], what: str, table: str, file: Path, text: str) -> None:

@@ -24,7 +24,7 @@ from bodyschema.interfaces.servos import BusHealth, ServoHealth
 
 from .bus import Bus, Counts, Request
 from .channel import Channel, Punctuality, Sample, middle
-from .config import ServosConfig
+from .config import AnyBus, ServosConfig
 from .handshake import RETRY_S, IdentifiedServo, identify, require_all, restore_torque, switch_torque_off
 from .health import Health
 from .vendor import ServoVendor
@@ -53,7 +53,7 @@ OpenPort = Callable[[Any, Clock], tuple[Port, float]]
 """Opens the port of a bus; with the latency of its adapter [s]."""
 
 
-def open_serial(config: Any, clock: Clock) -> tuple[Port, float]:
+def open_serial(config: AnyBus, clock: Clock) -> tuple[Port, float]:
     """Open the port of a bus; return it and the latency of its adapter [s]."""
     latency_s = adapter_latency_s(config.port) if config.latency_ms is None else config.latency_ms * 1e-3
     return SerialLine.open(config.port, config.baud, clock.now), latency_s

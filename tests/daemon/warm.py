@@ -18,6 +18,7 @@ import runpy
 import select
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import tempfile
@@ -164,7 +165,9 @@ def _serve(wire: socket.socket, others: socket.socket) -> list[str]:
         for ready in select.select([others.fileno(), *asking, *alive], [], [])[0]:
             if ready == others.fileno():
                 one = others.accept()[0]
-                asking[one.fileno()] = one
+                _, user, _ = struct.unpack("3i", one.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))
+                if user == os.getuid():  # anybody on the machine may connect
+                    asking[one.fileno()] = one
                 continue
             if ready in alive:
                 pid, fate = alive.pop(ready)

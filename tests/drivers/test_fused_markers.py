@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections import deque
 from types import TracebackType
 from typing import Self
@@ -12,7 +13,7 @@ from virtual_port import VirtualClock
 
 from bodyschema.drivers.markers.fusing import FusedMarkers, Member
 from bodyschema.interfaces.records import MarkerFix, MarkerMiss, Reason, frozen_array
-from bodyschema.robot.rpy import rotation_of
+from bodyschema.robot.rpy import pose_of, rotation_of
 
 STEREO = np.diag([1e-6, 1e-6, 25e-6])  # depth is five times less certain
 MOCAP = np.diag([1e-6, 25e-6, 1e-6])
@@ -101,6 +102,15 @@ def test_sources_in_their_own_frames_are_brought_together() -> None:
     pose[:3, :3], pose[:3, 3] = rotation_of(np.array([0.3, -0.2, 1.0])), [1.0, -2.0, 0.5]
     scene = Scene(STEREO, MOCAP, pose=pose)
     assert squared(scene, scene.run(200)).mean() < 4.0
+
+
+def test_orientations_turn_with_the_frame_without_an_import(monkeypatch) -> None:
+    member = Member("mocap", Script(VirtualClock()), pose_of(np.zeros(3), np.array([0.0, 0.0, np.pi / 2])))
+    monkeypatch.setitem(sys.modules, "scipy.spatial.transform", None)  # it takes half a second
+    member.take(MarkerFix(0.0, np.zeros(3), MOCAP, R=np.array([0.0, 0.0, 0.0, 1.0])), 0.0)
+    turn = member.fixes[0].R
+    assert turn is not None
+    np.testing.assert_allclose(np.abs(turn), [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-12)
 
 
 def test_contradicting_sources_give_no_position() -> None:
