@@ -24,6 +24,7 @@ from kbmaps.chains.placement import place
 
 from .limits import A_RADIAN_M, KNOWN_TOOL_M, MEASURED, SLIDES_M, TOOL_M, ZEROS_RAD, reach_m, spread_m
 from .reading import QUARTER, Reading
+from .size import size_of
 
 # Number of rows to be read in other ways, evenly spread. Twice as many cost twice the time and change no verdict of the
 # tests.
@@ -71,6 +72,9 @@ class _Settings:
     turned_rad: float = math.radians(30.0)
     # A position belongs to the angles of a row this near at most: logs joined by row number lose one or two.
     near_rows: int = 3
+    # Positions of another size are reported if it is off by this many times its own uncertainty. Right recordings of
+    # real and generated arms come to 4.0, and fit hardly better for it.
+    far_size: float = 5.0
     # Share of its tolerance that is left to a joint offset that is held.
     held: float = 1e-3
     # A zero of the last joint this far off is not fitted where the marker is known: its quarter turns are tried
@@ -185,6 +189,9 @@ def plausibility(
         if shifted is not None:
             return shifted
     noise = 0.0 if sigma_m is None else _SETTINGS.noises * sigma_m
+    sized = search.sized(before, fit.error)
+    if sized is not None:
+        return _decided(sized, len(q))
     if before <= _SETTINGS.much_better * fit.error and not _nameable(chosen, fit, spread):
         chosen, fit, after = as_it_is, search.fits[as_it_is], before
     held = search.with_marker_known(chosen) if robot.robot.marker_known else None
@@ -216,9 +223,14 @@ def plausibility(
         elif not robot.robot.marker_known and (nearer := search.with_marker_nearer(as_it_is)) is not None:
             looks, tool_m = nearer.looks(names, fit.zeros), search.fits[nearer].tool_m
             found = replace(found, warnings=(*found.warnings, f"perhaps {looks}: {_marker_then(tool_m, fit.tool_m)}"))
-    if found.refusal is None or len(q) >= FEWEST_ROWS:
+    return _decided(found, len(q))
+
+
+def _decided(found: Plausibility, pairs: int) -> Plausibility:
+    """Turn a refusal into a warning where there are too few pairs."""
+    if found.refusal is None or pairs >= FEWEST_ROWS:
         return found
-    few = f"{found.refusal}. {found.remedy}. (These are {len(q)} pairs: {FEWEST_ROWS} are needed to decide.)"
+    few = f"{found.refusal}. {found.remedy}. (These are {pairs} pairs: {FEWEST_ROWS} are needed to decide.)"
     return Plausibility(warnings=(few,))
 
 
@@ -331,7 +343,8 @@ class _Search:
     def __init__(self, chain: RigidChain, q: FloatArray, x: FloatArray, exact_m: float, pose_known: bool) -> None:
         self._chain, self._q, self._x, self._exact_m, self._pose_known = chain, q, x, exact_m, pose_known
         self._std = np.where(chain.prismatic, SLIDES_M, ZEROS_RAD)
-        self._poses = _poses_apart(q / np.where(chain.prismatic, A_RADIAN_M, 1.0))
+        self._apart = _poses_apart(q / np.where(chain.prismatic, A_RADIAN_M, 1.0))
+        self._poses = len(self._apart)
         self._tried: set[Reading] = set()
         self.fits: dict[Reading, _Fit] = {}
 
@@ -394,6 +407,31 @@ class _Search:
         )
         ratio = max(float(held.errors(MEASURED)[0]), self._exact_m) / fit.error
         return ratio > _SETTINGS.much_better and 3.0 * MEASURED * self._poses * math.log(ratio) > _SETTINGS.certain
+
+    def sized(self, before: float, best: float) -> Plausibility | None:
+        """Return what to say of positions that are too large or too small for the arm; None if they are not.
+
+        Args:
+            before: distance of the pairs as they are [m].
+            best: the same, in the best reading of the columns.
+        """
+        size = size_of(self._chain, self._q, self._x, self._apart)
+        after = max(size.error, self._exact_m)
+        far = size.sigmas > _SETTINGS.far_size and after < _SETTINGS.named / 2 * spread_m(self._x)
+        if not far or best < _SETTINGS.as_good * after:
+            return None
+        factor, low, high = (size.factor * math.exp(k * size.log_sigma) for k in (0.0, -1.96, 1.96))
+        text = (
+            f"the positions are {factor:.3g} times as large as the arm makes them (95 %: {low:.4g} to {high:.4g}): "
+            f"divided by that, the pairs fit to {_mm(after)}, and as they are to {_mm(before)}"
+        )
+        remedy = (
+            "Compare with what was measured: the size of the printed tag or the ball in [vision], the squares of the "
+            "calibration board, the unit of the columns x, y, z. If these are right, the URDF is of an arm of another size"
+        )
+        if best > _SETTINGS.much_better * after:
+            return Plausibility(f"it seems that {text}", remedy, misread=True)
+        return Plausibility(warnings=(f"perhaps {text}. {remedy}",))
 
     def errors(self, q: FloatArray, x: FloatArray) -> FloatArray:
         """Return the distances (s,) [m] of sets of pairs q (s, n, d) and x (s, n, 3), with the columns as they are."""
@@ -521,14 +559,14 @@ class _Search:
         return fits
 
 
-def _poses_apart(q: FloatArray) -> int:
-    """Return how many of the poses q (n, d) are `apart_rad` from each other, in at least one joint."""
+def _poses_apart(q: FloatArray) -> list[int]:
+    """Return poses of q (n, d) that are `apart_rad` from each other, in at least one joint."""
     apart = np.abs(q[:, None] - q).max(axis=2) > _SETTINGS.apart_rad
     kept: list[int] = []
     for pose, far in enumerate(apart):
         if far[kept].all():
             kept.append(pose)
-    return len(kept)
+    return kept
 
 
 def _mm(distance_m: float) -> str:

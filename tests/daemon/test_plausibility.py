@@ -179,6 +179,24 @@ def test_a_large_unit_is_named_before_anything_is_fitted(unit, span) -> None:
         require_units(robot(), recording, Path("pairs.csv"))
 
 
+@pytest.mark.parametrize("factor", [1.1, pytest.param(0.9144, marks=pytest.mark.soak)])
+def test_positions_of_another_size_are_refused_with_the_factor(factor) -> None:
+    right = pairs()
+    found = replace(right, x=factor * right.x).seen()
+    assert f"the positions are {factor:.3g} times as large as the arm makes them" in (found.refusal or "")
+    assert found.remedy.startswith("Compare with what was measured: the size of the printed tag")
+
+
+def test_a_size_that_lengths_explain_is_not_named() -> None:
+    """One link that is 20 mm longer is no larger unit."""
+    right = pairs(zeros_deg=0.0)
+    chain = arm()
+    fixed = chain.fixed.copy()
+    fixed[2, 0, 3] += 0.02
+    x = RigidChain(fixed, chain.axes, chain.prismatic).positions(right.q)
+    assert replace(right, x=x).seen().refusal is None
+
+
 def test_degrees_are_named_however_small() -> None:
     right = pairs()
     assert "the angles are in degrees" in (replace(right, q=np.degrees(right.q)).seen().refusal or "")
@@ -376,6 +394,24 @@ def test_real_recordings_are_not_doubted(name) -> None:
     robot = Config.load(REAL_DATA / name / "robot.toml", {}).robot
     recording = Recording.read(REAL_DATA / name / "measured.csv", robot.joints)
     assert plausibility(robot, recording.q, recording.x).sentences == ()
+
+
+@real
+@pytest.mark.parametrize(
+    "factor", [1.1, *(pytest.param(factor, marks=pytest.mark.soak) for factor in (0.9, 0.9144, 1.05, 1.0936))]
+)
+@pytest.mark.parametrize(
+    "name",
+    [
+        "panda_eyeinhand",
+        *(pytest.param(name, marks=pytest.mark.soak) for name in ("ur5_laser", "wam_laser", "tiago_eyehand")),
+    ],
+)
+def test_a_real_recording_of_another_size_is_refused(name, factor) -> None:
+    robot = Config.load(REAL_DATA / name / "robot.toml", {}).robot
+    recording = Recording.read(REAL_DATA / name / "measured.csv", robot.joints)
+    found = plausibility(robot, recording.q, factor * recording.x)
+    assert "times as large as the arm makes them" in (found.refusal or "")
 
 
 @real
