@@ -427,7 +427,8 @@ class _Search:
         )
         remedy = (
             "Compare with what was measured: the size of the printed tag or the ball in [vision], the squares of the "
-            "calibration board, the unit of the columns x, y, z. If these are right, the URDF is of an arm of another size"
+            "calibration board, the unit of the columns x, y, z. If these are right, the URDF is of an arm of another "
+            "size"
         )
         if best > _SETTINGS.much_better * after:
             return Plausibility(f"it seems that {text}", remedy, misread=True)
