@@ -23,6 +23,7 @@ from kbmaps import DegenerateDataError, RigidChain, align
 from kbmaps.chains.placement import place
 
 from .limits import A_RADIAN_M, KNOWN_TOOL_M, MEASURED, SLIDES_M, TOOL_M, ZEROS_RAD, reach_m, spread_m
+from .orientations import AS_IT_IS, REMEDIES, errors_rad
 from .reading import QUARTER, Reading
 from .size import size_of
 
@@ -75,6 +76,8 @@ class _Settings:
     # Positions of another size are reported if it is off by this many times its own uncertainty. Right recordings of
     # real and generated arms come to 4.0, and fit hardly better for it.
     far_size: float = 5.0
+    # Orientations of a tag on a nominal arm are no better than this.
+    oriented_rad: float = math.radians(1.0)
     # Share of its tolerance that is left to a joint offset that is held.
     held: float = 1e-3
     # A zero of the last joint this far off is not fitted where the marker is known: its quarter turns are tried
@@ -164,6 +167,7 @@ def plausibility(
     *,
     chain: RigidChain | None = None,
     sigma_m: float | None = None,
+    orientation: FloatArray | None = None,
 ) -> Plausibility:
     """Check pairs q (n, d) [rad, m] and x (n, 3) [m] before a fit to them is trusted.
 
@@ -173,6 +177,7 @@ def plausibility(
         x: positions (n, 3) [m].
         chain: the nominal chain if it is not the robot's.
         sigma_m: 1-sigma of a coordinate [m] if known.
+        orientation: of the marker, quaternions x, y, z, w (n, 4), if known.
     """
     chain = chain or robot.chain
     reach, spread = reach_m(robot), spread_m(x)
@@ -223,7 +228,24 @@ def plausibility(
         elif not robot.robot.marker_known and (nearer := search.with_marker_nearer(as_it_is)) is not None:
             looks, tool_m = nearer.looks(names, fit.zeros), search.fits[nearer].tool_m
             found = replace(found, warnings=(*found.warnings, f"perhaps {looks}: {_marker_then(tool_m, fit.tool_m)}"))
+    if orientation is not None and chosen == as_it_is and found.refusal is None:
+        found = _reordered(chain, q[rows] + fit.zeros, orientation[rows], fit) or found
     return _decided(found, len(q))
+
+
+def _reordered(chain: RigidChain, q: FloatArray, orientation: FloatArray, fit: _Fit) -> Plausibility | None:
+    """Return a refusal if the quaternions fit far better in another order, or inverted; else None."""
+    errors = errors_rad(chain, q, fit.rotation, orientation)
+    before, best = errors.pop(AS_IT_IS), min(errors, key=errors.__getitem__)
+    after = errors[best]
+    if before <= _SETTINGS.much_better * max(after, _SETTINGS.oriented_rad):
+        return None
+    return Plausibility(
+        f"it seems that the columns qx, qy, qz, qw {best}: the orientations then fit to {math.degrees(after):.1f}°, "
+        f"and as they are to {math.degrees(before):.1f}°",
+        f"In the recording, {REMEDIES[best]}",
+        misread=True,
+    )
 
 
 def _decided(found: Plausibility, pairs: int) -> Plausibility:

@@ -42,9 +42,9 @@ class Pairs:
     pose_known: bool = False
     marker_known: bool = False
 
-    def seen(self, rows: int | None = None) -> Plausibility:
+    def seen(self, rows: int | None = None, orientation: np.ndarray | None = None) -> Plausibility:
         known = robot(pose_known=self.pose_known, marker_known=self.marker_known)
-        return plausibility(known, self.q[:rows], self.x[:rows])
+        return plausibility(known, self.q[:rows], self.x[:rows], orientation=orientation)
 
     def read(self, reading: Reading) -> Pairs:
         """Apply `reading` to this recording's columns."""
@@ -195,6 +195,24 @@ def test_a_size_that_lengths_explain_is_not_named() -> None:
     fixed[2, 0, 3] += 0.02
     x = RigidChain(fixed, chain.axes, chain.prismatic).positions(right.q)
     assert replace(right, x=x).seen().refusal is None
+
+
+@pytest.mark.parametrize(
+    ("order", "signs", "said"),
+    [
+        ([0, 1, 2, 3], [1, 1, 1, 1], ""),
+        ([3, 0, 1, 2], [1, 1, 1, 1], "hold a quaternion with w first: "),
+        ([0, 1, 2, 3], [-1, -1, -1, 1], "hold the conjugate"),
+        ([3, 0, 1, 2], [1, -1, -1, -1], "w first, and hold the conjugate"),
+    ],
+)
+def test_quaternions_in_another_order_are_refused_and_named(order, signs, said) -> None:
+    right = pairs(zeros_deg=0.0)
+    noise = Rotation.from_rotvec(0.03 * np.random.default_rng(0).normal(size=(len(right.q), 3)))
+    shown = Rotation.from_matrix(arm().orientation(right.q)) * Rotation.from_rotvec([0.3, -1.0, 0.5]) * noise
+    found = Pairs(right.q, arm().positions(right.q)).seen(orientation=shown.as_quat()[:, order] * signs)
+    assert said in (found.refusal or "")
+    assert (found.refusal is None) == (not said)
 
 
 def test_degrees_are_named_however_small() -> None:
