@@ -13,13 +13,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bodyschema.interfaces.errors import RecordingError
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.recordings.recording import Recording
 from bodyschema.robot.description import RobotDescription
-from kbmaps import DegenerateDataError, RigidChain, align
+from kbmaps import ChainParameters, DegenerateDataError, RigidChain, align
 from kbmaps.chains.placement import place
 
 from .limits import A_RADIAN_M, KNOWN_TOOL_M, MEASURED, SLIDES_M, TOOL_M, ZEROS_RAD, reach_m, spread_m
@@ -78,6 +79,10 @@ class _Settings:
     far_size: float = 5.0
     # Orientations of a tag on a nominal arm are no better than this.
     oriented_rad: float = math.radians(1.0)
+    # Rows are shifted if this share of them fits so many times better with the angles of the row as far away. None do
+    # so in right recordings; 0.09 and more where half of the rows are shifted.
+    shifted: float = 0.08
+    shifted_better: float = 5.0
     # Share of its tolerance that is left to a joint offset that is held.
     held: float = 1e-3
     # A zero of the last joint this far off is not fitted where the marker is known: its quarter turns are tried
@@ -194,9 +199,9 @@ def plausibility(
         if shifted is not None:
             return shifted
     noise = 0.0 if sigma_m is None else _SETTINGS.noises * sigma_m
-    sized = search.sized(before, fit.error)
-    if sized is not None:
-        return _decided(sized, len(q))
+    found = _partly_shifted(search, q, x) or search.sized(before, fit.error)
+    if found is not None:
+        return _decided(found, len(q))
     if before <= _SETTINGS.much_better * fit.error and not _nameable(chosen, fit, spread):
         chosen, fit, after = as_it_is, search.fits[as_it_is], before
     held = search.with_marker_known(chosen) if robot.robot.marker_known else None
@@ -298,21 +303,55 @@ def _shifted(search: _Search, q: FloatArray, x: FloatArray, before: float) -> Pl
         q, x: all pairs (n, d) [rad, m] and (n, 3) [m].
         before: distance of the pairs as they are [m].
     """
-    shifts = [shift for shift in range(-_SETTINGS.near_rows, _SETTINGS.near_rows + 1) if shift]
-    rows = np.unique(np.linspace(_SETTINGS.near_rows, len(q) - 1 - _SETTINGS.near_rows, ROWS).astype(np.intp))
+    shifts, rows = _rows_nearby(len(q))
     errors = search.errors(np.stack([q[rows + shift] for shift in shifts]), np.stack([x[rows]] * len(shifts)))
     best = int(errors.argmin())
     after, shift = float(errors[best]), shifts[best]
     if after > _SETTINGS.named / 2 * spread_m(x) or before < _SETTINGS.much_better * after:
         return None
-    where, count = "later" if shift > 0 else "earlier", abs(shift)
-    row = f"{count} row{'s' if count > 1 else ''} {where}"
+    row, remedy = _moved(shift)
     return Plausibility(
         f"it seems that angles and positions are shifted against each other: with the angles of {row}, the pairs fit "
         f"to {_mm(after)}, and as they are to {_mm(before)}",
-        f"Move the columns of the joints by {row.removesuffix(f' {where}')} {'up' if shift > 0 else 'down'}, or the "
-        "positions the other way; or join the two logs by time, not by row",
+        remedy,
         misread=True,
+    )
+
+
+def _partly_shifted(search: _Search, q: FloatArray, x: FloatArray) -> Plausibility | None:
+    """Return a refusal if the positions of many rows, and not of most, belong to the angles of a row nearby."""
+    if len(q) < FEWEST_ROWS:
+        return None
+    shifts, rows = _rows_nearby(len(q))
+    own, *others = search.distances(np.stack([q[rows + shift] for shift in (0, *shifts)]), x[rows])
+    shares = [float((_SETTINGS.shifted_better * other < own).mean()) for other in others]
+    share, shift = max(zip(shares, shifts, strict=True))
+    if share < _SETTINGS.shifted:
+        return None
+    row, remedy = _moved(shift)
+    return Plausibility(
+        f"it seems that angles and positions are shifted against each other in {100.0 * share:.0f} % of the rows: "
+        f"these fit the angles of {row}",
+        f"In these rows: {remedy[0].lower()}{remedy[1:]}",
+        misread=True,
+    )
+
+
+def _rows_nearby(count: int) -> tuple[list[int], NDArray[np.intp]]:
+    """Return shifts, and rows of a recording of `count` that have neighbours so far away."""
+    near = _SETTINGS.near_rows
+    shifts = [shift for shift in range(-near, near + 1) if shift]
+    return shifts, np.unique(np.linspace(near, count - 1 - near, ROWS).astype(np.intp))
+
+
+def _moved(shift: int) -> tuple[str, str]:
+    """Return what row it is whose angles fit, and the remedy."""
+    count, where = abs(shift), "later" if shift > 0 else "earlier"
+    rows = f"{count} row{'s' if count > 1 else ''}"
+    return (
+        f"{rows} {where}",
+        f"Move the columns of the joints by {rows} {'up' if shift > 0 else 'down'}, or the positions the other way; or "
+        "join the two logs by time, not by row",
     )
 
 
@@ -364,6 +403,7 @@ class _Search:
 
     def __init__(self, chain: RigidChain, q: FloatArray, x: FloatArray, exact_m: float, pose_known: bool) -> None:
         self._chain, self._q, self._x, self._exact_m, self._pose_known = chain, q, x, exact_m, pose_known
+        self._parameters = ChainParameters(chain)
         self._std = np.where(chain.prismatic, SLIDES_M, ZEROS_RAD)
         self._apart = _poses_apart(q / np.where(chain.prismatic, A_RADIAN_M, 1.0))
         self._poses = len(self._apart)
@@ -460,6 +500,14 @@ class _Search:
         """Return the distances (s,) [m] of sets of pairs q (s, n, d) and x (s, n, 3), with the columns as they are."""
         placed = place(self._chain, q, x, zeros_std=self._std, tool_std=TOOL_M)
         return np.maximum(placed.errors(MEASURED), self._exact_m)
+
+    def distances(self, q: FloatArray, x: FloatArray) -> FloatArray:
+        """Return the distances (s, n) [m] of positions x (n, 3) from the arm at q (s, n, d), placed by the first."""
+        placed, p = place(self._chain, q[:1], x[None], zeros_std=self._std, tool_std=TOOL_M), self._parameters
+        change = np.zeros(p.size)
+        change[p.zeros], change[p.tool] = placed.zeros[0], placed.tools[0]
+        drawn = np.stack([p.positions(change, each) for each in q])
+        return np.linalg.norm(drawn @ placed.rotations[0].T + placed.shifts[0] - x, axis=2)
 
     def with_marker_known(self, reading: Reading) -> tuple[Reading, _Fit] | None:
         """Return the reading with a zero near the hand off by quarter turns, and its fit, if the known marker shows it.

@@ -284,6 +284,15 @@ def test_positions_of_another_row_are_named(rows, said) -> None:
     assert found.misread
 
 
+@pytest.mark.parametrize(("rows", "said"), [(slice(60, None), "1 row later"), (slice(1, None, 2), "2 rows later")])
+def test_positions_of_another_row_in_half_of_the_rows_are_named(rows, said) -> None:
+    right = pairs()
+    q = right.q.copy()
+    q[rows] = np.roll(q[rows], 1, axis=0)
+    found = replace(right, q=q).seen()
+    assert f"% of the rows: these fit the angles of {said}" in (found.refusal or "")
+
+
 def test_the_direction_of_a_joint_through_the_marker_is_not_shown() -> None:
     right = pairs(tool=0.0, zeros_deg=0.0)
     still = right.q * [1, 1, 1, 1, 1, 0]
