@@ -13,17 +13,20 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bodyschema.interfaces.errors import RecordingError
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.recordings.recording import Recording
 from bodyschema.robot.description import RobotDescription
-from kbmaps import DegenerateDataError, RigidChain, align
+from kbmaps import ChainParameters, DegenerateDataError, RigidChain, align
 from kbmaps.chains.placement import place
 
 from .limits import A_RADIAN_M, KNOWN_TOOL_M, MEASURED, SLIDES_M, TOOL_M, ZEROS_RAD, reach_m, spread_m
+from .orientations import AS_IT_IS, REMEDIES, errors_rad
 from .reading import QUARTER, Reading
+from .size import size_of
 
 # Number of rows to be read in other ways, evenly spread. Twice as many cost twice the time and change no verdict of the
 # tests.
@@ -71,6 +74,15 @@ class _Settings:
     turned_rad: float = math.radians(30.0)
     # A position belongs to the angles of a row this near at most: logs joined by row number lose one or two.
     near_rows: int = 3
+    # Positions of another size are reported if it is off by this many times its own uncertainty. Right recordings of
+    # real and generated arms come to 4.0, and fit hardly better for it.
+    far_size: float = 5.0
+    # Orientations of a tag on a nominal arm are no better than this.
+    oriented_rad: float = math.radians(1.0)
+    # Rows are shifted if this share of them fits so many times better with the angles of the row as far away. None do
+    # so in right recordings; 0.09 and more where half of the rows are shifted.
+    shifted: float = 0.08
+    shifted_better: float = 5.0
     # Share of its tolerance that is left to a joint offset that is held.
     held: float = 1e-3
     # A zero of the last joint this far off is not fitted where the marker is known: its quarter turns are tried
@@ -160,6 +172,7 @@ def plausibility(
     *,
     chain: RigidChain | None = None,
     sigma_m: float | None = None,
+    orientation: FloatArray | None = None,
 ) -> Plausibility:
     """Check pairs q (n, d) [rad, m] and x (n, 3) [m] before a fit to them is trusted.
 
@@ -169,6 +182,7 @@ def plausibility(
         x: positions (n, 3) [m].
         chain: the nominal chain if it is not the robot's.
         sigma_m: 1-sigma of a coordinate [m] if known.
+        orientation: of the marker, quaternions x, y, z, w (n, 4), if known.
     """
     chain = chain or robot.chain
     reach, spread = reach_m(robot), spread_m(x)
@@ -185,6 +199,9 @@ def plausibility(
         if shifted is not None:
             return shifted
     noise = 0.0 if sigma_m is None else _SETTINGS.noises * sigma_m
+    found = _partly_shifted(search, q, x) or search.sized(before, fit.error)
+    if found is not None:
+        return _decided(found, len(q))
     if before <= _SETTINGS.much_better * fit.error and not _nameable(chosen, fit, spread):
         chosen, fit, after = as_it_is, search.fits[as_it_is], before
     held = search.with_marker_known(chosen) if robot.robot.marker_known else None
@@ -216,9 +233,31 @@ def plausibility(
         elif not robot.robot.marker_known and (nearer := search.with_marker_nearer(as_it_is)) is not None:
             looks, tool_m = nearer.looks(names, fit.zeros), search.fits[nearer].tool_m
             found = replace(found, warnings=(*found.warnings, f"perhaps {looks}: {_marker_then(tool_m, fit.tool_m)}"))
-    if found.refusal is None or len(q) >= FEWEST_ROWS:
+    if orientation is not None and chosen == as_it_is and found.refusal is None:
+        found = _reordered(chain, q[rows] + fit.zeros, orientation[rows], fit) or found
+    return _decided(found, len(q))
+
+
+def _reordered(chain: RigidChain, q: FloatArray, orientation: FloatArray, fit: _Fit) -> Plausibility | None:
+    """Return a refusal if the quaternions fit far better in another order, or inverted; else None."""
+    errors = errors_rad(chain, q, fit.rotation, orientation)
+    before, best = errors.pop(AS_IT_IS), min(errors, key=errors.__getitem__)
+    after = errors[best]
+    if before <= _SETTINGS.much_better * max(after, _SETTINGS.oriented_rad):
+        return None
+    return Plausibility(
+        f"it seems that the columns qx, qy, qz, qw {best}: the orientations then fit to {math.degrees(after):.1f}°, "
+        f"and as they are to {math.degrees(before):.1f}°",
+        f"In the recording, {REMEDIES[best]}",
+        misread=True,
+    )
+
+
+def _decided(found: Plausibility, pairs: int) -> Plausibility:
+    """Turn a refusal into a warning where there are too few pairs."""
+    if found.refusal is None or pairs >= FEWEST_ROWS:
         return found
-    few = f"{found.refusal}. {found.remedy}. (These are {len(q)} pairs: {FEWEST_ROWS} are needed to decide.)"
+    few = f"{found.refusal}. {found.remedy}. (These are {pairs} pairs: {FEWEST_ROWS} are needed to decide.)"
     return Plausibility(warnings=(few,))
 
 
@@ -264,21 +303,55 @@ def _shifted(search: _Search, q: FloatArray, x: FloatArray, before: float) -> Pl
         q, x: all pairs (n, d) [rad, m] and (n, 3) [m].
         before: distance of the pairs as they are [m].
     """
-    shifts = [shift for shift in range(-_SETTINGS.near_rows, _SETTINGS.near_rows + 1) if shift]
-    rows = np.unique(np.linspace(_SETTINGS.near_rows, len(q) - 1 - _SETTINGS.near_rows, ROWS).astype(np.intp))
+    shifts, rows = _rows_nearby(len(q))
     errors = search.errors(np.stack([q[rows + shift] for shift in shifts]), np.stack([x[rows]] * len(shifts)))
     best = int(errors.argmin())
     after, shift = float(errors[best]), shifts[best]
     if after > _SETTINGS.named / 2 * spread_m(x) or before < _SETTINGS.much_better * after:
         return None
-    where, count = "later" if shift > 0 else "earlier", abs(shift)
-    row = f"{count} row{'s' if count > 1 else ''} {where}"
+    row, remedy = _moved(shift)
     return Plausibility(
         f"it seems that angles and positions are shifted against each other: with the angles of {row}, the pairs fit "
         f"to {_mm(after)}, and as they are to {_mm(before)}",
-        f"Move the columns of the joints by {row.removesuffix(f' {where}')} {'up' if shift > 0 else 'down'}, or the "
-        "positions the other way; or join the two logs by time, not by row",
+        remedy,
         misread=True,
+    )
+
+
+def _partly_shifted(search: _Search, q: FloatArray, x: FloatArray) -> Plausibility | None:
+    """Return a refusal if the positions of many rows, and not of most, belong to the angles of a row nearby."""
+    if len(q) < FEWEST_ROWS:
+        return None
+    shifts, rows = _rows_nearby(len(q))
+    own, *others = search.distances(np.stack([q[rows + shift] for shift in (0, *shifts)]), x[rows])
+    shares = [float((_SETTINGS.shifted_better * other < own).mean()) for other in others]
+    share, shift = max(zip(shares, shifts, strict=True))
+    if share < _SETTINGS.shifted:
+        return None
+    row, remedy = _moved(shift)
+    return Plausibility(
+        f"it seems that angles and positions are shifted against each other in {100.0 * share:.0f} % of the rows: "
+        f"these fit the angles of {row}",
+        f"In these rows: {remedy[0].lower()}{remedy[1:]}",
+        misread=True,
+    )
+
+
+def _rows_nearby(count: int) -> tuple[list[int], NDArray[np.intp]]:
+    """Return shifts, and rows of a recording of `count` that have neighbours so far away."""
+    near = _SETTINGS.near_rows
+    shifts = [shift for shift in range(-near, near + 1) if shift]
+    return shifts, np.unique(np.linspace(near, count - 1 - near, ROWS).astype(np.intp))
+
+
+def _moved(shift: int) -> tuple[str, str]:
+    """Return what row it is whose angles fit, and the remedy."""
+    count, where = abs(shift), "later" if shift > 0 else "earlier"
+    rows = f"{count} row{'s' if count > 1 else ''}"
+    return (
+        f"{rows} {where}",
+        f"Move the columns of the joints by {rows} {'up' if shift > 0 else 'down'}, or the positions the other way; or "
+        "join the two logs by time, not by row",
     )
 
 
@@ -330,8 +403,10 @@ class _Search:
 
     def __init__(self, chain: RigidChain, q: FloatArray, x: FloatArray, exact_m: float, pose_known: bool) -> None:
         self._chain, self._q, self._x, self._exact_m, self._pose_known = chain, q, x, exact_m, pose_known
+        self._parameters = ChainParameters(chain)
         self._std = np.where(chain.prismatic, SLIDES_M, ZEROS_RAD)
-        self._poses = _poses_apart(q / np.where(chain.prismatic, A_RADIAN_M, 1.0))
+        self._apart = _poses_apart(q / np.where(chain.prismatic, A_RADIAN_M, 1.0))
+        self._poses = len(self._apart)
         self._tried: set[Reading] = set()
         self.fits: dict[Reading, _Fit] = {}
 
@@ -395,10 +470,44 @@ class _Search:
         ratio = max(float(held.errors(MEASURED)[0]), self._exact_m) / fit.error
         return ratio > _SETTINGS.much_better and 3.0 * MEASURED * self._poses * math.log(ratio) > _SETTINGS.certain
 
+    def sized(self, before: float, best: float) -> Plausibility | None:
+        """Return what to say of positions that are too large or too small for the arm; None if they are not.
+
+        Args:
+            before: distance of the pairs as they are [m].
+            best: the same, in the best reading of the columns.
+        """
+        size = size_of(self._chain, self._q, self._x, self._apart)
+        after = max(size.error, self._exact_m)
+        far = size.sigmas > _SETTINGS.far_size and after < _SETTINGS.named / 2 * spread_m(self._x)
+        if not far or best < _SETTINGS.as_good * after:
+            return None
+        factor, low, high = (size.factor * math.exp(k * size.log_sigma) for k in (0.0, -1.96, 1.96))
+        text = (
+            f"the positions are {factor:.3g} times as large as the arm makes them (95 %: {low:.4g} to {high:.4g}): "
+            f"divided by that, the pairs fit to {_mm(after)}, and as they are to {_mm(before)}"
+        )
+        remedy = (
+            "Compare with what was measured: the size of the printed tag or the ball in [vision], the squares of the "
+            "calibration board, the unit of the columns x, y, z. If these are right, the URDF is of an arm of another "
+            "size"
+        )
+        if best > _SETTINGS.much_better * after:
+            return Plausibility(f"it seems that {text}", remedy, misread=True)
+        return Plausibility(warnings=(f"perhaps {text}. {remedy}",))
+
     def errors(self, q: FloatArray, x: FloatArray) -> FloatArray:
         """Return the distances (s,) [m] of sets of pairs q (s, n, d) and x (s, n, 3), with the columns as they are."""
         placed = place(self._chain, q, x, zeros_std=self._std, tool_std=TOOL_M)
         return np.maximum(placed.errors(MEASURED), self._exact_m)
+
+    def distances(self, q: FloatArray, x: FloatArray) -> FloatArray:
+        """Return the distances (s, n) [m] of positions x (n, 3) from the arm at q (s, n, d), placed by the first."""
+        placed, p = place(self._chain, q[:1], x[None], zeros_std=self._std, tool_std=TOOL_M), self._parameters
+        change = np.zeros(p.size)
+        change[p.zeros], change[p.tool] = placed.zeros[0], placed.tools[0]
+        drawn = np.stack([p.positions(change, each) for each in q])
+        return np.linalg.norm(drawn @ placed.rotations[0].T + placed.shifts[0] - x, axis=2)
 
     def with_marker_known(self, reading: Reading) -> tuple[Reading, _Fit] | None:
         """Return the reading with a zero near the hand off by quarter turns, and its fit, if the known marker shows it.
@@ -521,14 +630,14 @@ class _Search:
         return fits
 
 
-def _poses_apart(q: FloatArray) -> int:
-    """Return how many of the poses q (n, d) are `apart_rad` from each other, in at least one joint."""
+def _poses_apart(q: FloatArray) -> list[int]:
+    """Return poses of q (n, d) that are `apart_rad` from each other, in at least one joint."""
     apart = np.abs(q[:, None] - q).max(axis=2) > _SETTINGS.apart_rad
     kept: list[int] = []
     for pose, far in enumerate(apart):
         if far[kept].all():
             kept.append(pose)
-    return len(kept)
+    return kept
 
 
 def _mm(distance_m: float) -> str:

@@ -211,7 +211,14 @@ def run(config: Config, source: Source, asked: Asked, tell: Tell, *, force: bool
         raise DiagnosisError(f"{source.name}: no joint ever moved. Guide each joint through its range")
     tell(f"{len(recording)} pairs of {source.name}")
     chain = NominalModel.extended_by(config.simulation).chain
-    seen = plausibility(robot, recording.q, recording.x, chain=chain, sigma_m=told_sigma(recording))
+    seen = plausibility(
+        robot,
+        recording.q,
+        recording.x,
+        chain=chain,
+        sigma_m=told_sigma(recording),
+        orientation=recording.orientation,
+    )
     warnings = seen.require(source.name, force=force)
     diagnosis = diagnosed(
         recording, config.simulation, only=asked.only, without=asked.without, seed=asked.seed, tell=tell

@@ -30,9 +30,10 @@ from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.identity import SECURE
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.wire import encode
-from bodyschema.interfaces.errors import ConfigError
+from bodyschema.interfaces.errors import ConfigError, StoreUnwritable
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.waits import NICENESS, RETRY_S, STATUS_EVERY_S
+from bodyschema.recordings.store.file import lock
 
 IDLE_S = 0.02
 SOLVE_WHEN_IDLE_S = 0.5
@@ -103,7 +104,8 @@ def run_learners(configs: Sequence[Config], clock: Clock, wishes: SignalFlags, n
     """Learn and answer for all robots until `wishes` requests the end.
 
     Raise ConfigError if the robots cannot be served by one process. Raise BusError if a learner's port is in use. Raise
-    CheckpointError if an unusable checkpoint cannot be moved aside.
+    StoreError if another learner has the same state. Raise CheckpointError if an unusable checkpoint cannot be moved
+    aside.
 
     Args:
         notifier: is notified once everything is up, that every loop works, and of the learners' states.
@@ -114,6 +116,8 @@ def run_learners(configs: Sequence[Config], clock: Clock, wishes: SignalFlags, n
     with ExitStack() as stack:
         process = stack.enter_context(SolverProcess())
         bus = stack.enter_context(ZenohSession(settings=session_settings(configs)))
+        for config in configs:
+            stack.enter_context(alone(config))
         learners = _learners(configs, process, bus, clock, service)
         gc.collect()
         gc.freeze()  # objects of the start-up need not be scanned again
@@ -126,6 +130,25 @@ def run_learners(configs: Sequence[Config], clock: Clock, wishes: SignalFlags, n
             learners, [bus.publisher(Keys(c.robot.name).status("learner")) for c in configs], wishes, service, failed
         )
         service.stopping()
+
+
+@contextmanager
+def alone(config: Config) -> Iterator[None]:
+    """Keep other learners from the state of this one.
+
+    Raises:
+        StoreError: another learner has it.
+    """
+    try:
+        config.state_dir.mkdir(parents=True, exist_ok=True)
+        descriptor = lock(config.checkpoint_file, "learner")
+    except (OSError, StoreUnwritable):  # no learner can write there, and the health says so
+        yield
+        return
+    try:
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def session_settings(configs: Sequence[Config]) -> dict[str, Any]:

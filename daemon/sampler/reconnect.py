@@ -164,7 +164,7 @@ class ResilientWriter:
         """
         pair = self.attempt(lambda: self._store.append(segment, self._wall.utc(), q, fix))
         if pair is not None and self._refused is not None:
-            log.info("the disk takes pairs again, after %d frames that it did not", self._lost)
+            log.info("the disk takes pairs again")
             self._refused, self._lost = None, 0
         return pair
 

@@ -21,6 +21,8 @@ REPEATED_S = 60.0
 OFTEN = 20  # messages that differ only in numbers may appear this often in that time
 REMEMBERED = 256
 _NUMBER = re.compile(r"\d+")
+# Clients of the page, and a disk that is full again after each pair, cause messages without end.
+_FLOODED = ("uvicorn", "bodyschema.daemon.sampler.reconnect")
 
 
 class PlainFormatter(logging.Formatter):
@@ -106,17 +108,18 @@ class UnrepeatedHandler(logging.StreamHandler[TextIO]):
 def set_up(*, verbose: bool = False, environment: Mapping[str, str] = os.environ, stream: TextIO | None = None) -> None:
     """Send the log to `stream` (stderr): under systemd with priorities and without repeats, otherwise with times."""
     out = sys.stderr if stream is None else stream
-    # Clients of the page, whoever they are, cause its server's messages as often as they like.
-    server = logging.getLogger("uvicorn")
     if is_journal(out, environment):
-        handler = UnrepeatedHandler(out, JournalFormatter("%(name)s: %(message)s"))
-        server.handlers[:], server.propagate = [], True
+        handler: logging.Handler = UnrepeatedHandler(out, JournalFormatter("%(name)s: %(message)s"))
+        limited: list[logging.Handler] = []
         faulthandler.enable(out)  # shows what each thread did when the watchdog ends the process
     else:
         formatter = PlainFormatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s", "%H:%M:%S")
         handler = logging.StreamHandler(out)
         handler.setFormatter(formatter)
-        server.handlers[:], server.propagate = [UnrepeatedHandler(out, formatter)], False
+        limited = [UnrepeatedHandler(out, formatter)]
+    for name in _FLOODED:
+        flooded = logging.getLogger(name)
+        flooded.handlers[:], flooded.propagate = limited, not limited
     root = logging.getLogger()
     root.handlers[:] = [handler]
     root.setLevel(logging.DEBUG if verbose else logging.INFO)

@@ -100,19 +100,24 @@ def disk_free(file: Path) -> int:
         raise StoreError(f"the directory of {file} is gone: {error.strerror}") from error
 
 
-def lock(file: Path) -> int:
-    """Lock a file next to the store; the process's end releases the lock, and children do not inherit it."""
+def lock(file: Path, writer: str = "sampler") -> int:
+    """Lock a file next to `file`; the process's end releases the lock, and children do not inherit it.
+
+    Raises:
+        StoreUnwritable: the disk accepts no file.
+        StoreError: another process has locked it.
+    """
     lock_file = file.with_name(file.name + ".lock")
     try:
         descriptor = os.open(lock_file, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     except OSError as error:
-        raise StoreError(unwritable(file, error.errno, error.strerror)) from error
+        raise StoreUnwritable(unwritable(file, error.errno, error.strerror)) from error
     try:
         fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except OSError as error:
         os.close(descriptor)
         raise StoreError(
-            f"another sampler is writing {file}. Stop it (`bodyschema status` shows it), "
+            f"another {writer} is writing {file}. Stop it (`bodyschema status` shows it), "
             "or give this one a --state-dir of its own"
         ) from error
     return descriptor

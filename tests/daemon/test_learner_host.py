@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -15,7 +17,7 @@ from small_arm import write_small_arm
 from told_statuses import LEARNER
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.learner.host import Background, attend, run_learners, session_settings
+from bodyschema.daemon.learner.host import Background, alone, attend, run_learners, session_settings
 from bodyschema.daemon.learner.learner import Learner
 from bodyschema.daemon.learner.solver_pool import SolverPool
 from bodyschema.daemon.learner.solver_process import SolverLostError
@@ -28,7 +30,7 @@ from bodyschema.daemon.transport.status import LearnerStatus
 from bodyschema.daemon.transport.wire import decode
 from bodyschema.fleet.hosting import configs_of, descriptions, shares
 from bodyschema.interfaces.clock import SystemClock
-from bodyschema.interfaces.errors import BusError, ConfigError
+from bodyschema.interfaces.errors import BusError, ConfigError, StoreError
 from bodyschema.learning.solvers.solver import Solved, Task
 from kbmaps import ChainTolerances
 
@@ -73,6 +75,31 @@ def test_every_robot_is_answered_for_by_the_one_process(robots: list[Config]) ->
         host.join()
     assert [status.robot for status in said] == ["left", "right"]
     assert all(config.checkpoint_file.exists() for config in robots)
+
+
+@pytest.mark.parametrize("killed", [False, True])
+def test_a_second_learner_on_the_state_is_refused(robots: list[Config], killed: bool) -> None:
+    """Another process has the lock, since locks belong to processes; its end releases it however it ends."""
+    file = robots[0].checkpoint_file
+    file.parent.mkdir(parents=True, exist_ok=True)
+    code = (
+        "import sys; from pathlib import Path; from bodyschema.recordings.store.file import lock\n"
+        "lock(Path(sys.argv[1]), 'learner'); print('locked', flush=True); sys.stdin.read()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code, file], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout is not None
+        other.stdout.readline()
+        if killed:
+            other.kill()
+            other.wait()
+            with alone(robots[0]):
+                pass
+        else:
+            with pytest.raises(StoreError, match=f"another learner is writing {file}"), alone(robots[0]):
+                pass
+            other.terminate()
 
 
 class Attended:

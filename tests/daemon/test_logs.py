@@ -8,20 +8,30 @@ import signal
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import cast
 
+import numpy as np
 import pytest
 
+from bodyschema.daemon.sampler import reconnect
+from bodyschema.daemon.sampler.reconnect import ResilientWriter
 from bodyschema.daemon.service import logs
 from bodyschema.daemon.service.signals import on_termination
+from bodyschema.interfaces.clock import SystemClock
+from bodyschema.interfaces.errors import StoreUnwritable
+from bodyschema.interfaces.records import MarkerFix
+from bodyschema.recordings.store.store import PairStore
 
 
 @pytest.fixture(autouse=True)
 def root_logger() -> Iterator[None]:
-    root, server = logging.getLogger(), logging.getLogger("uvicorn")
+    root = logging.getLogger()
     handlers, level = root.handlers[:], root.level
     yield
     root.handlers[:], root.level = handlers, level
-    server.handlers[:], server.propagate = [], True
+    for name in logs._FLOODED:
+        flooded = logging.getLogger(name)
+        flooded.handlers[:], flooded.propagate = [], True
 
 
 def logged(file: Path, environment: Callable[[os.stat_result], dict[str, str]]) -> list[str]:
@@ -67,6 +77,33 @@ def test_malformed_requests_fill_no_terminal(tmp_path) -> None:
     assert lines.count("ours") == 50
     first, again = (line for line in lines if line != "ours")
     assert (first, again[:13]) == ("Invalid HTTP request received.", "49 more times")
+
+
+def test_a_disk_that_is_full_again_after_each_pair_fills_no_terminal() -> None:
+    stream, said = io.StringIO(), [StoreUnwritable("the disk is full"), 1] * 50
+    logs.set_up(environment={}, stream=stream)
+    writer = ResilientWriter(cast(PairStore, Flapping(said)), SystemClock())
+    for _ in range(100):
+        writer.append(1, np.zeros(2), cast(MarkerFix, None))
+    lines = [line.split(": ", 1)[1] for line in stream.getvalue().splitlines()]
+    assert lines == ["the disk is full; it is tried again with each pair", "the disk takes pairs again"]
+    logging.getLogger(reconnect.__name__).handlers[0].close()
+    assert "49 more times" in stream.getvalue()
+
+
+class Flapping:
+    """A store on a disk that is full for every second pair."""
+
+    file = Path("pairs.sqlite")
+
+    def __init__(self, said: list[Exception | int]) -> None:
+        self._said = iter(said)
+
+    def append(self, *_: object) -> int:
+        found = next(self._said)
+        if isinstance(found, Exception):
+            raise found
+        return found
 
 
 class HandClock:

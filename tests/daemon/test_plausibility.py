@@ -42,9 +42,9 @@ class Pairs:
     pose_known: bool = False
     marker_known: bool = False
 
-    def seen(self, rows: int | None = None) -> Plausibility:
+    def seen(self, rows: int | None = None, orientation: np.ndarray | None = None) -> Plausibility:
         known = robot(pose_known=self.pose_known, marker_known=self.marker_known)
-        return plausibility(known, self.q[:rows], self.x[:rows])
+        return plausibility(known, self.q[:rows], self.x[:rows], orientation=orientation)
 
     def read(self, reading: Reading) -> Pairs:
         """Apply `reading` to this recording's columns."""
@@ -179,6 +179,42 @@ def test_a_large_unit_is_named_before_anything_is_fitted(unit, span) -> None:
         require_units(robot(), recording, Path("pairs.csv"))
 
 
+@pytest.mark.parametrize("factor", [1.1, pytest.param(0.9144, marks=pytest.mark.soak)])
+def test_positions_of_another_size_are_refused_with_the_factor(factor) -> None:
+    right = pairs()
+    found = replace(right, x=factor * right.x).seen()
+    assert f"the positions are {factor:.3g} times as large as the arm makes them" in (found.refusal or "")
+    assert found.remedy.startswith("Compare with what was measured: the size of the printed tag")
+
+
+def test_a_size_that_lengths_explain_is_not_named() -> None:
+    """One link that is 20 mm longer is no larger unit."""
+    right = pairs(zeros_deg=0.0)
+    chain = arm()
+    fixed = chain.fixed.copy()
+    fixed[2, 0, 3] += 0.02
+    x = RigidChain(fixed, chain.axes, chain.prismatic).positions(right.q)
+    assert replace(right, x=x).seen().refusal is None
+
+
+@pytest.mark.parametrize(
+    ("order", "signs", "said"),
+    [
+        ([0, 1, 2, 3], [1, 1, 1, 1], ""),
+        ([3, 0, 1, 2], [1, 1, 1, 1], "hold a quaternion with w first: "),
+        ([0, 1, 2, 3], [-1, -1, -1, 1], "hold the conjugate"),
+        ([3, 0, 1, 2], [1, -1, -1, -1], "w first, and hold the conjugate"),
+    ],
+)
+def test_quaternions_in_another_order_are_refused_and_named(order, signs, said) -> None:
+    right = pairs(zeros_deg=0.0)
+    noise = Rotation.from_rotvec(0.03 * np.random.default_rng(0).normal(size=(len(right.q), 3)))
+    shown = Rotation.from_matrix(arm().orientation(right.q)) * Rotation.from_rotvec([0.3, -1.0, 0.5]) * noise
+    found = Pairs(right.q, arm().positions(right.q)).seen(orientation=shown.as_quat()[:, order] * signs)
+    assert said in (found.refusal or "")
+    assert (found.refusal is None) == (not said)
+
+
 def test_degrees_are_named_however_small() -> None:
     right = pairs()
     assert "the angles are in degrees" in (replace(right, q=np.degrees(right.q)).seen().refusal or "")
@@ -246,6 +282,15 @@ def test_positions_of_another_row_are_named(rows, said) -> None:
     found = replace(right, q=np.roll(right.q, -rows, axis=0)).seen()
     assert f"with the angles of {said}" in (found.refusal or "")
     assert found.misread
+
+
+@pytest.mark.parametrize(("rows", "said"), [(slice(60, None), "1 row later"), (slice(1, None, 2), "2 rows later")])
+def test_positions_of_another_row_in_half_of_the_rows_are_named(rows, said) -> None:
+    right = pairs()
+    q = right.q.copy()
+    q[rows] = np.roll(q[rows], 1, axis=0)
+    found = replace(right, q=q).seen()
+    assert f"% of the rows: these fit the angles of {said}" in (found.refusal or "")
 
 
 def test_the_direction_of_a_joint_through_the_marker_is_not_shown() -> None:
@@ -376,6 +421,24 @@ def test_real_recordings_are_not_doubted(name) -> None:
     robot = Config.load(REAL_DATA / name / "robot.toml", {}).robot
     recording = Recording.read(REAL_DATA / name / "measured.csv", robot.joints)
     assert plausibility(robot, recording.q, recording.x).sentences == ()
+
+
+@real
+@pytest.mark.parametrize(
+    "factor", [1.1, *(pytest.param(factor, marks=pytest.mark.soak) for factor in (0.9, 0.9144, 1.05, 1.0936))]
+)
+@pytest.mark.parametrize(
+    "name",
+    [
+        "panda_eyeinhand",
+        *(pytest.param(name, marks=pytest.mark.soak) for name in ("ur5_laser", "wam_laser", "tiago_eyehand")),
+    ],
+)
+def test_a_real_recording_of_another_size_is_refused(name, factor) -> None:
+    robot = Config.load(REAL_DATA / name / "robot.toml", {}).robot
+    recording = Recording.read(REAL_DATA / name / "measured.csv", robot.joints)
+    found = plausibility(robot, recording.q, factor * recording.x)
+    assert "times as large as the arm makes them" in (found.refusal or "")
 
 
 @real

@@ -192,7 +192,13 @@ def arm(
     description, source = config.robot, source or config.store_file
     recording, first = _rows(config, source, taken, servos.lerobot, (first, last))
     require_units(description, recording, source)
-    seen = plausibility(description, recording.q, recording.x, sigma_m=told_sigma(recording) or fit.sigma_m)
+    seen = plausibility(
+        description,
+        recording.q,
+        recording.x,
+        sigma_m=told_sigma(recording) or fit.sigma_m,
+        orientation=recording.orientation,
+    )
     if seen.misread:
         seen.require(source, force=force)
     found, free = fit.fitted(description, recording)

@@ -85,7 +85,14 @@ def replay(
         require_path(Steps.of(rows, config.robot, config.tables.daemon), rows)
     sigma_m = None if sigma_mm is None else 1e-3 * sigma_mm
     chain = NominalModel.extended_by(config.simulation).chain
-    seen = plausibility(config.robot, rows.q, rows.x, chain=chain, sigma_m=told_sigma(rows) or sigma_m)
+    seen = plausibility(
+        config.robot,
+        rows.q,
+        rows.x,
+        chain=chain,
+        sigma_m=told_sigma(rows) or sigma_m,
+        orientation=rows.orientation,
+    )
     warnings = seen.require(recording, force=force)
     if keep is not None:
         _make_folder(keep)

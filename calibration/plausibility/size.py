@@ -1,0 +1,144 @@
+"""Size of the measured positions against the lengths of the arm."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from bodyschema.interfaces.records import FloatArray
+from bodyschema.learning.solvers.tolerance_selection import WORKMANSHIP
+from kbmaps import ChainParameters, ChainTolerances, RigidChain
+from kbmaps.chains.parameters import WIDE
+from kbmaps.chains.placement import Placements, place
+from kbmaps.rotations import rotation_vectors
+
+from .limits import MEASURED, SLIDES_M, TOOL_M, ZEROS_RAD
+
+# The links are linearised about a fit with nominal links: two steps reach 0.1 % from a size that is 20 % off.
+_STEPS = 3
+# Candidate noise levels, as shares of the residuals with nominal links: tolerances explain the rest of these.
+_NOISES = np.geomspace(0.01, 2.0, 16)
+# Rows farther off than this multiple of the median are outliers.
+_FAR = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """Estimated size of measured positions, as a multiple of the true ones.
+
+    Attributes:
+        factor: the multiple.
+        log_sigma: 1-sigma of its logarithm, with the tolerances of links, joint offsets and marker integrated over.
+        error: RMS distance of the nearest pairs from the nominal chain of that size, in the recording's unit.
+    """
+
+    factor: float
+    log_sigma: float
+    error: float
+
+    @property
+    def sigmas(self) -> float:
+        """Distance from the right size, in its uncertainty."""
+        return abs(math.log(self.factor)) / self.log_sigma
+
+
+def size_of(chain: RigidChain, q: FloatArray, x: FloatArray, apart: list[int]) -> Size:
+    """Estimate the size of positions x (n, 3) [m] at q (n, d) [rad, m].
+
+    The links of an arm may be a little longer than nominal, by tolerances that the pairs show, but hardly all of them
+    by the same factor.
+
+    Args:
+        apart: rows of poses far from each other. The errors of others are alike, and say nothing new.
+    """
+    log, sigma = 0.0, math.inf
+    for _ in range(_STEPS):
+        placed = _placed(chain, q[apart], x[apart] / math.exp(log))
+        step, sigma = _log_size(chain, q[apart], placed, x[apart] / math.exp(log))
+        log += step
+    error = float(_placed(chain, q, x / math.exp(log)).errors(MEASURED)[0])
+    return Size(math.exp(log), sigma, math.exp(log) * error)
+
+
+def _placed(chain: RigidChain, q: FloatArray, x: FloatArray) -> Placements:
+    std = np.where(chain.prismatic, SLIDES_M, ZEROS_RAD)
+    return place(chain, q[None], x[None], zeros_std=std, tool_std=TOOL_M)
+
+
+def _log_size(chain: RigidChain, q: FloatArray, placed: Placements, x: FloatArray) -> tuple[float, float]:
+    """Return mean and 1-sigma of the logarithm of the positions' size, over all workmanships and noise levels."""
+    distances, parameters = placed.distances[0], ChainParameters(chain)
+    good = distances <= _FAR * np.median(distances)
+    change = np.zeros(parameters.size)
+    change[parameters.zeros], change[parameters.tool] = placed.zeros[0], placed.tools[0]
+    tolerated = change.copy()
+    change[parameters.base_turn] = rotation_vectors(placed.rotations)[0]
+    change[parameters.base_shift] = placed.shifts[0]
+    drawn, jacobian = parameters.linearised(change, q[good])
+    jacobian = jacobian.reshape(-1, parameters.size)
+    # The prior of zeros and marker is about nominal, not about their fit.
+    residuals = (x[good] - drawn).ravel() + jacobian @ tolerated
+    larger = (drawn - drawn.mean(axis=0)).ravel()
+    noises = np.square(_NOISES * np.sqrt(np.square(distances[good]).mean() / 3.0))
+    # All that the parameters explain is in a few directions.
+    basis, effects = np.linalg.qr(jacobian)
+    both = np.stack([residuals, larger])
+    within = both @ basis
+    beyond = (both - within @ basis.T) @ (both - within @ basis.T).T
+    found = [_posteriors(effects @ made, within, beyond, noises, len(residuals)) for made in _made(parameters)]
+    evidence, means, variances = np.concatenate(found, axis=1)
+    shares = np.exp(evidence - evidence.max())
+    shares /= shares.sum()
+    mean = float(shares @ means)
+    return mean, math.sqrt(float(shares @ (variances + np.square(means - mean))))
+
+
+def _made(parameters: ChainParameters) -> Iterator[FloatArray]:
+    """Yield roots (p, k) of the covariance of each workmanship, and of the same with one link of any length."""
+    _, _, tangents, _, marker = parameters.tables
+    joints = len(tangents)
+    for axes, points in WORKMANSHIP:
+        tolerances = ChainTolerances(
+            axes=axes,
+            points=points,
+            zeros=ZEROS_RAD,
+            slide_zeros=SLIDES_M,
+            tool=TOOL_M,
+            base_rotation=WIDE,
+            base_translation=WIDE,
+        )
+        root = np.diag(parameters.standard_deviations(tolerances))
+        yield root
+        for joint in range(1, joints):
+            # Such a link moves all axes behind it, and the marker.
+            moved = np.zeros((parameters.size, 3))
+            moved[parameters.shifts] = (
+                (tangents * (np.arange(joints) >= joint)[:, None, None]).swapaxes(1, 2).reshape(-1, 3)
+            )
+            moved[parameters.tool] = marker[:3, :3].T
+            yield np.hstack([root, TOOL_M * moved])
+
+
+def _posteriors(
+    effects: FloatArray, within: FloatArray, beyond: FloatArray, noises: FloatArray, count: int
+) -> FloatArray:
+    """Return log evidence, mean and variance (3, k) of the size, for each noise variance (k,).
+
+    Args:
+        effects: of numbers of variance 1 (p, k).
+        within: residuals and the effect of the size, as far as the parameters can explain them (2, p).
+        beyond: products of the rest (2, 2).
+        count: of coordinates.
+    """
+    directions, sizes, _ = np.linalg.svd(effects, full_matrices=False)
+    within = within @ directions
+    variances = np.square(sizes) + noises[:, None]
+    products = np.einsum("ip,jp,kp->kij", within, within, 1.0 / variances) + beyond / noises[:, None, None]
+    # A prior of a factor e.
+    precision = products[:, 1, 1] + 1.0
+    unexplained = products[:, 0, 0] - np.square(products[:, 0, 1]) / precision
+    volume = np.log(variances).sum(axis=1) + (count - len(sizes)) * np.log(noises) + np.log(precision)
+    return np.stack([-0.5 * (unexplained + volume), products[:, 0, 1] / precision, 1.0 / precision])
