@@ -24,8 +24,7 @@ from kbmaps import ChainParameters, DegenerateDataError, RigidChain, align
 from kbmaps.chains.placement import place
 
 from .limits import A_RADIAN_M, KNOWN_TOOL_M, MEASURED, SLIDES_M, TOOL_M, ZEROS_RAD, reach_m, spread_m
-from .orientations import AS_IT_IS, REMEDIES, errors_rad
-from .reading import QUARTER, Reading
+from .reading import AS_IT_IS, QUARTER, REMEDIES, Reading, errors_rad
 from .size import size_of
 
 # Number of rows to be read in other ways, evenly spread. Twice as many cost twice the time and change no verdict of the
