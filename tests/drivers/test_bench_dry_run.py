@@ -328,6 +328,7 @@ def test_readings_through_servos_keep_their_times_and_have_the_servos_resolution
 
 
 @EACH
+@pytest.mark.usefixtures("patient_host")
 def test_readings_through_a_bench_can_be_opened_again(make) -> None:
     source = through(Scripted([POSE] * 2), make)
     for _ in range(2):
