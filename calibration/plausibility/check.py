@@ -76,6 +76,8 @@ class _Settings:
     # Positions of another size are reported if it is off by this many times its own uncertainty. Right recordings of
     # real and generated arms come to 4.0, and fit hardly better for it.
     far_size: float = 5.0
+    # Smaller ones are warned of: a joint whose ratio is 2 % off looks like positions 2.4 % off.
+    other_size: float = 0.04
     # Orientations of a tag on a nominal arm are no better than this.
     oriented_rad: float = math.radians(1.0)
     # Rows are shifted if this share of them fits so many times better with the angles of the row as far away. None do
@@ -491,7 +493,7 @@ class _Search:
             "calibration board, the unit of the columns x, y, z. If these are right, the URDF is of an arm of another "
             "size"
         )
-        if best > _SETTINGS.much_better * after:
+        if best > _SETTINGS.much_better * after and abs(math.log(size.factor)) > _SETTINGS.other_size:
             return Plausibility(f"it seems that {text}", remedy, misread=True)
         return Plausibility(warnings=(f"perhaps {text}. {remedy}",))
 
