@@ -200,9 +200,9 @@ def plausibility(
         if shifted is not None:
             return shifted
     noise = 0.0 if sigma_m is None else _SETTINGS.noises * sigma_m
-    found = _partly_shifted(search, q, x) or search.sized(before, fit.error)
-    if found is not None:
-        return _decided(found, len(q))
+    sized = _partly_shifted(search, q, x) or search.sized(before, fit.error) or Plausibility()
+    if sized.refusal is not None:
+        return _decided(sized, len(q))
     if before <= _SETTINGS.much_better * fit.error and not _nameable(chosen, fit, spread):
         chosen, fit, after = as_it_is, search.fits[as_it_is], before
     held = search.with_marker_known(chosen) if robot.robot.marker_known else None
@@ -236,7 +236,7 @@ def plausibility(
             found = replace(found, warnings=(*found.warnings, f"perhaps {looks}: {_marker_then(tool_m, fit.tool_m)}"))
     if orientation is not None and chosen == as_it_is and found.refusal is None:
         found = _reordered(chain, q[rows] + fit.zeros, orientation[rows], fit) or found
-    return _decided(found, len(q))
+    return _decided(replace(found, warnings=(*sized.warnings, *found.warnings)), len(q))
 
 
 def _reordered(chain: RigidChain, q: FloatArray, orientation: FloatArray, fit: _Fit) -> Plausibility | None:

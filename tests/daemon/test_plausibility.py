@@ -215,6 +215,14 @@ def test_quaternions_in_another_order_are_refused_and_named(order, signs, said) 
     assert (found.refusal is None) == (not said)
 
 
+def test_a_doubt_about_the_size_hides_no_other_fault() -> None:
+    right = pairs(zeros_deg=0.0)
+    shown = Rotation.from_matrix(arm().orientation(right.q)).as_quat()[:, [3, 0, 1, 2]]
+    found = Pairs(right.q, 1.03 * arm().positions(right.q)).seen(orientation=shown)
+    assert "w first" in (found.refusal or "")
+    assert "1.03 times as large" in found.warnings[0]
+
+
 def test_degrees_are_named_however_small() -> None:
     right = pairs()
     assert "the angles are in degrees" in (replace(right, q=np.degrees(right.q)).seen().refusal or "")
