@@ -60,8 +60,8 @@ class RigidChain:
         for name, array in (("fixed", fixed), ("axes", axes)):
             if not np.isfinite(array).all():
                 raise NonFiniteError(name)
-        for k, transform in enumerate(fixed):
-            check_rigid(f"fixed[{k}]", transform)
+        for k in np.flatnonzero(~_are_rigid(fixed)).tolist():
+            check_rigid(f"fixed[{k}]", fixed[k])
         lengths = np.linalg.norm(axes, axis=1)
         if np.abs(lengths - 1.0).max() > _RIGID_TOLERANCE:
             worst = int(np.abs(lengths - 1.0).argmax())
@@ -243,7 +243,12 @@ def check_rigid(name: str, transform: FloatArray) -> None:
     """Raise ShapeError or ChainError unless `transform` (4, 4) is a proper rigid transform."""
     if transform.shape != (4, 4):
         raise ShapeError(name, "(4, 4)", transform.shape)
-    rotation = transform[:3, :3]
-    off = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if not (off <= _RIGID_TOLERANCE and np.linalg.det(rotation) > 0.0 and (transform[3] == (0, 0, 0, 1)).all()):
+    if not _are_rigid(transform[None])[0]:
         raise ChainError(f"{name} is not a rigid transform: a proper rotation, a translation and the row 0 0 0 1")
+
+
+def _are_rigid(transforms: FloatArray) -> BoolArray:
+    rotations = transforms[:, :3, :3]
+    off = np.abs(rotations @ rotations.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
+    is_proper = (off <= _RIGID_TOLERANCE) & (np.linalg.det(rotations) > 0.0)
+    return is_proper & (transforms[:, 3] == (0.0, 0.0, 0.0, 1.0)).all(axis=1)
