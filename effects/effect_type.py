@@ -220,7 +220,7 @@ class StructureEffect(EffectType):
         """
         return np.zeros_like(torque), side
 
-    def load(self, robot: RobotDescription, values: FloatArray) -> GravityLoad | None:
+    def load(self, gravity: GravityLoad, values: FloatArray) -> GravityLoad | None:
         """Return the load of a mass that the URDF does not state; None without one."""
         return None
 

@@ -67,7 +67,7 @@ class EncoderEffect(EffectType):
     def jacobian(self, run: Simulated, effect: Effect) -> FloatArray:
         """Return derivatives (n, 3, p) of the measurements by the effect's values."""
         place = run.simulation.place(effect)
-        return run.by_joint[:, :, [place.joint]] * self.columns(run.readings, place, effect.values)[:, None, :]
+        return run.by_joint[:, :, place.joint, None] * self.columns(run.readings, place, effect.values)[:, None, :]
 
     @property
     def encoder(self) -> EncoderEffect:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -34,6 +36,18 @@ class Body:
     mass_kg: float = 0.0
     moment: FloatArray = field(default_factory=lambda: np.zeros(3))
 
+    @cached_property
+    def across(self) -> FloatArray:
+        """The cross-product matrix (3, 3) of its joint's axis."""
+        assert self.joint is not None
+        return cross_matrix(self.joint.axis)
+
+    @cached_property
+    def turns(self) -> FloatArray:
+        """Rotations (3, 3, 3) into the carrier, by 1 + sine of the joint's angle + cosine of it (Rodrigues)."""
+        over = self.across @ self.across
+        return self.T_carrier_joint[:3, :3] @ np.stack([np.eye(3) + over, self.across, -over])
+
 
 class GravityLoad:
     """Gravity's torques about the joints of a robot, independent of what holds them.
@@ -41,33 +55,38 @@ class GravityLoad:
     Joints that are not read stand where robot.toml holds them. The mass of the tool is unknown and not included.
 
     Args:
-        masses: masses of the links. By default those of the URDF; if it states none that a joint bears, each link
-            weighs `ROD_KG_PER_M` along straight lines between its joints.
+        robot: its links have the masses of the URDF; if it states none that a joint bears, each link weighs
+            `ROD_KG_PER_M` along straight lines between its joints.
 
     Attributes:
         known: True if the URDF states a mass that a joint bears.
     """
 
-    def __init__(self, robot: RobotDescription, masses: Mapping[str, PointMass] | None = None) -> None:
+    def __init__(self, robot: RobotDescription) -> None:
         self._robot = robot
         stated = _bodies(robot, robot.tree.masses)
         self.known = any(body.mass_kg > 0.0 for k, body in stated.items() if k is not None)
-        assumed = {} if self.known or masses is not None else _rods(robot)
-        self._bodies = stated if self.known and masses is None else _bodies(robot, masses or assumed)
+        self._bodies = stated if self.known else _bodies(robot, _rods(robot))
         self._outwards = [k for k in self._order() if k is not None]
 
-    @classmethod
-    def of_payload(cls, robot: RobotDescription, mass_kg: float, moment: FloatArray) -> GravityLoad:
+    def of_payload(self, mass_kg: float, moment: FloatArray) -> GravityLoad:
         """Return the load of a mass at the marker's link alone.
 
         Args:
             moment: mass times its place in the link's frame [kg·m], shape (3,).
         """
-        load = cls(robot, {})
-        carrier, T = carried(robot.tree, robot.robot.marker_link, robot.joints, robot.robot.held_at)
+        carrier, T = self._marker
+        load = copy(self)
+        load._bodies = {k: Body(body.joint, body.carrier, body.T_carrier_joint) for k, body in self._bodies.items()}
         body = load._bodies[carrier]
         body.mass_kg, body.moment = mass_kg, mass_kg * T[:3, 3] + T[:3, :3] @ moment
         return load
+
+    @cached_property
+    def _marker(self) -> tuple[int | None, FloatArray]:
+        """The joint that carries the marker's link, and the link's pose (4, 4), as in `carried`."""
+        robot = self._robot
+        return carried(robot.tree, robot.robot.marker_link, robot.joints, robot.robot.held_at)
 
     @property
     def bodies(self) -> Mapping[int | None, Body]:
@@ -94,39 +113,46 @@ class GravityLoad:
 
     def torques(self, q: FloatArray) -> FloatArray:
         """Return gravity's torque about each joint, positive in its direction [N·m, or N] (n, d), at q (n, d)."""
-        moments, forces = self.loads(q)
         torques = np.zeros_like(q)
-        for k in self._outwards:
-            joint = self._bodies[k].joint
-            assert joint is not None
-            torques[:, k] = (moments if joint.kind in REVOLUTE else forces)[:, k] @ joint.axis
+        for k, mass, moment, down, _ in self._inwards(q):
+            body = self._bodies[k]
+            assert body.joint is not None
+            if body.joint.kind in REVOLUTE:
+                torques[:, k] = np.einsum("in,in->n", body.across @ moment, down)
+            else:
+                torques[:, k] = mass * (body.joint.axis @ down)
         return torques
 
     def loads(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return gravity's load on what each joint carries: moments about its origin [N·m] and forces [N], (n, d, 3).
 
-        Vectors are in the joint's frame on its parent link, at q (n, d). They pass from frame to frame: gravity
-        outwards, mass times centre of mass back.
+        Vectors are in the joint's frame on its parent link, at q (n, d).
         """
-        turns = {k: _Turn.of(body.joint, q[:, k]) for k, body in self._bodies.items() if body.joint is not None}
+        moments, forces = np.zeros((2, *q.shape, 3))
+        for k, mass, moment, down, turn in self._inwards(q):
+            to_joint = self._bodies[k].T_carrier_joint[:3, :3].T
+            moments[:, k] = (to_joint @ turn.apply(_cross(moment, down))).T
+            forces[:, k] = mass * (to_joint @ turn.apply(down)).T
+        return moments, forces
+
+    def _inwards(self, q: FloatArray) -> Iterator[tuple[int, float, FloatArray, FloatArray, _Turn]]:
+        """Yield each joint's index, the mass [kg] that it bears, mass times place [kg·m], gravity [m/s²], and its turn.
+
+        Vectors (3, n) are in the frame of the joint's child link. They pass from frame to frame: gravity outwards, mass
+        times centre of mass back.
+        """
+        turns = {k: _Turn.of(body, q[:, k]) for k, body in self._bodies.items() if k is not None}
         # Components come first in memory, so that each operation covers all rows.
         down: dict[int | None, FloatArray] = {None: np.array([[0.0], [0.0], [-GRAVITY_M_S2]])}
         for k in self._outwards:
-            body = self._bodies[k]
-            down[k] = turns[k].inverse(body.T_carrier_joint[:3, :3].T @ down[body.carrier])
+            down[k] = turns[k].inverse(down[self._bodies[k].carrier])
         mass = {k: body.mass_kg for k, body in self._bodies.items()}
         moment = {k: body.moment[:, None] for k, body in self._bodies.items()}
-        moments, forces = np.zeros((2, *q.shape, 3))
         for k in reversed(self._outwards):
-            body = self._bodies[k]
-            turn, T = turns[k], body.T_carrier_joint
-            lever, downward = turn.apply(moment[k]), T[:3, :3].T @ down[body.carrier]
-            moments[:, k] = _cross(lever, downward).T
-            forces[:, k] = mass[k] * downward.T
-            mass[body.carrier] += mass[k]
-            at_carrier = T[:3, :3] @ (lever + mass[k] * turn.slide) + mass[k] * T[:3, 3:]
-            moment[body.carrier] = moment[body.carrier] + at_carrier
-        return moments, forces
+            carrier, turn = self._bodies[k].carrier, turns[k]
+            yield k, mass[k], moment[k], down[k], turn
+            mass[carrier] += mass[k]
+            moment[carrier] = moment[carrier] + turn.apply(moment[k]) + mass[k] * turn.origin
 
     def _order(self) -> list[int | None]:
         order: list[int | None] = [None]
@@ -193,35 +219,40 @@ def _borne(
 
 @dataclass(frozen=True, eq=False)
 class _Turn:
-    """Motion of a joint: a rotation about a fixed axis, and a translation (3, n).
+    """Motion of a joint into its carrier's frame.
 
     Attributes:
-        across, over: the cross-product matrix (3, 3) of the axis, and its square.
-        sine, versine: sin and 1 - cos of the angle (n,).
-        slide: translation along the axis [m] (3, n).
+        turns: as in `Body`.
+        sine, cosine: of the angle (n,); 0 and 1 for a prismatic joint.
+        origin: of the joint's child link in the carrier's frame [m] (3, n).
     """
 
-    across: FloatArray
-    over: FloatArray
+    turns: FloatArray
     sine: FloatArray
-    versine: FloatArray
-    slide: FloatArray
+    cosine: FloatArray
+    origin: FloatArray
 
     @classmethod
-    def of(cls, joint: UrdfJoint, q: FloatArray) -> _Turn:
+    def of(cls, body: Body, q: FloatArray) -> _Turn:
         """Build the motion at q (n,)."""
-        across = cross_matrix(joint.axis)
-        if joint.kind in REVOLUTE:
-            return cls(across, across @ across, np.sin(q), 1.0 - np.cos(q), np.zeros((3, 1)))
-        return cls(across, across @ across, np.zeros(1), np.zeros(1), joint.axis[:, None] * q)
+        assert body.joint is not None
+        T = body.T_carrier_joint
+        if body.joint.kind in REVOLUTE:
+            return cls(body.turns, np.sin(q), np.cos(q), T[:3, 3:])
+        slid = T[:3, :3] @ body.joint.axis
+        return cls(body.turns, np.zeros(1), np.ones(1), T[:3, 3:] + slid[:, None] * q)
 
     def apply(self, vectors: FloatArray) -> FloatArray:
-        """Return vectors (3, n) rotated (Rodrigues)."""
-        return vectors + self.sine * (self.across @ vectors) + self.versine * (self.over @ vectors)
+        """Return vectors (3, n) in the carrier's frame."""
+        return self._mixed(self.turns, vectors)
 
     def inverse(self, vectors: FloatArray) -> FloatArray:
-        """Return vectors (3, n) rotated back."""
-        return vectors - self.sine * (self.across @ vectors) + self.versine * (self.over @ vectors)
+        """Return vectors (3, n) of the carrier's frame in that of the joint's child link."""
+        return self._mixed(self.turns.swapaxes(1, 2), vectors)
+
+    def _mixed(self, turns: FloatArray, vectors: FloatArray) -> FloatArray:
+        steady, by_sine, by_cosine = (turns.reshape(9, 3) @ vectors).reshape(3, 3, -1)
+        return steady + self.sine * by_sine + self.cosine * by_cosine
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -116,13 +116,11 @@ class Motion:
         """Path from each row to the next of its run (4, n, d), as coefficients of powers of the time since, highest
         first.
         """
-        from scipy.interpolate import PchipInterpolator
-
         cubics = np.zeros((4, *self.q.shape))
         cubics[3] = self.q
         for first, end in self.runs:
             if end - first > 1:
-                cubics[:, first : end - 1] = PchipInterpolator(self.clock[first:end], self.q[first:end], axis=0).c
+                cubics[:3, first : end - 1] = _cubics(self.clock[first:end], self.q[first:end])
         return frozen_array(cubics)
 
     def earlier(self, lag_s: float) -> Motion:
@@ -151,6 +149,32 @@ def _earlier(motion: Motion, lag_s: float) -> Motion:
     rate = (3.0 * a * since + 2.0 * b) * since + c
     q = ((a * since + b) * since + c) * since + d + (asked - inside)[:, None] * rate
     return Motion(frozen_array(q), motion.t, motion.segment, motion.begun_at)
+
+
+def _cubics(t: FloatArray, q: FloatArray) -> FloatArray:
+    """Return the highest three coefficients (3, m - 1, d) of a path through q (m, d) at times t (m,).
+
+    It never overshoots: its rate at a reading is the harmonic mean of the slopes beside it, and 0 at a turn (Fritsch
+    and Butland 1984).
+    """
+    gaps = np.diff(t)[:, None]
+    slopes = np.diff(q, axis=0) / gaps
+    rates = np.zeros_like(q)
+    if len(gaps) == 1:
+        rates[:] = slopes
+    else:
+        one, other = 2.0 * gaps[1:] + gaps[:-1], gaps[1:] + 2.0 * gaps[:-1]
+        onward = slopes[:-1] * slopes[1:] > 0.0
+        before, after = (np.where(onward, part, 1.0) for part in (slopes[:-1], slopes[1:]))
+        rates[1:-1] = np.where(onward, (one + other) / (one / before + other / after), 0.0)
+        for end, inner in ((0, 1), (-1, -2)):
+            slope, next_one = slopes[end], slopes[inner]
+            rate = ((2.0 * gaps[end] + gaps[inner]) * slope - gaps[end] * next_one) / (gaps[end] + gaps[inner])
+            rate = np.where(rate * slope > 0.0, rate, 0.0)
+            too_fast = (slope * next_one <= 0.0) & (np.abs(rate) > 3.0 * np.abs(slope))
+            rates[end] = np.where(too_fast, 3.0 * slope, rate)
+    bend = (rates[:-1] + rates[1:] - 2.0 * slopes) / gaps
+    return np.stack([bend / gaps, (slopes - rates[:-1]) / gaps - bend, rates[:-1]])
 
 
 def flanks(torque: FloatArray, hold: float, before: float = 0.0) -> FloatArray:
@@ -185,13 +209,24 @@ def rotation(values: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def moved_and_turned(shifts: FloatArray, axes: FloatArray, lever: FloatArray) -> FloatArray:
-    """Return moves (n, 3, 6) at levers (n, 3): shifts (n, 3, 3), and turns about the columns of axes (n, 3, 3)."""
-    turned = np.cross(np.swapaxes(axes, 1, 2), lever[:, None, :])
-    return np.concatenate([shifts, np.swapaxes(turned, 1, 2)], axis=2)
+    """Return moves (n, 3, 6) at levers (n, 3): shifts (n, 3, 3), and turns about the columns of axes (n, 3, 3).
+
+    Shifts and axes may be one (1, 3, 3) for all.
+    """
+    moves = np.empty((len(lever), 3, 6))
+    moves[:, :, :3] = shifts
+    moves[:, :, 3:] = crossed(axes, lever[:, :, None])
+    return moves
+
+
+def crossed(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return a × b (n, 3, p), of which either may be one for all rows or for all columns."""
+    rows = [a[:, (k + 1) % 3] * b[:, (k + 2) % 3] - a[:, (k + 2) % 3] * b[:, (k + 1) % 3] for k in range(3)]
+    return np.stack(rows, axis=1)
 
 
 def moved_by_observer(values: FloatArray, x: FloatArray) -> FloatArray:
     """Return moves (n, 3, 6) of points x (n, 3) in an observer's frame, by the values (6, ...) of its pose."""
     turn, by_turn = rotation(values)
-    axes = np.broadcast_to(-turn.T, (len(x), 3, 3))
+    axes = -turn.T[None]
     return moved_and_turned(axes, axes @ by_turn, x)

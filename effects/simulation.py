@@ -13,7 +13,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from bodyschema.effects.motion import transforms
+from bodyschema.effects.motion import crossed, transforms
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.urdf import inverse
@@ -41,9 +41,9 @@ Staged = TypeVar("Staged", bound=EffectType)
 
 
 class _Beneath(NamedTuple):
-    """Links (d + 1, 4, 4) of a chain, and joint angles (n, d) by the readings, as a background alone makes them."""
+    """The chain, and joint angles (n, d) by the readings, as a background alone makes them."""
 
-    fixed: FloatArray
+    chain: RigidChain
     angles: WeakKeyDictionary[Motion, FloatArray]
 
 
@@ -200,7 +200,7 @@ class Simulation:
     @cached_property
     def _beneath(self) -> _Beneath:
         """What the background alone does, which is the same with other effects."""
-        return _Beneath(self._moved(self.robot.chain.fixed, self.background), WeakKeyDictionary())
+        return _Beneath(self._bent(self.robot.chain, self.background), WeakKeyDictionary())
 
     def place(self, effect: Effect) -> Place:
         """Return the place of an effect of the first stage."""
@@ -299,7 +299,7 @@ class Simulation:
     @cached_property
     def payloads(self) -> list[GravityLoad]:
         """Loads of masses that the URDF does not state."""
-        loads = [kind.load(self.robot, effect.values) for effect, kind in self._of(StructureEffect)]
+        loads = [kind.load(self.gravity, effect.values) for effect, kind in self._of(StructureEffect)]
         return [load for load in loads if load is not None]
 
     @property
@@ -325,18 +325,20 @@ class Simulation:
 
     def _chain(self) -> RigidChain:
         """Return the chain with corrected links."""
-        chain = self.robot.chain
-        return RigidChain(self._moved(self._beneath.fixed, self.effects), chain.axes, chain.prismatic)
+        return self._bent(self._beneath.chain, self.effects)
 
-    def _moved(self, links: FloatArray, effects: Sequence[Effect]) -> FloatArray:
-        """Return links (d + 1, 4, 4) with the corrections of some effects."""
-        fixed = links.copy()
-        for k, moved in self._link_moves(effects):
+    def _bent(self, chain: RigidChain, effects: Sequence[Effect]) -> RigidChain:
+        """Return a chain with the corrections of its links by some effects."""
+        moves = self._link_moves(effects)
+        if not moves:
+            return chain
+        fixed = chain.fixed.copy()
+        for k, moved in moves:
             if self.upward[k]:
                 fixed[k + 1] = inverse(moved) @ fixed[k + 1]
             else:
                 fixed[k] = fixed[k] @ moved
-        return fixed
+        return RigidChain(fixed, chain.axes, chain.prismatic)
 
     @property
     def link_moves(self) -> list[tuple[int, FloatArray]]:
@@ -420,10 +422,9 @@ class Simulated:
     def by_joint(self) -> FloatArray:
         """Derivatives (n, 3, d) of the measurements by the true joint angles [m/rad, m/m]."""
         chain, frames = self.chain, self.frames
-        axes = np.einsum("nkij,kj->nki", frames[:, :-1, :3, :3], chain.axes)
-        levers = self.x_true[:, None] - frames[:, :-1, :3, 3]
-        moved = np.where(chain.prismatic[:, None], axes, np.cross(axes, levers))
-        return self.seen(np.swapaxes(moved, 1, 2))
+        joints = np.moveaxis(frames[:, :-1, :3], 1, 3)
+        axes = (joints[:, :, :3] * chain.axes.T).sum(axis=2)
+        return self.seen(np.where(chain.prismatic, axes, crossed(axes, self.x_true[:, :, None] - joints[:, :, 3])))
 
     @cached_property
     def torques(self) -> FloatArray:

@@ -44,7 +44,9 @@ class JointRipple(EncoderEffect):
 
     def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
         phase = motion.q[:, place.joint] * values[2] * (2.0 * np.pi if place.prismatic else 1.0)
-        return np.stack([np.sin(phase), np.cos(phase), np.zeros_like(phase)], axis=1)
+        columns = np.zeros((len(phase), 3))
+        columns[:, 0], columns[:, 1] = np.sin(phase), np.cos(phase)
+        return columns
 
     def shape_step(self, run: Simulated, effect: Effect, k: int) -> float:
         return _OF_A_PEAK / max(float(np.ptp(run.readings.q[:, run.simulation.place(effect).joint])), 1e-6)

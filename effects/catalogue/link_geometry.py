@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from bodyschema.effects.effect_type import StructureEffect
 from bodyschema.effects.motion import moved_and_turned, rotation, transforms
 from bodyschema.effects.parameter import Parameter, shifts, turns
@@ -35,10 +37,9 @@ class LinkGeometry(StructureEffect):
         turn, by_turn = rotation(effect.values)
         if run.simulation.upward[k]:
             # Frame after the joint's own motion, in which the link above begins.
-            frame = run.frames[:, k + 1] @ inverse(run.chain.fixed[k + 1])
-            axes = -frame[:, :3, :3] @ turn.T
+            frame, turn = run.frames[:, k + 1] @ inverse(run.chain.fixed[k + 1]), -turn
         else:
             frame = run.frames[:, k]
-            axes = frame[:, :3, :3] @ turn.T
-        lever = run.x_true - frame[:, :3, 3]
-        return run.seen(moved_and_turned(axes, axes @ by_turn, lever))
+        both = frame[:, :3, :3].reshape(-1, 3) @ np.concatenate([turn.T, turn.T @ by_turn], axis=1)
+        axes, turned = np.split(both.reshape(-1, 3, 6), 2, axis=2)
+        return run.seen(moved_and_turned(axes, turned, run.x_true - frame[:, :3, 3]))

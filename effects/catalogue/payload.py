@@ -10,7 +10,6 @@ from bodyschema.effects.effect_type import StructureEffect
 from bodyschema.effects.gravity import GravityLoad
 from bodyschema.effects.parameter import Parameter
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.urdf import PointMass
 
 if TYPE_CHECKING:
@@ -31,8 +30,8 @@ class Payload(StructureEffect):
         mass = Parameter("mass_kg", 1.0, never_negative=True)
         return (mass, *(Parameter(f"{axis}_kgm", 0.05) for axis in "xyz"))
 
-    def load(self, robot: RobotDescription, values: FloatArray) -> GravityLoad | None:
-        return GravityLoad.of_payload(robot, float(values[0]), values[1:]) if values.any() else None
+    def load(self, gravity: GravityLoad, values: FloatArray) -> GravityLoad | None:
+        return gravity.of_payload(float(values[0]), values[1:]) if values.any() else None
 
     def point_mass(self, values: FloatArray) -> PointMass | None:
         return PointMass(float(values[0]), values[1:] / values[0]) if values[0] > 0.0 else None
@@ -41,5 +40,5 @@ class Payload(StructureEffect):
         simulation, springs = run.simulation, run.simulation.springs
         if not (springs.any() and simulation.bears_weight):
             return np.zeros((len(run.q), 3, len(effect.values)))
-        units = [GravityLoad.of_payload(simulation.robot, float(one[0]), one[1:]) for one in np.eye(len(effect.values))]
+        units = [simulation.gravity.of_payload(float(one[0]), one[1:]) for one in np.eye(len(effect.values))]
         return np.stack([run.by_joint @ (springs * one.torques(run.q))[:, :, None] for one in units], axis=2)[..., 0]
