@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import combinations_with_replacement, product
 from typing import Literal
+from weakref import WeakKeyDictionary
 
 import numpy as np
 
@@ -172,8 +174,17 @@ def _joint(k: int) -> Columns:
     return lambda run: run.by_joint[:, :, [k]]
 
 
+@cache
 def _link(k: int) -> Columns:
-    return lambda run: run.columns(Effect.at(run.simulation.robot, "link_geometry", run.simulation.robot.joints[k]))
+    known: WeakKeyDictionary[Simulated, FloatArray] = WeakKeyDictionary()
+
+    def moves(run: Simulated) -> FloatArray:
+        if run not in known:
+            robot = run.simulation.robot
+            known[run] = run.columns(Effect.at(robot, "link_geometry", robot.joints[k]))
+        return known[run]
+
+    return moves
 
 
 def _tool(run: Simulated) -> FloatArray:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import combinations_with_replacement
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -49,8 +50,8 @@ class Way:
 
     Attributes:
         family: the family.
-        moved: displacements (n, 3, m), whitened and scaled to about unit length.
-        functions: functions (n, a) of each motion, scaled to about one.
+        moved: displacements (n, 3, m), whitened; many are scaled to about unit length, a single one is shared.
+        functions: functions (n, a) of each motion, scaled so that their columns have about unit length.
         scales: lengths of the columns (p,): those of the motions times those of the functions.
         choice: number of further parameters spent on choosing the part.
     """
@@ -62,15 +63,18 @@ class Way:
     choice: int = 0
 
     @classmethod
-    def of(cls, family: Family, start: Fit) -> Way:
-        """Prepare the whole family."""
+    def of(cls, family: Family, start: Fit, moved: FloatArray | None = None) -> Way:
+        """Prepare the whole family; its displacements may be known."""
         functions = family.functions(start.run)
-        moved = start.observations.whitened(family.moved(start.run))
+        moved = start.observations.whitened(family.moved(start.run)) if moved is None else moved
         # Lengths (m, a) of the columns, which are products of motions and functions.
         lengths = np.sqrt(np.square(moved).sum(axis=1).T @ np.square(functions))
         of_moves = np.maximum(np.sqrt(np.square(lengths).mean(axis=1, keepdims=True)), 1e-100)
         of_functions = np.maximum(np.sqrt(np.square(lengths / of_moves).mean(axis=0)), 1e-100)
-        return cls(family, moved / of_moves[:, 0], functions / of_functions, (of_moves * of_functions).ravel())
+        scales = of_moves * of_functions
+        if len(of_moves) == 1:
+            return cls(family, moved, functions / scales, scales.ravel())
+        return cls(family, moved / of_moves[:, 0], functions / of_functions, scales.ravel())
 
     @property
     def columns(self) -> FloatArray:
@@ -79,20 +83,34 @@ class Way:
         return columns.reshape(3 * len(self.moved), self.moves * self.amounts)
 
     @cached_property
-    def inner(self) -> FloatArray:
-        """Products (p, p) of the columns with one another."""
-        columns = self.columns
-        return columns.T @ columns
+    def _inner(self) -> FloatArray:
+        return self._products(np.ones(len(self.moved)))
 
-    def weighted_inner(self, weights: FloatArray) -> FloatArray:
+    def inner(self, weights: FloatArray) -> FloatArray:
         """Return the products (p, p) of the columns, rows weighted (n,)."""
         partly = rows_in_part(weights)
-        some = replace(self, moved=self.moved[partly], functions=self.functions[partly]).columns
-        return self.inner - (some * np.repeat(1.0 - weights[partly], 3)[:, None]).T @ some
+        if not len(partly):
+            return self._inner
+        some = replace(self, moved=self.moved[partly], functions=self.functions[partly])
+        return self._inner - some._products(1.0 - weights[partly])
 
-    def toward(self, others: FloatArray) -> FloatArray:
-        """Return the products (p, r) of the columns with others (n, 3, r), without forming the columns."""
-        along = np.swapaxes(self.moved, 1, 2) @ others
+    def _products(self, weights: FloatArray) -> FloatArray:
+        """Return the products (p, p) of the columns, without forming them."""
+        along = np.swapaxes(self.moved, 1, 2) @ (self.moved * weights[:, None, None])
+        products = np.empty((self.moves, self.amounts, self.moves, self.amounts))
+        for one, other in combinations_with_replacement(range(self.moves), 2):
+            both = self.functions.T @ (along[:, one, other, None] * self.functions)
+            products[one, :, other], products[other, :, one] = both, both
+        return products.reshape(len(self.scales), -1)
+
+    def toward(self, others: FloatArray, along: FloatArray | None) -> FloatArray:
+        """Return the products (p, r) of the columns with others (n, 3, r).
+
+        Args:
+            along: the same of `moved` (n, m, r), row by row; not needed for a single function of each motion.
+        """
+        if along is None:
+            return self.columns.T @ others.reshape(3 * len(others), -1)
         products = self.functions.T @ along.reshape(len(along), -1)
         return np.swapaxes(products.reshape(self.amounts, self.moves, -1), 0, 1).reshape(len(self.scales), -1)
 
@@ -162,8 +180,16 @@ class Unknowns:
     def _way(self, k: int) -> Way:
         """Return a family, prepared on first use."""
         if k not in self._prepared:
-            self._prepared[k] = Way.of(self._families[k], self._start)
+            family = self._families[k]
+            joint = family.joint if family.kind == "joint" else None
+            self._prepared[k] = Way.of(family, self._start, None if joint is None else self._by_joint[joint])
         return self._prepared[k]
+
+    @cached_property
+    def _by_joint(self) -> list[FloatArray]:
+        """Displacements (n, 3, 1) by each joint, whitened."""
+        moved = self._start.observations.whitened(self._run.by_joint)
+        return [moved[:, :, [k]] for k in range(moved.shape[2])]
 
     @property
     def count(self) -> int:
@@ -196,12 +222,15 @@ class Unknowns:
         twice = np.column_stack([directions * np.sqrt(shares), fit.unshared(np.column_stack([basis, left]))])
         seen = twice.reshape(*fit.left.shape, -1) * fit.root_weights[:, :, None]
         ranked: list[tuple[float, Way, FloatArray | None]] = []
+        moved, along = np.empty(0), np.empty(0)
         for way in map(self._way, range(self.count)):
             if way in others:
                 continue
-            products = way.toward(seen)
+            if way.moved is not moved and way.amounts > 1:
+                moved, along = way.moved, np.swapaxes(way.moved, 1, 2) @ seen
+            products = way.toward(seen, along if way.moved is moved else None)
             onto, toward = products[:, :-1], products[:, -1]
-            inner = way.weighted_inner(fit.noise.weights) - onto @ onto.T
+            inner = way.inner(fit.noise.weights) - onto @ onto.T
             values, vectors = np.linalg.eigh(inner)
             told = (values > _TOLD * max(float(values.max()), 1e-12)) & (values > _LEFT)
             explained = float(np.square(vectors[:, told].T @ toward / np.sqrt(values[told])).sum())
