@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bodyschema.diagnosis.fit.fit import Fit, amount_columns
+from bodyschema.diagnosis.fit.fit import Fit, amount_columns, solved
 from bodyschema.diagnosis.fit.scatter import beyond_single_rows, limited_rows, remembers
 from bodyschema.diagnosis.fit.worth import nats
 from bodyschema.diagnosis.search.held_out import Blocks
@@ -232,7 +232,4 @@ def _columns(fit: Fit | Nameless, motion: Motion) -> FloatArray:
 def _beside(apart: FloatArray, columns: FloatArray) -> FloatArray:
     """Return the part of `apart` (n, 3) that columns (n, 3, p) cannot follow."""
     flat = columns.reshape(apart.size, -1)
-    scales = np.linalg.norm(flat, axis=0)
-    flat = flat / np.where(scales > 0.0, scales, 1.0)
-    solved = np.linalg.lstsq(flat, apart.ravel(), rcond=1e-9)[0]
-    return (apart.ravel() - flat @ solved).reshape(apart.shape)
+    return apart - (flat @ solved(flat.T @ flat, flat.T @ apart.ravel())).reshape(apart.shape)

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import uniform_filter1d
 
 from bodyschema.effects import Effect, Simulated, Simulation
 from bodyschema.interfaces.records import FloatArray
@@ -94,7 +93,8 @@ class Noise:
             off = 1.0 - weights
             bursts = np.zeros(len(off), dtype=np.bool_)
             if off.sum() > _BURST * _WINDOW:
-                bursts = uniform_filter1d(off, _WINDOW, mode="constant") > _BURST
+                near = np.convolve(off, np.full(_WINDOW, 1.0 / _WINDOW))[_WINDOW // 2 :][: len(off)]
+                bursts = near > _BURST
                 weights[bursts] = 1.0
             share = float(np.clip(1.0 - weights[trusted].mean(), _FEWEST_OUTLIERS, 0.5))
             weights[~trusted] = 0.0

@@ -93,6 +93,8 @@ class Tangent:
 
 def solved(normal: FloatArray, gradient: FloatArray) -> FloatArray:
     """Return the solution (p,) of normal equations, with columns scaled to equal length; the shortest of many."""
+    if not len(gradient):
+        return gradient
     scales = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     scaled, wanted = normal / np.outer(scales, scales), gradient / scales
     factor, failed = dpotrf(scaled, lower=True)

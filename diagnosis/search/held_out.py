@@ -229,7 +229,7 @@ def scores_p_value(columns: FloatArray, left: FloatArray, blocks: Blocks) -> flo
     k = columns.shape[2]
     scores = np.einsum("nik,ni->nk", columns, left)
     total = scores.sum(axis=0)
-    fitted = scores - np.einsum("nik,nil,l->nk", columns, columns, total, optimize=True)
+    fitted = scores - np.einsum("nik,ni->nk", columns, columns @ total)
     spread = blocks.sums(fitted)
     spread = spread.T @ spread * blocks.count / (blocks.count - 1.0)
     statistic = float(total @ np.linalg.lstsq(spread, total, rcond=1e-12)[0])

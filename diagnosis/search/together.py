@@ -18,7 +18,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve, get_lapack_funcs
+from scipy.linalg import get_lapack_funcs
 
 from bodyschema.diagnosis.fit.background import MOST, SPREAD, Scales
 from bodyschema.diagnosis.fit.fit import Fit, solved
@@ -55,7 +55,7 @@ _FOLLOWED = 0.1
 
 _LOG_SMALLEST, _LOG_MOST, _SCALES = math.log(_SMALLEST), math.log(MOST), len(Scales())
 
-dpotrf, dpotri, dpotrs = get_lapack_funcs(("potrf", "potri", "potrs"), dtype=np.float64)
+dpotrf, dpotri, dpotrs, dtrtri = get_lapack_funcs(("potrf", "potri", "potrs", "trtri"), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,7 @@ class Together:
         sigma: size of the noise, in units of the stated one.
         spent: effective number of data that determine each scale (4,).
         amounts: amounts of all its columns (p,).
-        factor: factor of their precision, from `cho_factor`.
+        factor: lower Cholesky factor (p, p) of their precision; what is above its diagonal has no meaning.
         columns: indices of its columns (p,).
     """
 
@@ -96,13 +96,14 @@ class Together:
     sigma: float
     spent: FloatArray
     amounts: FloatArray
-    factor: tuple[FloatArray, bool]
+    factor: FloatArray
     columns: NDArray[np.intp]
 
     @cached_property
     def covariance(self) -> FloatArray:
         """Covariance of the amounts (p, p)."""
-        return cho_solve(self.factor, np.eye(len(self.columns)))
+        lower = np.tril(dpotri(self.factor, lower=True)[0])
+        return lower + np.tril(lower, -1).T
 
 
 class Sets:
@@ -141,6 +142,7 @@ class Sets:
         ends = np.cumsum([0, *(len(effect.amounts) for effect in self.effects)])
         first = self._nuisances + self._tolerances
         self._places = [np.arange(first + a, first + b) for a, b in pairwise(ends)]
+        self._known_places: dict[tuple[int, ...], NDArray[np.intp]] = {}
         # Numbers of one cause that are added and removed together.
         groups: dict[tuple[object, ...], list[int]] = {}
         for k, effect in enumerate(self.effects):
@@ -239,7 +241,7 @@ class Sets:
 
     def _losses(self, here: Together, groups: Sequence[tuple[int, ...]]) -> FloatArray:
         """Return the worth of each of some groups of numbers with scales and noise held fixed [nats]."""
-        own = [np.searchsorted(here.columns, np.concatenate([self._places[k] for k in group])) for group in groups]
+        own = [np.searchsorted(here.columns, self._places_of(group)) for group in groups]
         squares, volumes = _in_groups(here.covariance, here.amounts, own)
         fewer = np.array([self._cost(_without(here.chosen, group)) for group in groups])
         return squares + volumes - (self._cost(here.chosen) - fewer)
@@ -255,9 +257,13 @@ class Sets:
                 continue
             total += self._trials[k] + (min(self._first, ANOTHER) if kind in kinds else self._first)
             kinds.add(kind)
-        return total + sum(
-            self._first + float(np.log(ways_to_choose(n, self._numbers[key]))) for key, n in numbers.items()
-        )
+        return total + sum(self._first + math.log(ways_to_choose(n, self._numbers[key])) for key, n in numbers.items())
+
+    def _places_of(self, group: tuple[int, ...]) -> NDArray[np.intp]:
+        """Return the columns of some candidates (p,)."""
+        if group not in self._known_places:
+            self._known_places[group] = np.concatenate([self._places[k] for k in group])
+        return self._known_places[group]
 
     @cached_property
     def _numbers(self) -> dict[Key, int]:
@@ -271,17 +277,19 @@ class Sets:
         """
         present = frozenset(here.chosen)
         closed = present | (self._begins if present & self._begins else set())
-        groups = dict.fromkeys(_without(group, here.chosen) for group in self._groups)
+        groups = dict.fromkeys(tuple(k for k in group if k not in present) for group in self._groups)
         open_groups = [group for group in groups if group and closed.isdisjoint(group)]
         if not open_groups:
             return []
-        places = np.concatenate([self._places[k] for k in sorted(frozenset[int]().union(*open_groups))])
+        places = self._places_of(tuple(sorted(frozenset[int]().union(*open_groups))))
         across = self._inner[np.ix_(here.columns, places)] / here.sigma**2
-        solved = cho_solve(here.factor, across)
+        solved = dpotrs(here.factor, across, lower=True)[0]
         inner = self._inner[np.ix_(places, places)] / here.sigma**2 - across.T @ solved
         inner[np.diag_indices_from(inner)] += 1.0
         gradient = self._toward[places] / here.sigma**2 - solved.T @ (self._toward[here.columns] / here.sigma**2)
-        own = [np.searchsorted(places, np.concatenate([self._places[k] for k in group])) for group in open_groups]
+        at = np.empty(len(self._toward), dtype=np.intp)
+        at[places] = np.arange(len(places))
+        own = [at[self._places_of(group)] for group in open_groups]
         squares, volumes = _in_groups(inner, gradient, own)
         worths = squares - volumes - self._costs_beside(here.chosen, open_groups)
         best = np.argsort(worths)[::-1]
@@ -297,8 +305,8 @@ class Sets:
             effect = self.effects[group[0]]
             if effect.kind.in_parts:
                 before, of = numbers[effect.key], self._numbers[effect.key]
-                known = self._first + float(np.log(ways_to_choose(before, of))) if before else 0.0
-                costs.append(self._first + float(np.log(ways_to_choose(before + len(group), of))) - known)
+                known = self._first + math.log(ways_to_choose(before, of)) if before else 0.0
+                costs.append(self._first + math.log(ways_to_choose(before + len(group), of)) - known)
             else:
                 first = min(self._first, ANOTHER) if effect.kind in kinds else self._first
                 costs.append(self._trials[group[0]] + first)
@@ -321,7 +329,7 @@ class Sets:
         members, spent = (group == np.arange(_SCALES)[:, None]).astype(np.float64), np.zeros(_SCALES)
         for done in range(_ROUNDS if near is None else _ROUNDS_NEAR):
             factor, variances, amounts = self._solved(inner, toward, group, logs, sigma)
-            told = 1.0 - dpotri(factor[0], lower=True)[0].diagonal() / variances
+            told = 1.0 - np.square(np.tril(dtrtri(factor, lower=True)[0])).sum(axis=0) / variances
             # Update from a scale's tolerances and its prior (MacKay 1992, equation 4.10).
             spent, squares = members @ told, members @ (np.square(amounts) / variances)
             steps = (squares - spent - logs / SPREAD**2) / (2.0 * np.maximum(spent, 0.5) + 1.0 / SPREAD**2)
@@ -380,17 +388,17 @@ class Sets:
 
     def _worth(
         self, inner: FloatArray, toward: FloatArray, group: np.ndarray, logs: FloatArray, sigma: float
-    ) -> tuple[float, tuple[FloatArray, bool], FloatArray]:
+    ) -> tuple[float, FloatArray, FloatArray]:
         """Return the evidence of scales and noise [nats], the factor of the precision, and the amounts (p,)."""
         factor, variances, amounts = self._solved(inner, toward, group, logs, sigma)
         left = self._square - float(amounts @ toward)
         evidence = -0.5 * left / sigma**2 - self._rows * float(np.log(sigma))
-        evidence -= float(np.log(factor[0].diagonal()).sum()) + 0.5 * float(np.log(variances).sum())
+        evidence -= float(np.log(factor.diagonal()).sum()) + 0.5 * float(np.log(variances).sum())
         return evidence, factor, amounts
 
     def _solved(
         self, inner: FloatArray, toward: FloatArray, group: np.ndarray, logs: FloatArray, sigma: float
-    ) -> tuple[tuple[FloatArray, bool], FloatArray, FloatArray]:
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the factor of the precision, prior variances (p,) and amounts (p,), in units of `_units`."""
         # The last of the scales stands for columns that are no tolerances.
         variances = np.append(np.exp(2.0 * logs), 1.0)[group]
@@ -402,7 +410,7 @@ class Sets:
         if failed:
             diagonal += _ONE_BEYOND_ROUNDING * squares
             factor = dpotrf(precision, lower=True, clean=False)[0]
-        return (factor, True), variances, dpotrs(factor, toward / sigma**2, lower=True)[0]
+        return factor, variances, dpotrs(factor, toward / sigma**2, lower=True)[0]
 
     def causes(self, here: Together) -> list[Effect]:
         """Return the causes of a set, with their amounts."""
@@ -447,6 +455,10 @@ def _in_groups(
     for size in np.unique(sizes).tolist():
         some = np.flatnonzero(sizes == size)
         places = np.stack([groups[k] for k in some.tolist()])
+        if size == 1:
+            alone = matrix.diagonal()[places[:, 0]]
+            squares[some], volumes[some] = 0.5 * np.square(vector[places[:, 0]]) / alone, 0.5 * np.log(alone)
+            continue
         matrices, vectors = matrix[places[:, :, None], places[:, None, :]], vector[places]
         squares[some] = 0.5 * (vectors * np.linalg.solve(matrices, vectors[:, :, None])[:, :, 0]).sum(axis=1)
         volumes[some] = 0.5 * np.linalg.slogdet(matrices)[1]
@@ -542,10 +554,10 @@ class _Place:
         self._sets = Sets(fit, candidates, float(np.log(max(len(hypotheses), 1))))
         own = self._sets.again(fit.causes)
         self.here = self._sets.of(own)
-        if self.here.worth > max((place.here.worth for place in others), default=-np.inf):
+        if self.here.worth > max((place.here.worth for place in others), default=-np.inf) + _COMES_NEAR:
             starts = self._sets.starts(own, links=not others)
         else:
-            # A fit no better than others leads on from what these have reached.
+            # A fit that is not clearly better than others leads on from what these have reached.
             reached = (self._sets.again(place.numbers_of(one)) for place in others for one in place.reached)
             starts = dict.fromkeys([own, *reached])
         self.reached = self._sets.climbed(starts)
