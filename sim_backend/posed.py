@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import threading
 from contextlib import ExitStack
-from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -36,7 +35,6 @@ log = logging.getLogger(__name__)
 PERIOD_S = 1.0
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the search for postures."""
 
@@ -47,9 +45,6 @@ class _Settings:
     # How far the head may be turned away from the marker [rad]: with it the head's angles say more than where the hand
     # is.
     wander: float = np.radians(20.0)
-
-
-_SETTINGS = _Settings()
 
 
 class PosedWorld:
@@ -141,7 +136,7 @@ class PosedWorld:
             return stereo_frame(self.now(), images)
 
     def _ask_ahead(self) -> None:
-        while self._asked < min(self._delivered + _SETTINGS.ahead, len(self._postures)):
+        while self._asked < min(self._delivered + _Settings.ahead, len(self._postures)):
             self._renderer.request(self._asked, self.scene(self._asked))
             self._asked += 1
 
@@ -171,16 +166,16 @@ def visible_postures(
     with Body(physics_urdf(truth), robot.joints) as body:
         looking = Gaze(robot, calibration, roles.gaze, config.guide.gaze_speed_rad_s)
         sight = Sight(truth, calibration, roles, looking, body, config.camera)
-        for _ in range(_SETTINGS.most_batches):
-            q = np.tile((robot.lower + robot.upper) / 2, (_SETTINGS.batch, 1))
-            q[:, guided] = rng.uniform(robot.lower[guided], robot.upper[guided], (_SETTINGS.batch, len(guided)))
+        for _ in range(_Settings.most_batches):
+            q = np.tile((robot.lower + robot.upper) / 2, (_Settings.batch, 1))
+            q[:, guided] = rng.uniform(robot.lower[guided], robot.upper[guided], (_Settings.batch, len(guided)))
             q = sight.gazed(q)
-            q[:, gaze] += rng.uniform(-_SETTINGS.wander, _SETTINGS.wander, (_SETTINGS.batch, len(gaze)))
+            q[:, gaze] += rng.uniform(-_Settings.wander, _Settings.wander, (_Settings.batch, len(gaze)))
             q = np.clip(q, robot.lower, robot.upper)
             found += list(q[sight.visible(q)])
             if len(found) >= count:
                 return np.array(found[:count])
     raise ConfigError(
-        f"the cameras see the marker in only {len(found)} of {_SETTINGS.batch * _SETTINGS.most_batches} postures",
+        f"the cameras see the marker in only {len(found)} of {_Settings.batch * _Settings.most_batches} postures",
         remedy="Check [camera] xyz and rpy, marker_xyz and the joint limits",
     )

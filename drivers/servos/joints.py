@@ -6,7 +6,6 @@ import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
 from itertools import zip_longest
 from typing import Any, Self
 
@@ -32,7 +31,6 @@ from .vendor import ServoVendor
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the reading of servos."""
 
@@ -43,8 +41,6 @@ class _Settings:
     anchor_polls: int = 50
     slack_ticks: int = 3
 
-
-_SETTINGS = _Settings()
 
 IMPROVE_EVERY_S = 10.0  # a failed attempt costs a reading or two
 GOLDEN = 0.618034  # its multiples, modulo 1, are spread most evenly
@@ -246,7 +242,7 @@ class ServoJoints:
         self._at = {(servo.bus, servo.id): place for place, servo in enumerate(self.servos)}
         speed = math.radians(self._config.max_speed_deg_s)
         self._gate = SpeedGate(
-            [speed / s.model.rad_per_tick for s in self.servos], [_SETTINGS.slack_ticks] * len(self.servos)
+            [speed / s.model.rad_per_tick for s in self.servos], [_Settings.slack_ticks] * len(self.servos)
         )
         self._punctuality = Punctuality()
         now = self._clock.now()
@@ -258,7 +254,7 @@ class ServoJoints:
     def _anchor(self) -> None:
         """Find the turn of each joint from two consistent readings."""
         believed = 0
-        for _ in range(_SETTINGS.anchor_polls):
+        for _ in range(_Settings.anchor_polls):
             samples = self._ask_all()
             if samples is None:
                 continue
@@ -309,7 +305,7 @@ class ServoJoints:
         if reading is None:
             self.dropped += 1
             self._failures += 1
-            if self._failures >= _SETTINGS.few_polls and self._clock.now() - self._believed_s > LOST_AFTER_S:
+            if self._failures >= _Settings.few_polls and self._clock.now() - self._believed_s > LOST_AFTER_S:
                 raise SourceLost(self._inspection.first_silent() or self._why, retry_s=RETRY_S)
         else:
             self._believed_s, self._failures = self._clock.now(), 0
@@ -349,7 +345,7 @@ class ServoJoints:
             if sample is None:
                 stale = True
                 self._why = f"joint {self.joints[place]!r}: an answer from another time"
-                if channel.doubts >= _SETTINGS.doubts:
+                if channel.doubts >= _Settings.doubts:
                     raise SourceLost(
                         f"joint {channel.servo.joint!r} (ID {channel.servo.id}) was restarted", retry_s=RETRY_S
                     )

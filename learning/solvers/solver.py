@@ -36,7 +36,6 @@ log = logging.getLogger(__name__)
 LARGEST_NET = 2187
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the solver."""
 
@@ -55,8 +54,6 @@ class _Settings:
     # While pairs are few, a solution is cheap, and renewed after this growth of their number.
     growth: float = 0.1
 
-
-_SETTINGS = _Settings()
 
 # The information about the chain of pairs older than those kept is folded into its prior, this many at a time.
 FOLDED = 2000
@@ -188,12 +185,12 @@ class DirectSolver:
     def solutions(self) -> Iterator[Solved]:
         """Yield each model's solution as it is found, the rigid chain first: it is the quickest."""
         task = self._started
-        if self._pairs >= _SETTINGS.first_growth * self._solved_at:
+        if self._pairs >= _Settings.first_growth * self._solved_at:
             yield from self._solved_of_some(task)
         self._solved_at = self._pairs
         wide = fitted_belief(self._before, self._q, self._x)
         made = _ways_made(wide, task)
-        residual_due = self._pairs >= _SETTINGS.residual_growth * self._residual_at
+        residual_due = self._pairs >= _Settings.residual_growth * self._residual_at
         turns = self._orientations if self._orientations is not None and self._orientations.due else None
         rigid = _solved_chain(task, self._pairs, wide, made)
         yield replace(rigid, last=self._exact is None and not residual_due and turns is None)
@@ -213,8 +210,8 @@ class DirectSolver:
 
     def _solved_of_some(self, task: Task) -> Iterator[Solved]:
         """Yield the chain fitted to the first pairs only, so that the remaining pairs can test it."""
-        some = int(len(self._q) * _SETTINGS.first_share)
-        if some >= _SETTINGS.fewest_first:
+        some = int(len(self._q) * _Settings.first_share)
+        if some >= _Settings.fewest_first:
             wide = fitted_belief(self._before, self._q[:some], self._x[:some])
             pairs = self._pairs - len(self._q) + some
             yield replace(_solved_chain(task, pairs, wide, _ways_made(wide, task)), last=False)
@@ -225,7 +222,7 @@ class DirectSolver:
         The evidence finds the prior's precision if pairs are apart. On a guided path, neighbours share their errors,
         which the evidence would take for shape: there, left-out blocks choose it.
         """
-        retune = self._precision is None or learner.pairs >= _SETTINGS.retune * self._tuned_at
+        retune = self._precision is None or learner.pairs >= _Settings.retune * self._tuned_at
         try:
             solution = learner.solve(self._sought_precision(learner.prior) if retune else self._precision)
         except SettingError:
@@ -284,7 +281,7 @@ def fitted_belief(prior: ChainBelief, q: FloatArray, x: FloatArray) -> ChainBeli
     learner.learn(q, x)
     inliers = learner.inliers
     shared = shared_by(x[inliers] - learner.predict(q[inliers]))
-    if shared < _SETTINGS.shared:
+    if shared < _Settings.shared:
         return learner.belief
     again = RigidLearner(prior.parameters.reference, ChainTolerances(), prior)
     again.learn(q[inliers], x[inliers], learner.scatter.noise * math.sqrt(shared))
@@ -309,7 +306,7 @@ def fitted_residual(prior: ChainBelief | ResidualModel, q: FloatArray, x: FloatA
 
 def _spread(q: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return at most `fitted` of the pairs, evenly spread."""
-    chosen = np.linspace(0, len(q) - 1, min(len(q), _SETTINGS.fitted)).round().astype(np.intp)
+    chosen = np.linspace(0, len(q) - 1, min(len(q), _Settings.fitted)).round().astype(np.intp)
     return q[chosen], x[chosen]
 
 
@@ -337,7 +334,7 @@ class SolverClient:
     @property
     def due(self) -> bool:
         """True if it is time to ask."""
-        enough = min(self._every, max(_SETTINGS.growth * self._solved_at, 1.0))
+        enough = min(self._every, max(_Settings.growth * self._solved_at, 1.0))
         return self._fed > 0 and (self._soon or self._fed - self._solved_at >= enough)
 
     def works_on(self, task: int) -> bool:
