@@ -124,9 +124,10 @@ class TypeComparison(msgspec.Struct, frozen=True):
 def common_poses(coverages: Sequence[Mapping[str, JointRange]], joints: tuple[str, ...]) -> FloatArray:
     """Return poses (n, d) [rad, m] from the median ranges of the robots.
 
-    Raise RequestError if no robot reports the ranges of its joints.
-
     One robot that hardly moved does not matter.
+
+    Raises:
+        RequestError: no robot reports the ranges of its joints.
     """
     ranges = [[(each[joint].low, each[joint].high) for joint in joints] for each in coverages]
     if not ranges:

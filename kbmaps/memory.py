@@ -57,7 +57,11 @@ def describe_memory(memory: Memory) -> dict[str, float | None]:
 
 
 def parse_memory(value: Any) -> Memory:
-    """Return the memory from `describe_memory`. Raises ModelFormatError, SettingError."""
+    """Return the memory from `describe_memory`.
+
+    Raises:
+        ModelFormatError, SettingError: it does not describe one.
+    """
     described = named(value, "the memory", ("window", "forgetting"))
     window = None if described["window"] is None else count(described["window"], "the window")
     return Memory(window, number(described["forgetting"], "forgetting"))

@@ -165,7 +165,11 @@ class Recording:
         return Table(names, np.hstack([values for _, values in blocks]))
 
     def write_csv(self, file: Path) -> None:
-        """Write CSV; reading it gives every number back exactly. Raises RecordingError: the file cannot be written."""
+        """Write CSV; reading it gives every number back exactly.
+
+        Raises:
+            RecordingError: the file cannot be written.
+        """
         try:
             with file.open("w", encoding="utf-8", newline="\n") as out:
                 self.write_csv_to(out)
@@ -173,7 +177,11 @@ class Recording:
             raise RecordingError(f"cannot be written: {error.strerror or error}", file=file) from error
 
     def write_csv_to(self, out: TextIO) -> None:
-        """Write CSV to an open file. Raise OSError if that fails."""
+        """Write CSV to an open file.
+
+        Raises:
+            OSError: that fails.
+        """
         table = self.to_table()
         integers = frozenset(i for i, name in enumerate(table.names) if name in INTEGER_COLUMNS)
         out.write(",".join(table.names) + "\n")

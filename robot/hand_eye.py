@@ -148,7 +148,8 @@ def pose_covariance(pose: Callable[[FloatArray], FloatArray], values: FloatArray
 def write_launch_file(pose: HandEye, folder: Path) -> Path:
     """Write a ROS 2 launch file that publishes the pose on /tf_static; an older one is replaced.
 
-    Raise ConfigError if it cannot be written.
+    Raises:
+        ConfigError: it cannot be written.
     """
     from bodyschema.interfaces.whole_files import write_whole
 

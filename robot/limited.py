@@ -31,8 +31,9 @@ class UnfitFile(OSError):
 def check_regular(file: Path) -> None:
     """Check that `file` can be given to a library that reads it to its end.
 
-    Raise UnfitFile if it is a device, a pipe or a socket, which may have no end. Raise OSError if it is a folder, or
-    cannot be examined.
+    Raises:
+        UnfitFile: it is a device, a pipe or a socket, which may have no end.
+        OSError: it is a folder, or cannot be examined.
     """
     _require_regular(os.stat(file).st_mode)
 
@@ -41,10 +42,12 @@ def check_regular(file: Path) -> None:
 def opened(file: Path, most: int) -> Iterator[BinaryIO]:
     """Open a regular file for reading.
 
-    Raise UnfitFile if it is larger, or a device, a pipe or a socket. Raise OSError if it cannot be read.
-
     Args:
         most: largest plausible size of its kind [bytes].
+
+    Raises:
+        UnfitFile: it is larger, or a device, a pipe or a socket.
+        OSError: it cannot be read.
     """
     check_regular(file)  # before it is opened: opening a port or a watchdog has side effects
     with open(file, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as stream:

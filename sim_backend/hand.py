@@ -44,8 +44,6 @@ class _Settings:
 class GuidePath:
     """Postures along the path, at constant speed in the joint space of all learnt joints.
 
-    Raise ConfigError if the ball is visible at hardly any posture.
-
     Args:
         lower, upper: joint limits (d,); guided joints stay within.
         guided: indices of the guided joints.
@@ -53,6 +51,9 @@ class GuidePath:
 
     Attributes:
         waypoints: visible postures (n, d) between which the path runs; it begins at the first.
+
+    Raises:
+        ConfigError: the ball is visible at hardly any posture.
     """
 
     def __init__(

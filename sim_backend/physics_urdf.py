@@ -45,11 +45,12 @@ MOST_TRIANGLES = 8_000
 def physics_urdf(truth: TrueRobot) -> PhysicsUrdf:
     """Return the URDF of `truth`: joint frames replaced by the true ones, joints that are not learnt locked.
 
-    Raise RobotError if the robot has more links than pybullet takes, or joints too far apart.
-
     Meshes have few triangles. What cannot be drawn is left out, and links whose meshes are missing or malformed are
     rods between their joints. Links that state no inertia get a small one. Textures are left out: no other file of the
     machine's is read because a URDF names it.
+
+    Raises:
+        RobotError: the robot has more links than pybullet takes, or joints too far apart.
     """
     return _Writer(truth).written()
 

@@ -50,8 +50,6 @@ class _Settings:
 class PosedWorld:
     """A robot that stands still in given postures when its encoders are read and its frames are taken.
 
-    Raise ConfigError if [camera] has no stereo calibration, or pybullet is not installed (both on entering).
-
     Each posture gives one reading and one frame with the same time. The same arguments reproduce them bit by bit.
 
     Args:
@@ -59,6 +57,9 @@ class PosedWorld:
         postures: reported joint angles (n, d) [rad or m] to go to; encoders report them in whole ticks.
         extension: the robot with effects, to which the random errors are added; None: no effects. Camera latency has
             no influence on a robot that stands still.
+
+    Raises:
+        ConfigError: [camera] has no stereo calibration, or pybullet is not installed (both on entering).
     """
 
     def __init__(
@@ -116,7 +117,11 @@ class PosedWorld:
                 self._ask_ahead()
 
     def next_reading(self, timeout_s: float) -> JointReading:  # noqa: ARG002 - nothing to wait for
-        """Return the encoders' reading in the next posture. Raise SourceEnded after the last one."""
+        """Return the encoders' reading in the next posture.
+
+        Raises:
+            SourceEnded: there are no more.
+        """
         if self._read == len(self._postures):
             raise SourceEnded("the encoders were read in all postures")
         q = self._encoders.read(self._postures[self._read] - self._truth.offsets)
@@ -124,7 +129,11 @@ class PosedWorld:
         return JointReading(self._read * PERIOD_S, frozen_array(q))
 
     def next_frame(self, timeout_s: float) -> StereoFrame | None:
-        """Return the next posture's frame, None if it is not rendered in time. Raise SourceEnded after the last one."""
+        """Return the next posture's frame, None if it is not rendered in time.
+
+        Raises:
+            SourceEnded: there are no more.
+        """
         with self._fetching:
             if self._delivered == len(self._postures):
                 raise SourceEnded("all postures were seen")

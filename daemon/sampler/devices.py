@@ -156,8 +156,9 @@ class SamplerRules:
     def reload(self) -> str:
         """Read robot.toml again and return a message about the result; sampling continues meanwhile.
 
-        Raise ConfigError if robot.toml is invalid; nothing changed. Raise StoreError if the new session cannot be
-        stored; nothing changed.
+        Raises:
+            ConfigError: robot.toml is invalid; nothing changed.
+            StoreError: the new session cannot be stored; nothing changed.
         """
         with self._one_at_a_time:
             found = reload(self._config, TABLES, CHANGEABLE)
@@ -168,7 +169,8 @@ class SamplerRules:
     def trim(self) -> None:
         """Delete a batch of the pairs that are no longer kept, if there are any.
 
-        Raise StoreError if the disk is full or broken.
+        Raises:
+            StoreError: the disk is full or broken.
         """
         rules = self._config.tables.daemon
         most_bytes = None if rules.keep_mb is None else 1e6 * rules.keep_mb
@@ -249,7 +251,8 @@ def _bus(bus: BusHealth) -> BusStatus:
 def accept_turns(encoders: object) -> str:
     """Set lost turn counts to the turns nearest to the last positions; return a message.
 
-    Raise RequestError if no turn count was lost.
+    Raises:
+        RequestError: no turn count was lost.
     """
     if not isinstance(encoders, AsksForTurns) or not encoders.asks_for_turns:
         raise RequestError("no joint has lost its turn count: there is nothing to accept")

@@ -80,7 +80,8 @@ class ReconnectingSource(Generic[R_co]):
     def read(self, timeout_s: float) -> R_co | None:
         """Read like the source's `read`; also return None while the source is lost.
 
-        Raise SourceError if it came back as a device that only a new process may open.
+        Raises:
+            SourceError: it came back as a device that only a new process may open.
         """
         if not self._is_open and not self._try_again(timeout_s):
             return None
@@ -160,7 +161,8 @@ class ResilientWriter:
     def append(self, segment: int, q: FloatArray, fix: MarkerFix) -> Pair | None:
         """Return the committed pair; None if the disk did not accept it.
 
-        Raise StoreError if the store is damaged, or no longer a store.
+        Raises:
+            StoreError: the store is damaged, or no longer a store.
         """
         pair = self.attempt(lambda: self._store.append(segment, self._wall.utc(), q, fix))
         if pair is not None and self._refused is not None:
@@ -169,7 +171,11 @@ class ResilientWriter:
         return pair
 
     def attempt(self, write: Callable[[], T]) -> T | None:
-        """Return the result of `write`; None if the disk did not accept it. Raise StoreError as `append` does."""
+        """Return the result of `write`; None if the disk did not accept it.
+
+        Raises:
+            StoreError: as `append` does.
+        """
         begun = self._wall.now()
         try:
             return write()

@@ -113,13 +113,21 @@ class Receiver(Protocol):
     """The wire that messages come over."""
 
     def open(self) -> None:
-        """Open it. Raise SourceError if that is not possible."""
+        """Open it.
+
+        Raises:
+            SourceError: that is not possible.
+        """
 
     def close(self) -> None:
         """Close it; again does no harm."""
 
     def receive(self, until: float) -> Packet | None:
-        """Return the next message; None when none arrives by `until` [s]. Raise SourceLost if the other end is gone."""
+        """Return the next message; None when none arrives by `until` [s].
+
+        Raises:
+            SourceLost: the other end is gone.
+        """
 
     def silence(self) -> str:
         """Return why nothing may be coming, and what to do."""

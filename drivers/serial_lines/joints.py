@@ -185,7 +185,8 @@ class SerialLineJoints:
     def read(self, timeout_s: float) -> JointReading | None:
         """Return the next reading; see `JointSource.read`.
 
-        Raise SourceLost if the port is gone, no intact lines arrive, or the board was restarted.
+        Raises:
+            SourceLost: the port is gone, no intact lines arrive, or the board was restarted.
         """
         if self._port is None:
             raise SourceError("the encoders are not open; use them in a with statement")

@@ -81,7 +81,11 @@ def with_checksum(content: str) -> bytes:
 
 
 def parse(line: bytes) -> Header | Reading:
-    """Parse a line without its line feed. Raise GarbledLine if it is not intact."""
+    """Parse a line without its line feed.
+
+    Raises:
+        GarbledLine: it is not intact.
+    """
     found = _LINE.fullmatch(line)
     if found is None or crc_ccitt(found[1]) != int(found[2], 16):
         raise GarbledLine

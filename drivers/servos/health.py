@@ -100,7 +100,8 @@ class Inspection:
     def go_on(self) -> None:
         """Inspect the next servo, if it is time.
 
-        Raise SourceLost if its torque is on, and none of our drives switched it on.
+        Raises:
+            SourceLost: its torque is on, and none of our drives switched it on.
         """
         if self._clock.now() < self._next_s:
             return

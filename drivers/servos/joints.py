@@ -185,7 +185,8 @@ class ServoJoints:
     def read(self, timeout_s: float) -> JointReading | None:
         """Return the next reading; see `JointSource.read`.
 
-        Raise SourceLost if a port is gone, or a servo no longer answers, was restarted, or has torque.
+        Raises:
+            SourceLost: a port is gone, or a servo no longer answers, was restarted, or has torque.
         """
         if not self._is_open:
             raise SourceError("the servos are not open; use them in a with statement")

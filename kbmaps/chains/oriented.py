@@ -100,7 +100,11 @@ class OrientedChain:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
-        """Restore the bytes of `to_bytes`. Raises ModelFormatError: wrong type of model, or damaged."""
+        """Restore the bytes of `to_bytes`.
+
+        Raises:
+            ModelFormatError: wrong type of model, or damaged.
+        """
         fields, arrays = unpack(data, _KIND)
         with restoring("an oriented chain"):
             complete(arrays, (*CHAIN, "mean", "turn", "root"))

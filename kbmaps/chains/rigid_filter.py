@@ -143,7 +143,11 @@ class RigidFilter:
         return {"change": self.change, "covariance": self._covariance, "noise": noise, "origin": origin}
 
     def restore(self, arrays: Mapping[str, FloatArray]) -> None:
-        """Restore the state from `arrays`. Raises KeyError, ShapeError, NonFiniteError, SettingError."""
+        """Restore the state from `arrays`.
+
+        Raises:
+            KeyError, ShapeError, NonFiniteError, SettingError: they are not those of a state.
+        """
         shapes = {name: array.shape for name, array in self.arrays().items()}
         linearised = arrays["origin"].size > 0
         shapes["origin"] = self.change.shape if linearised else (0,)

@@ -193,7 +193,11 @@ class RigidLearner(Model):
 
     @property
     def scatter(self) -> Scatter:
-        """Scatter of the pairs about the chain. Raises DegenerateDataError: no pair has been learnt."""
+        """Scatter of the pairs about the chain.
+
+        Raises:
+            DegenerateDataError: no pair has been learnt.
+        """
         fit = self._fitted()
         if fit is None:
             raise DegenerateDataError("nothing lies around the chain before the first pair was learnt")

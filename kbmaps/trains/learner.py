@@ -275,7 +275,11 @@ class TensorLearner(Model):
             self.refit()
 
     def forget(self, keep: int) -> None:
-        """Drop all but the last `keep` pairs. The train stays until the next fit. Raises SettingError: keep below 0."""
+        """Drop all but the last `keep` pairs. The train stays until the next fit.
+
+        Raises:
+            SettingError: keep below 0.
+        """
         if keep < 0:
             raise SettingError(f"keep must be at least 0, got {keep}")
         self._keep(keep)
