@@ -19,7 +19,7 @@ from bodyschema.drivers.turns import SpeedGate
 from bodyschema.interfaces.errors import SourceError, SourceLost
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import JointReading, frozen_array
-from bodyschema.interfaces.servos import BusHealth, ServoHealth
+from bodyschema.interfaces.servos import BusStatus, ServoStatus
 
 from .bus import Bus, Counts, Request
 from .channel import Channel, Punctuality, Sample, middle
@@ -121,19 +121,21 @@ class ServoJoints:
         return (*self._health.complaints, *self._slow, *of_drives)
 
     @property
-    def servo_health(self) -> tuple[ServoHealth, ...]:
-        """State of each servo; empty before the first opening. From any thread."""
+    def servo_health(self) -> Mapping[str, ServoStatus]:
+        """State of each servo, by joint; empty before the first opening. From any thread."""
         samples, lost = self.samples, self._turns.lost
-        return tuple(self._health.of(servo, samples.get(servo.joint), lost) for servo in list(self.servos))
+        return {servo.joint: self._health.of(servo, samples.get(servo.joint), lost) for servo in list(self.servos)}
 
     @property
-    def bus_health(self) -> Mapping[str, BusHealth]:
+    def bus_health(self) -> Mapping[str, BusStatus]:
         """Statistics of each bus since the start, by name. From any thread."""
-        ways = {name: plan.name for name, plan in self._plans.items()}
-        return {
-            name: BusHealth(counts.exchanges, {str(t): n for t, n in list(counts.troubles.items())}, ways.get(name, ""))
-            for name, counts in self._counts.items()
-        }
+        found = dict[str, BusStatus]()
+        for name, counts in self._counts.items():
+            troubles = {str(trouble): count for trouble, count in list(counts.troubles.items())}
+            answered = 1.0 - sum(troubles.values()) / counts.exchanges if counts.exchanges else 0.0
+            way = self._plans[name].name if name in self._plans else ""
+            found[name] = BusStatus(counts.exchanges, round(answered, 5), troubles, way)
+        return found
 
     @property
     def samples(self) -> Mapping[str, Sample | None]:
