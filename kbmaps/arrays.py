@@ -100,3 +100,8 @@ def limits(name: str, values: ArrayLike, width: int) -> FloatArray:
     if np.isnan(array).any():
         raise NonFiniteError(name)
     return array
+
+
+def evenly_spread(count: int, most: int) -> NDArray[np.intp]:
+    """Return at most `most` of the places 0 ... count − 1, the first and the last among them."""
+    return np.linspace(0, count - 1, min(count, most)).round().astype(np.intp)

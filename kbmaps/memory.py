@@ -13,7 +13,7 @@ from kbmaps.errors import SettingError
 from kbmaps.packed import count, named, number
 
 # A smaller weight next to that of a new pair has no effect on a float64 sum.
-_NOTHING = 1e-20
+_NOTHING = float(np.finfo(np.float64).eps)
 
 
 @dataclass(frozen=True)

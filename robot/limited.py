@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import resource
 import stat
@@ -11,7 +12,6 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-_PIECE = 2**20
 # For text written by a person or a command: over ten times the size of any URDF, log or table of ours.
 MOST_TEXT_BYTES = 2**24
 # What reading one file may take: 20 million joint states of some 200 bytes. A file of 256 kB can unpack to 8 GiB.
@@ -62,7 +62,7 @@ def read_at_most(file: Path, most: int = MOST_TEXT_BYTES) -> bytes:
     """Return the bytes of a regular file. Raise the errors of `opened`."""
     data = bytearray()
     with opened(file, most) as stream:
-        while piece := stream.read(_PIECE):  # files of /proc report no size
+        while piece := stream.read(io.DEFAULT_BUFFER_SIZE):  # files of /proc report no size
             data += piece
             if len(data) > most:
                 raise _too_large(most)

@@ -9,7 +9,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import BoolArray, FloatArray, frozen, numbers, rows
+from kbmaps.arrays import BoolArray, FloatArray, evenly_spread, frozen, numbers, rows
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.parameters import ChainParameters, ChainTolerances
 from kbmaps.errors import DegenerateDataError, SettingError, ShapeError
@@ -311,7 +311,7 @@ class PlacedStart:
         """
         first = 1 << (len(q).bit_length() - 1)
         if self.needed and first != self._placed_at:
-            chosen = np.linspace(0, first - 1, min(first, _Settings.placed)).round().astype(np.intp)
+            chosen = evenly_spread(first, _Settings.placed)
             self._change, self._placed_at = self._placed(q[chosen], x[chosen]), first
         return self._change
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.model_bank import EXACT, RESIDUAL, RIGID, LearntModel
-from bodyschema.learning.solvers.orientation import KEPT, WINDOW, OrientationSolution, OrientationSolver
+from bodyschema.learning.solvers.orientation import GROWTH, KEPT, WINDOW, OrientationSolution, OrientationSolver
 from bodyschema.learning.solvers.tolerance_selection import Tolerances, best_tolerances, workmanship
 from kbmaps import (
     ChainBelief,
@@ -29,6 +29,7 @@ from kbmaps import (
     follow_a_path,
     shared_by,
 )
+from kbmaps.arrays import evenly_spread
 
 log = logging.getLogger(__name__)
 
@@ -43,8 +44,6 @@ class _Settings:
     retune: float = 1.25
     # Number of pairs that a chain is fitted to, evenly spread.
     fitted: int = 2000
-    # The chain with residual takes longest, up to a second: it waits for this growth of the number of pairs.
-    residual_growth: float = 1.15
     # With this growth of the number of pairs, this share of them is solved for first, if it is at least this many.
     first_growth: float = 1.5
     first_share: float = 0.75
@@ -56,7 +55,7 @@ class _Settings:
 
 
 # The information about the chain of pairs older than those kept is folded into its prior, this many at a time.
-FOLDED = 2000
+FOLDED = _Settings.fitted
 
 
 @dataclass(frozen=True)
@@ -190,7 +189,7 @@ class DirectSolver:
         self._solved_at = self._pairs
         wide = fitted_belief(self._before, self._q, self._x)
         made = _ways_made(wide, task)
-        residual_due = self._pairs >= _Settings.residual_growth * self._residual_at
+        residual_due = self._pairs >= GROWTH * self._residual_at
         turns = self._orientations if self._orientations is not None and self._orientations.due else None
         rigid = _solved_chain(task, self._pairs, wide, made)
         yield replace(rigid, last=self._exact is None and not residual_due and turns is None)
@@ -306,7 +305,7 @@ def fitted_residual(prior: ChainBelief | ResidualModel, q: FloatArray, x: FloatA
 
 def _spread(q: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return at most `fitted` of the pairs, evenly spread."""
-    chosen = np.linspace(0, len(q) - 1, min(len(q), _Settings.fitted)).round().astype(np.intp)
+    chosen = evenly_spread(len(q), _Settings.fitted)
     return q[chosen], x[chosen]
 
 
