@@ -12,7 +12,7 @@ from typing import Protocol, Self
 import numpy as np
 
 from bodyschema.drivers.checks import Check, warned
-from bodyschema.drivers.markers.config import SourceTable
+from bodyschema.drivers.markers.config import UNKNOWN_LATENCY_SIGMA_S, SourceTable
 from bodyschema.drivers.markers.report import ADVICE, Fault, Packet, Report, Unusable
 from bodyschema.drivers.ros2.cdr import Malformed
 from bodyschema.drivers.ros2.senders import Refusal, Sender
@@ -31,8 +31,6 @@ class _Settings:
     many: float = 0.02
     # The first messages of a clock that is not known yet may be refused.
     worth_a_word: int = 4
-    # of a position without a stamp: the sender's computation and the network
-    arrival_sigma_s: float = 0.005
     # with unit = "mm": metres, divided by 1000, are all nearer to the origin
     nearest_m: float = 0.005
     # a wider covariance is in mm², or useless
@@ -286,7 +284,7 @@ class MarkerStream:
     def _time(self, report: Report, arrived: float) -> tuple[float, float]:
         """Return the time of the measurement and its 1-sigma [s]."""
         if report.stamp_ns is None:
-            return arrived - self._table.latency_s, math.hypot(_Settings.arrival_sigma_s, self._table.sigma_s)
+            return arrived - self._table.latency_s, math.hypot(UNKNOWN_LATENCY_SIGMA_S, self._table.sigma_s)
         times_set = self._clock_of.times_set
         t = self._clock_of.time_of(report.stamp_ns, (0,), arrived)
         if self._clock_of.times_set != times_set:
