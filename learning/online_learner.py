@@ -42,6 +42,9 @@ class OnlineLearner:
     """Learns the forward kinematics of one robot from pairs.
 
     Runs one regime after another, whose models are in `Regimes`; counts, synchronises the two threads, and publishes.
+
+    Attributes:
+        nominal: nominal model, where learning starts.
     """
 
     def __init__(
@@ -56,7 +59,7 @@ class OnlineLearner:
             together_s: maximum wait of pairs to be judged together [s], which costs a fraction of judging each. The
                 instant learner does not wait.
         """
-        self._nominal, self._settings = nominal, settings
+        self.nominal, self._settings = nominal, settings
         self._solving = SolverClient(solver, settings.solve_every)
         self._lock = threading.Lock()
         self._together_s = together_s
@@ -77,11 +80,6 @@ class OnlineLearner:
     def belief(self) -> ChainBelief | None:
         """Posterior of the chain from the pairs with the current tool; None before the first solution."""
         return self._regimes.claims.belief
-
-    @property
-    def nominal(self) -> NominalModel:
-        """Nominal model, where learning starts."""
-        return self._nominal
 
     @property
     def aligning(self) -> bool:
@@ -148,7 +146,7 @@ class OnlineLearner:
         """Return poses (n, d) [rad, m] that represent the data's region; the same for the same pairs."""
         rng = np.random.default_rng(0)
         q, _ = regime.memory.at(rng.integers(len(regime.memory), size=REGION_SAMPLES))
-        return q + rng.normal(0.0, 1.0, q.shape) * self._nominal.reach(REGION_RAD)
+        return q + rng.normal(0.0, 1.0, q.shape) * self.nominal.reach(REGION_RAD)
 
     def orientation_status(self) -> OrientationStatus | None:
         """Return the accuracy of the marker's orientation; None if no pair with the current tool has one."""
@@ -173,7 +171,7 @@ class OnlineLearner:
             seen, _ = regime.memory.some(regime.memory.count, LOOKED_BACK)
             q, x, _ = regime.memory.since(self._solving.fed - LOOKED_BACK, LOOKED_BACK)  # pairs that the solver knows
             return LearnerEvidence(
-                nominal=self._nominal,
+                nominal=self.nominal,
                 belief=claims.belief,
                 wide=claims.wide or claims.belief,
                 tolerances=chain_tolerances(self._settings),
@@ -203,7 +201,7 @@ class OnlineLearner:
             RequestError: it is not a pair of this robot and store, or not newer than the last one; nothing changed.
         """
         with self._lock:
-            _check_pair(pair, self._counters, self._nominal.joints)
+            _check_pair(pair, self._counters, self.nominal.joints)
             self._counters.store, self._counters.last_seq = pair.store, pair.seq
             self._counters.pairs += 1
             self._counters.since_change += 1
@@ -268,7 +266,7 @@ class OnlineLearner:
             if self._before is None:
                 raise RequestError("there was no change since learning began, so there is no older model to go back to")
             since_change = self._before.header.counters.since_change
-            regimes = Regimes.restored(self._before, self._nominal, self._settings, self._task_numbers)
+            regimes = Regimes.restored(self._before, self.nominal, self._settings, self._task_numbers)
             self._regimes, self._before, self._counters.since_change = regimes, self._before.before, since_change
             self._publish()
 
@@ -310,7 +308,7 @@ class OnlineLearner:
             StateError: it belongs to another nominal model, or to other tolerances.
         """
         with self._lock:
-            regimes, header = Regimes.restored(state, self._nominal, self._settings, self._task_numbers), state.header
+            regimes, header = Regimes.restored(state, self.nominal, self._settings, self._task_numbers), state.header
             self._regimes, self._counters, self._before = regimes, header.counters, state.before
             self._curve = Curve(header.curve, header.curve_stride)
             self._publish()
@@ -364,7 +362,7 @@ class OnlineLearner:
         return state
 
     def _at_nominal(self) -> Regimes:
-        return Regimes.at_nominal(self._nominal, self._settings, self._task_numbers)
+        return Regimes.at_nominal(self.nominal, self._settings, self._task_numbers)
 
     def _look_again(self) -> bool:
         """Identify the last change again, with more pairs."""
@@ -461,9 +459,9 @@ class OnlineLearner:
         )
 
     def _waiting_for(self) -> str:
-        needed, have = self._nominal.pairs_to_align, self._regimes.waiting.count
+        needed, have = self.nominal.pairs_to_align, self._regimes.waiting.count
         return (
-            f"there is no model yet: robot.toml says {self._nominal.unknown}, so positions have no frame until about "
+            f"there is no model yet: robot.toml says {self.nominal.unknown}, so positions have no frame until about "
             f"{needed} pairs have come ({have} so far). Start the sampler with `bodyschema run sampler` and guide "
             "the arm"
         )
