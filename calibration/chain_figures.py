@@ -21,7 +21,6 @@ BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the figures that are shown."""
 
@@ -37,8 +36,6 @@ class _Settings:
     # From one linearisation to the next the error along a curve is squared.
     relinearised: int = 4
 
-
-_SETTINGS = _Settings()
 
 HALF_WIDTH_95 = 1.959964
 
@@ -118,7 +115,7 @@ class ChainFigures:
 
     @property
     def _unsure(self) -> FloatArray:
-        return _SETTINGS.not_shown * _spread(self.prior, self._zeros)
+        return _Settings.not_shown * _spread(self.prior, self._zeros)
 
     @cached_property
     def _best(self) -> ChainBelief:
@@ -163,15 +160,15 @@ class ChainFigures:
         return np.concatenate([camera[:3, 3], rpy_of(camera[:3, :3]), geometry.marker_xyz, split[self._zeros]])
 
     def _derivatives(self, change: FloatArray) -> FloatArray:
-        steps = _SETTINGS.step * np.eye(len(change))
+        steps = _Settings.step * np.eye(len(change))
         here = self._figures(change, change)
-        return np.array([_unwound(self._figures(moved, moved) - here) for moved in change + steps]).T / _SETTINGS.step
+        return np.array([_unwound(self._figures(moved, moved) - here) for moved in change + steps]).T / _Settings.step
 
 
 def after_exact_pairs(prior: ChainBelief, change: FloatArray, robot: RobotDescription) -> ChainBelief:
     """Return what exact pairs of all poses would leave of the prior, linearised at a change (size,)."""
     _, jacobian = prior.parameters.linearised(change, _poses(robot))
-    rows = (jacobian @ prior.root).reshape(-1, prior.root.shape[1]) / _SETTINGS.exact_m
+    rows = (jacobian @ prior.root).reshape(-1, prior.root.shape[1]) / _Settings.exact_m
     _, singular, vt = np.linalg.svd(rows, full_matrices=False)
     return replace(prior, root=prior.root @ (vt.T / np.sqrt(1.0 + np.square(singular))))
 
@@ -183,12 +180,12 @@ def most_probable_alike(prior: ChainBelief, change: FloatArray, robot: RobotDesc
     """
     poses = _poses(robot)
     same, found = prior.parameters.positions(change, poses), change
-    for _ in range(_SETTINGS.relinearised):
+    for _ in range(_Settings.relinearised):
         x, jacobian = prior.parameters.linearised(found, poses)
         u, singular, vt = np.linalg.svd(
-            (jacobian @ prior.root).reshape(3 * _SETTINGS.poses, -1) / _SETTINGS.exact_m, full_matrices=False
+            (jacobian @ prior.root).reshape(3 * _Settings.poses, -1) / _Settings.exact_m, full_matrices=False
         )
-        target = (same - x + jacobian @ (found - prior.mean)).ravel() / _SETTINGS.exact_m
+        target = (same - x + jacobian @ (found - prior.mean)).ravel() / _Settings.exact_m
         found = prior.mean + prior.root @ (vt.T @ (singular / (1.0 + np.square(singular)) * (u.T @ target)))
     return found
 
@@ -217,13 +214,13 @@ def no_surer_than_possible(belief: ChainBelief, prior: ChainBelief, robot: Robot
 
 def _poses(robot: RobotDescription) -> FloatArray:
     """Return a fixed random sample of configurations (m, d) within the joint limits."""
-    return np.random.default_rng(0).uniform(robot.lower, robot.upper, (_SETTINGS.poses, len(robot.joints)))
+    return np.random.default_rng(0).uniform(robot.lower, robot.upper, (_Settings.poses, len(robot.joints)))
 
 
 def is_told(made: Sequence[tuple[float, float]]) -> bool:
     """Return True if the probable workmanships (axes [rad], positions [m]) agree within the factor `told_within`."""
     axes = [axes for axes, _ in made]
-    return max(axes) <= _SETTINGS.told_within * min(axes)
+    return max(axes) <= _Settings.told_within * min(axes)
 
 
 def _spread(belief: ChainBelief, which: IntArray) -> FloatArray:

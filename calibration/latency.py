@@ -26,7 +26,6 @@ EARLIEST_S, LATEST_S = -0.05, 0.25  # search range
 STEP_S = 0.004
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the search for the latency."""
 
@@ -53,8 +52,6 @@ class _Settings:
     # on both sides of the smooth function's estimate
     refined_s: float = 0.024
 
-
-_SETTINGS = _Settings()
 
 # Prior deviations of an arm from its URDF; they only constrain what the pairs do not determine.
 LOOSE = ChainTolerances(axes=0.02, points=0.005, zeros=0.1, tool=0.1, base_rotation=0.5, base_translation=0.5)
@@ -103,7 +100,7 @@ class Wiggle:
     @cached_property
     def _places(self) -> tuple[FloatArray, FloatArray]:
         """Times [s], and the indices of the readings at them."""
-        numbers = np.linspace(0.0, len(self.q) - 1.0, _SETTINGS.finer * (len(self.q) - 1) + 1)
+        numbers = np.linspace(0.0, len(self.q) - 1.0, _Settings.finer * (len(self.q) - 1) + 1)
         return np.asarray(_smooth(self.t_joints)(numbers), dtype=np.float64), numbers
 
 
@@ -153,7 +150,7 @@ def latency_of(wiggle: Wiggle, chain: RigidChain) -> Latency:
     fit, near_s, residual_m = _nearest(fit, grid[best])
     lag = _minimum(fit, near_s)
     sigma_s = _sigma(fit, lag)
-    if sigma_s > _SETTINGS.largest_sigma_s:
+    if sigma_s > _Settings.largest_sigma_s:
         raise LatencyError(
             f"the latency is known to {1e3 * sigma_s:.1f} ms only. Move the arm faster, to and fro, or longer "
             "(--seconds), the marker in sight of both eyes"
@@ -177,12 +174,12 @@ class _Fit:
     def of(cls, wiggle: Wiggle, chain: RigidChain) -> _Fit:
         t = wiggle.t_marker
         inside = (t - LATEST_S - STEP_S >= wiggle.t_joints[0]) & (t - EARLIEST_S + STEP_S <= wiggle.t_joints[-1])
-        if inside.sum() < _SETTINGS.fewest_fixes:
+        if inside.sum() < _Settings.fewest_fixes:
             raise LatencyError(_too_few(wiggle, int(inside.sum())))
         centre = wiggle.q.mean(axis=0)
         _, size, directions = np.linalg.svd(wiggle.q - centre, full_matrices=False)
         size = size / math.sqrt(len(wiggle.q))
-        moving = size > _SETTINGS.small * size[0]
+        moving = size > _Settings.small * size[0]
         axes = directions[moving].T / size[moving]
         return cls(wiggle, chain, t[inside], wiggle.x[inside], centre, axes)
 
@@ -209,7 +206,7 @@ class _Fit:
         A, x = self.terms(lag)[keep], self.x[keep]
         scale = np.linalg.norm(A, axis=0) + np.finfo(float).tiny
         A = A / scale
-        weights = np.linalg.solve(A.T @ A + _SETTINGS.ridge * np.eye(A.shape[1]), A.T @ x)
+        weights = np.linalg.solve(A.T @ A + _Settings.ridge * np.eye(A.shape[1]), A.T @ x)
         return x - A @ weights
 
     def whitened(self, lag: float) -> _Fit:
@@ -274,7 +271,7 @@ class _RigidFit:
 
     def whitened(self, lag: float) -> _RigidFit:
         """Return the same fit with residuals whitened by their covariance at `lag` (larger in depth)."""
-        start, left = self.fitted(lag, steps=_SETTINGS.settling)
+        start, left = self.fitted(lag, steps=_Settings.settling)
         return replace(self, start=start, white=_whitening(left))
 
     def cost(self, lag: float, keep: NDArray[np.bool_] | slice = slice(None)) -> float:
@@ -297,7 +294,7 @@ def _nearest(smooth: _Fit, lag: float) -> tuple[_AnyFit, float, float]:
     unexplained = smooth.whitened(lag), lag, _rms(left)
     try:
         rigid = _RigidFit.of(smooth, lag).whitened(lag)
-        grid = lag + np.arange(-_SETTINGS.refined_s, _SETTINGS.refined_s + STEP_S, STEP_S)
+        grid = lag + np.arange(-_Settings.refined_s, _Settings.refined_s + STEP_S, STEP_S)
         near_s = float(grid[int(np.argmin([rigid.cost(each) for each in grid]))])
         rigid = rigid.whitened(near_s)
     except (DegenerateDataError, np.linalg.LinAlgError):
@@ -324,7 +321,7 @@ def _volume(left: FloatArray, unknowns: int) -> float:
 def _whitening(residual: FloatArray) -> FloatArray:
     """Return the matrix, shape (3, 3), that transforms residuals (m, 3) to unit covariance."""
     noise = residual.T @ residual / len(residual)
-    least = _SETTINGS.small * float(np.trace(noise)) + np.finfo(float).tiny
+    least = _Settings.small * float(np.trace(noise)) + np.finfo(float).tiny
     return np.asarray(np.linalg.inv(np.linalg.cholesky(noise + least * np.eye(3))), dtype=np.float64)
 
 
@@ -333,7 +330,7 @@ def _require_motion(wiggle: Wiggle, chain: RigidChain) -> None:
     if len(wiggle.t_joints) < 2:
         raise LatencyError("there are no encoder readings")
     span = np.ptp(wiggle.q, axis=0)
-    if not (span > np.where(chain.prismatic, _SETTINGS.least_slide_m, _SETTINGS.least_turn_rad)).any():
+    if not (span > np.where(chain.prismatic, _Settings.least_slide_m, _Settings.least_turn_rad)).any():
         turned = np.degrees(span[~chain.prismatic])
         most = f"{turned.max():.1f}° at most" if len(turned) else f"{1e3 * span.max():.1f} mm at most"
         raise LatencyError(
@@ -346,9 +343,9 @@ def _require_following(fit: _Fit, cost: float) -> None:
     """Raise LatencyError if the marker hardly moves with the joints."""
     residual_m = math.sqrt(cost / len(fit.x))
     moved_m = fit.motion_m
-    if moved_m > _SETTINGS.follows * residual_m:
+    if moved_m > _Settings.follows * residual_m:
         return
-    if moved_m < _SETTINGS.little_m:
+    if moved_m < _Settings.little_m:
         raise LatencyError(
             f"the marker moved by {1e3 * moved_m:.1f} mm only (RMS), hardly more than its noise. Move joints that "
             "bring it far: not one that turns it on the spot"
@@ -369,13 +366,13 @@ def _strange(fit: _Fit, cost: float) -> str:
 
 def _too_few(wiggle: Wiggle, fixes: int) -> str:
     """Return the reason for too few fixes with known angles at every latency: short, slow or out of sight."""
-    t, usable = wiggle.t_marker, f"the marker was seen {fixes} times, {_SETTINGS.fewest_fixes} are needed"
+    t, usable = wiggle.t_marker, f"the marker was seen {fixes} times, {_Settings.fewest_fixes} are needed"
     span_s = min(t[-1], wiggle.t_joints[-1]) - max(t[0], wiggle.t_joints[0])
-    if span_s < _SETTINGS.shortest_s:
+    if span_s < _Settings.shortest_s:
         return f"{usable}: encoders and cameras looked on together for {max(span_s, 0.0):.1f} s only. Move for 5 s"
     rate_hz = 1.0 / max(float(np.quantile(np.diff(t), 0.1)), 1e-3)
-    if rate_hz * (span_s - LATEST_S + EARLIEST_S) < 1.2 * _SETTINGS.fewest_fixes:
-        seconds = math.ceil(1.2 * _SETTINGS.fewest_fixes / rate_hz + LATEST_S - EARLIEST_S)
+    if rate_hz * (span_s - LATEST_S + EARLIEST_S) < 1.2 * _Settings.fewest_fixes:
+        seconds = math.ceil(1.2 * _Settings.fewest_fixes / rate_hz + LATEST_S - EARLIEST_S)
         return (
             f"{usable}: the cameras give {rate_hz:.1f} images a second. Give --seconds {seconds}, or make them faster: "
             "a shorter exposure, or buffers = 2 (docs/cameras.md)"
@@ -396,9 +393,9 @@ def _sigma(fit: _AnyFit, lag: float) -> float:
 
     The jackknife accounts for correlated residuals. The result is at least the sigma for independent residuals.
     """
-    blocks = np.arange(len(fit.x)) * _SETTINGS.blocks // len(fit.x)
-    without = np.array([_minimum(fit, lag, blocks != block) for block in range(_SETTINGS.blocks)])
-    jackknife = math.sqrt((_SETTINGS.blocks - 1) * float(np.mean((without - without.mean()) ** 2)))
+    blocks = np.arange(len(fit.x)) * _Settings.blocks // len(fit.x)
+    without = np.array([_minimum(fit, lag, blocks != block) for block in range(_Settings.blocks)])
+    jackknife = math.sqrt((_Settings.blocks - 1) * float(np.mean((without - without.mean()) ** 2)))
     residual, step = fit.residual(lag), 1e-3
     slope = (fit.residual(lag + step) - fit.residual(lag - step)) / (2 * step)
     free = max(residual.size - fit.unknowns - 1, 1)
@@ -411,8 +408,8 @@ def _require_one(grid: FloatArray, cost: FloatArray, best: int) -> None:
     inner = np.r_[False, (cost[1:-1] <= cost[:-2]) & (cost[1:-1] <= cost[2:]), False]
     rivals = (
         inner
-        & (np.abs(grid - grid[best]) > _SETTINGS.apart_s)
-        & (np.sqrt(cost) < _SETTINGS.rival * math.sqrt(cost[best]))
+        & (np.abs(grid - grid[best]) > _Settings.apart_s)
+        & (np.sqrt(cost) < _Settings.rival * math.sqrt(cost[best]))
     )
     if rivals.any():
         other = grid[rivals][0]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bodyschema.interfaces.errors import RecordingError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.whole_files import write_whole
+from bodyschema.interfaces.whole_files import require_target, write_whole
 from bodyschema.robot.description import link_poses
 from kbmaps import ChainPosterior, ExperimentDesign, next_poses
 
@@ -114,10 +114,7 @@ class NextPoses:
 
 def check_target(file: Path, *, replace: bool) -> None:
     """Raise RecordingError unless poses can be written to `file`: known ending, no file in the way."""
-    if file.suffix.lower() not in (JSON, CSV):
-        raise RecordingError(f"files of poses end in {JSON} or {CSV}", file=file, remedy="Give another name")
-    if file.exists() and not replace:
-        raise RecordingError("the file is there already", file=file, remedy="Give another name, or --force")
+    require_target(file, (JSON, CSV), "files of poses", force=replace, error=RecordingError)
 
 
 def allowed_poses(calibration: Calibration, rng: np.random.Generator) -> FloatArray:

@@ -19,7 +19,6 @@ from bodyschema.robot.hand_eye import HandEye
 from kbmaps import ChainBelief, ChainParameters, RigidLearner
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the test for another tool."""
 
@@ -30,9 +29,6 @@ class _Settings:
     far: float = 5.0
     # Excludes splits that the data cannot determine, e.g. where all poses are alike.
     ridge: float = 1e-9
-
-
-_SETTINGS = _Settings()
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,12 +54,12 @@ def tool_jump(learner: RigidLearner, recording: Recording) -> ToolJump | None:
     Args:
         learner: fitted to all pairs in the recording.
     """
-    if len(recording) < 2 * _SETTINGS.fewest:
+    if len(recording) < 2 * _Settings.fewest:
         return None
     explained, shifts = _splits(learner, recording)
-    allowed = slice(_SETTINGS.fewest - 1, len(recording) - _SETTINGS.fewest)
-    best = _SETTINGS.fewest - 1 + int(explained[allowed].argmax())
-    if explained[best] < _SETTINGS.explained:
+    allowed = slice(_Settings.fewest - 1, len(recording) - _Settings.fewest)
+    best = _Settings.fewest - 1 + int(explained[allowed].argmax())
+    if explained[best] < _Settings.explained:
         return None
     return ToolJump(best + 2, float(np.linalg.norm(shifts[best])))
 
@@ -88,7 +84,7 @@ def _splits(learner: RigidLearner, recording: Recording) -> tuple[FloatArray, Fl
     in_basis = _after(np.einsum("nip,nij->npj", basis.reshape(*residuals.shape, -1), columns))
     square = _after(columns.swapaxes(1, 2) @ columns) - in_basis.swapaxes(1, 2) @ in_basis
     product = _after(np.einsum("nij,ni->nj", columns, target))
-    shifts: FloatArray = np.linalg.solve(square + _SETTINGS.ridge * np.eye(3), product[..., None])[..., 0].astype(
+    shifts: FloatArray = np.linalg.solve(square + _Settings.ridge * np.eye(3), product[..., None])[..., 0].astype(
         np.float64
     )
     return np.einsum("nj,nj->n", shifts, product) / np.square(target).sum(), shifts
@@ -97,7 +93,7 @@ def _splits(learner: RigidLearner, recording: Recording) -> tuple[FloatArray, Fl
 def _weights(residuals: FloatArray) -> FloatArray:
     """Return square roots of the weights (n,) of residuals (n, 3)."""
     squares = np.square(residuals).sum(axis=1)
-    far = _SETTINGS.far**2 * max(float(np.median(squares)), np.finfo(float).tiny)
+    far = _Settings.far**2 * max(float(np.median(squares)), np.finfo(float).tiny)
     return np.sqrt(far / (far + squares))
 
 

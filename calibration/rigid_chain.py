@@ -34,7 +34,6 @@ IntArray = NDArray[np.intp]
 Trusted = Literal["nothing", "links", "urdf"]
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the calibration and its cross-validation."""
 
@@ -54,9 +53,6 @@ class _Settings:
     # Rows that one of these fits takes at most: figures of a millimetre do not change by more, and 20,000 take a
     # minute.
     fold_rows: int = 2000
-
-
-_SETTINGS = _Settings()
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,15 +150,15 @@ class Calibration:
     def expected(self) -> Expected | None:
         """Errors on new poses, from contiguous blocks that were each held out; None of too few rows."""
         rows = len(self.recording)
-        fold = np.arange(rows) * 2 * _SETTINGS.folds // rows % _SETTINGS.folds
-        if rows < _SETTINGS.folds * 2 * len(self.robot.joints):
+        fold = np.arange(rows) * 2 * _Settings.folds // rows % _Settings.folds
+        if rows < _Settings.folds * 2 * len(self.robot.joints):
             return None
         sigma_m = self.learner.report().noise if self.noise_told else None
         told = _told(self.recording, self.learner, np.arange(rows))
         predicted = np.empty_like(self.recording.x)
-        for held_out in range(_SETTINGS.folds):
+        for held_out in range(_Settings.folds):
             kept = np.flatnonzero(fold != held_out)
-            kept = kept[np.unique(np.linspace(0, len(kept) - 1, _SETTINGS.fold_rows).astype(np.intp))]
+            kept = kept[np.unique(np.linspace(0, len(kept) - 1, _Settings.fold_rows).astype(np.intp))]
             fresh = RigidLearner(self.placed.chain, self.learner.tolerances)
             q, x = self.recording.q[kept], self.recording.x[kept]
             fresh.learn(q, x, sigma_m) if told is None else fresh.learn(q, x, cov=told[kept])
@@ -185,7 +181,7 @@ class Calibration:
         _, jacobian = parameters.linearised(self.learner.change, self.recording.q)
         rows = (jacobian @ before.root).reshape(-1, before.root.shape[1]) / (report.noise * report.misfit)
         left = 1.0 / np.sqrt(1.0 + np.square(np.linalg.svd(rows, compute_uv=False)))
-        return int((left < _SETTINGS.much_surer).sum())
+        return int((left < _Settings.much_surer).sum())
 
     @cached_property
     def figures(self) -> ChainFigures:
@@ -199,7 +195,7 @@ def _learners(
 ) -> tuple[tuple[RigidLearner, ...], FloatArray]:
     """Return learners of all pairs with the tolerances that a sample of the pairs makes probable, and their shares."""
     told = None if recording.cov is None else recording.cov + ROUNDING_M**2 * np.eye(3)
-    some = np.unique(np.linspace(0, len(recording) - 1, _SETTINGS.judged_pairs).astype(np.intp))
+    some = np.unique(np.linspace(0, len(recording) - 1, _Settings.judged_pairs).astype(np.intp))
 
     def learner(tolerances: ChainTolerances, rows: IntArray) -> RigidLearner:
         fresh = RigidLearner(nominal, tolerances)
@@ -241,10 +237,10 @@ def _tolerances(robot: RobotDescription, zeros_rad: float, trusted: Trusted) -> 
             axes=axes,
             points=points,
             zeros=zeros_rad if free_zeros else 0.0,
-            slide_zeros=_SETTINGS.slide_zeros_m if free_zeros else 0.0,
-            tool=_SETTINGS.known_place_m if marker_known else _SETTINGS.fitted_place_m,
-            base_rotation=_SETTINGS.known_turn_rad if pose_known else _SETTINGS.fitted_turn_rad,
-            base_translation=_SETTINGS.known_place_m if pose_known else _SETTINGS.fitted_place_m,
+            slide_zeros=_Settings.slide_zeros_m if free_zeros else 0.0,
+            tool=_Settings.known_place_m if marker_known else _Settings.fitted_place_m,
+            base_rotation=_Settings.known_turn_rad if pose_known else _Settings.fitted_turn_rad,
+            base_translation=_Settings.known_place_m if pose_known else _Settings.fitted_place_m,
         )
         for axes, points in links
     ]

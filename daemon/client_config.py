@@ -107,7 +107,8 @@ class ClientConfig:
     def joint_limits(self) -> Mapping[str, tuple[str, float, float]]:
         """By joint of the URDF, its type and its limits [rad; m if it slides].
 
-        Raise ConfigError if the URDF is not one.
+        Raises:
+            ConfigError: the URDF is not one.
         """
         try:
             found = ElementTree.fromstring(read_at_most(self.urdf), ElementTree.XMLParser(target=_Plain())).findall(

@@ -113,7 +113,11 @@ class Config:
 
     @classmethod
     def load(cls, file: Path, environment: Mapping[str, str] = os.environ) -> Config:
-        """Read robot.toml, its URDF and the environment. Raise ConfigError with file, line, key and remedy."""
+        """Read robot.toml, its URDF and the environment.
+
+        Raises:
+            ConfigError: one is wrong; the message has file, line, key and remedy.
+        """
         raw, text = read_toml(file)
         known = [field.encode_name for field in msgspec.structs.fields(Tables)]
         for name in raw:
@@ -178,7 +182,8 @@ class Config:
     def with_state_dir(self, folder: Path) -> Config:
         """Return a copy with another folder for store and checkpoint, relative to the working directory.
 
-        Raise ConfigError if `folder` is a file.
+        Raises:
+            ConfigError: `folder` is a file.
         """
         if os.path.exists(folder) and not os.path.isdir(folder):
             raise ConfigError("is a file, and store and checkpoint need a folder", file=folder, remedy=_STATE_REMEDY)

@@ -68,7 +68,11 @@ class Diagnoses:
         self._folder.cleanup()
 
     def start(self) -> int:
-        """Start a diagnosis and return its number. Raise RequestError if one is running."""
+        """Start a diagnosis and return its number.
+
+        Raises:
+            RequestError: one is running.
+        """
         with self._lock:
             if self._thread is not None and self._thread.is_alive():
                 raise RequestError("a diagnosis is running. Wait for it, or stop it")
@@ -80,7 +84,11 @@ class Diagnoses:
         return number
 
     def stop(self) -> None:
-        """End the running diagnosis. Raise RequestError if none is running."""
+        """End the running diagnosis.
+
+        Raises:
+            RequestError: none is running.
+        """
         if self._thread is None or not self._thread.is_alive():
             raise RequestError("no diagnosis is running")
         self._end()

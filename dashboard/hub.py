@@ -78,7 +78,8 @@ class Hub:
     def follow(self) -> Follower:
         """Return a follower, to be passed to `leave` in the end; it starts with all documents.
 
-        Raise HubFullError if too many follow.
+        Raises:
+            HubFullError: too many follow.
         """
         with self._lock:
             if len(self._followers) >= MOST_FOLLOWERS:

@@ -74,10 +74,13 @@ class RecentPairs:
 
 
 def cloud(pairs: list[Pair], predict: Callable[[list[list[float]]], PredictReply]) -> CloudDocument:
-    """Return the model's residuals at pairs. Raise BusError if the learner does not answer.
+    """Return the model's residuals at pairs.
 
     Args:
         predict: queries the learner; RequestError while it has no model.
+
+    Raises:
+        BusError: the learner does not answer.
     """
     if not pairs:
         return NOTHING

@@ -6,6 +6,7 @@ import numpy as np
 
 from bodyschema.daemon.transport.status import LearnerStatus
 from bodyschema.daemon.transport.wire import PredictReply
+from bodyschema.dashboard.recent import DECIMALS
 from bodyschema.interfaces.records import FloatArray, Pair
 from bodyschema.robot.description import RobotDescription, link_poses
 from bodyschema.robot.hand_eye import MarkerPose
@@ -14,8 +15,6 @@ from kbmaps.rotations import quaternions
 
 from .documents import ArmDocument
 
-# Decimals of a coordinate [m] that is sent to the page.
-_DECIMALS = 5
 # Half axes of the ellipsoid that holds 95 % of a normal distribution in space, in units of its 1-sigma: the root of the
 # chi-squared distribution's quantile for three degrees of freedom.
 _RADIUS_95 = 2.7955
@@ -57,9 +56,9 @@ def arm(
         links=_pose_numbers(newest),
         camera=_pose_numbers(T_root_cameras[-1:])[0],
         hand=robot.tree.links.index(robot.robot.marker_link),
-        measured=measured[-1].round(_DECIMALS).tolist(),
-        trail=measured[:-1].round(_DECIMALS).tolist(),
-        predicted=None if predicted is None else predicted.round(_DECIMALS).tolist(),
+        measured=measured[-1].round(DECIMALS).tolist(),
+        trail=measured[:-1].round(DECIMALS).tolist(),
+        predicted=None if predicted is None else predicted.round(DECIMALS).tolist(),
         measured_pose=MarkerPose.of(pairs[-1].x, pairs[-1].cov, pairs[-1].R, pairs[-1].cov_R),
         predicted_pose=None if reply is None or reply.poses is None else reply.poses[0],
         radii=radii,
@@ -70,4 +69,4 @@ def arm(
 
 def _pose_numbers(T: FloatArray) -> list[list[float]]:
     """Return poses (n, 4, 4) as x, y, z and the quaternion's x, y, z, w."""
-    return np.hstack([T[:, :3, 3], quaternions(T[:, :3, :3])]).round(_DECIMALS).tolist()
+    return np.hstack([T[:, :3, 3], quaternions(T[:, :3, :3])]).round(DECIMALS).tolist()

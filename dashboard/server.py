@@ -42,11 +42,14 @@ class _Server(uvicorn.Server):
 
 
 def serve(config: Config, port: int, ready: Callable[[str], None]) -> None:
-    """Serve the page of one robot until SIGTERM or Ctrl-C. Raise ConfigError if the port cannot be used.
+    """Serve the page of one robot until SIGTERM or Ctrl-C.
 
     Args:
         port: on loopback; 0 takes one that is free.
         ready: called with the page's address when a browser may request it.
+
+    Raises:
+        ConfigError: the port cannot be used.
     """
     with listening(port) as listener:
         hub = Hub()

@@ -137,7 +137,8 @@ class Body:
 def read_shapes(urdf: Path) -> LinkShapes:
     """Return the visual shapes of all links of a URDF, and their meshes with few triangles.
 
-    Raise RobotError if the URDF cannot be read.
+    Raises:
+        RobotError: the URDF cannot be read.
     """
     meshes, shapes = MeshSet(urdf, MOST_TRIANGLES), link_shapes(parse_urdf(urdf))
     named = [(shape.mesh, shape.sizes) for parts in shapes.values() for shape in parts if shape.kind == "mesh"]

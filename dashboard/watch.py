@@ -135,7 +135,9 @@ class Watch:
     def command(self, process: Process, name: CommandName) -> str:
         """Send a command to a process and return its reply.
 
-        Raise BusError if it does not answer. Raise RequestError if it refused.
+        Raises:
+            BusError: it does not answer.
+            RequestError: it refused.
         """
         payload = encode(CommandRequest(name))
         reply = self._sessions[process].ask_one(self._keys.command(process), payload, timeout_s=COMMAND_LIMIT_S)
@@ -144,7 +146,9 @@ class Watch:
     def picture(self) -> bytes:
         """Return the sampler's newest camera picture with detections, as JPEG; at most one request each half second.
 
-        Raise BusError if the sampler does not answer, or has no cameras. Raise RequestError if no frame has come yet.
+        Raises:
+            BusError: the sampler does not answer, or has no cameras.
+            RequestError: no frame has come yet.
         """
         with self._picturing:
             now = self._clock.now()
@@ -156,7 +160,8 @@ class Watch:
     def history(self, newest: int) -> History:
         """Return the sampler's newest pairs, `newest` of them, to be read page by page.
 
-        Raise BusError if the sampler does not answer.
+        Raises:
+            BusError: the sampler does not answer.
         """
         status = self._sampler.status
         if status is None or not self._sampler.answers:

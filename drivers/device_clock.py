@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
 
 RELEARN_AFTER_S = 30.0
 KNOWN_AFTER_S = 1.0
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the fit of a device's clock."""
 
@@ -34,9 +32,6 @@ class _Settings:
     quickest_sigma_s: float = 1e-3 / math.sqrt(3)
 
 
-_SETTINGS = _Settings()
-
-
 class DeviceClock:
     """Map from a device clock to host time, for events that answer a request.
 
@@ -50,7 +45,7 @@ class DeviceClock:
     def __init__(self, tick_s: float, ticks: int) -> None:
         """Start without knowledge of the offset; the stamps count ticks of `tick_s` from 0 to `ticks`, excluded."""
         self._tick_s, self._ticks = tick_s, ticks
-        self._rate, self._spread = 1.0, _SETTINGS.drift
+        self._rate, self._spread = 1.0, _Settings.drift
         self._low = self._high = 0.0  # bounds of host time minus device time
         self._host_s = self._device_s = 0.0  # of the last event
         self._is_known = False
@@ -72,7 +67,7 @@ class DeviceClock:
         device_s = self._unwrapped(stamp, ((earliest + latest) - (low + high)) / (2 * self._rate))
         first = device_s * self._rate + low
         last = (device_s + self._tick_s) * self._rate + high
-        slack_s = _SETTINGS.slack_s + (0.0 if self._is_known else _SETTINGS.worst * (latest - self._begin[1]))
+        slack_s = _Settings.slack_s + (0.0 if self._is_known else _Settings.worst * (latest - self._begin[1]))
         if first > latest + slack_s or last < earliest - slack_s:
             return None
         offsets = self._offsets(earliest, latest, device_s)
@@ -104,7 +99,7 @@ class DeviceClock:
         if unsure_s / passed_s < max(self._spread, abs(rate - self._rate)):
             turned = (self._rate - rate) * self._device_s  # keeps the offset at the present unchanged
             self._low, self._high = self._low + turned, self._high + turned
-            self._rate, self._spread = rate, max(_SETTINGS.drift, unsure_s / passed_s)
+            self._rate, self._spread = rate, max(_Settings.drift, unsure_s / passed_s)
         if passed_s > RELEARN_AFTER_S:
             self._begin = (earliest, latest, self._device_s)
 
@@ -136,14 +131,14 @@ class StreamClock:
     @property
     def sigma_s(self) -> float:
         """1-sigma of an estimated time [s]: delay of the fastest message, and uncertainty of the edge."""
-        if len(self._least) <= _SETTINGS.lately:
+        if len(self._least) <= _Settings.lately:
             return math.inf
         if not self._edge_s:
-            lately = [offset for _, offset in list(self._least)[-_SETTINGS.lately :]]
-            unknown_rate_s = _SETTINGS.worst * _SETTINGS.lately * _SETTINGS.bucket_s / math.sqrt(3)
-            return math.hypot(_SETTINGS.quickest_sigma_s, unknown_rate_s, max(lately) - min(lately))
+            lately = [offset for _, offset in list(self._least)[-_Settings.lately :]]
+            unknown_rate_s = _Settings.worst * _Settings.lately * _Settings.bucket_s / math.sqrt(3)
+            return math.hypot(_Settings.quickest_sigma_s, unknown_rate_s, max(lately) - min(lately))
         fraction = (self._device_s - self._origin_s) / self._edge_s
-        return math.hypot(_SETTINGS.quickest_sigma_s, self._above_s * math.hypot(1 - fraction, fraction))
+        return math.hypot(_Settings.quickest_sigma_s, self._above_s * math.hypot(1 - fraction, fraction))
 
     def time(self, latest: float, stamp: int) -> float | None:
         """Return the time of the event whose message arrived at `latest` [s].
@@ -155,8 +150,8 @@ class StreamClock:
             self._offset_s = latest - self._device_s
         device_s = self._unwrapped(stamp, latest)
         t = self._mapped(device_s)
-        is_early = device_s - self._least[0][0] < _SETTINGS.early_s if self._least else True
-        if latest - t > LONGEST_HELD_S or t - latest > (LONGEST_HELD_S if is_early else _SETTINGS.ahead_s):
+        is_early = device_s - self._least[0][0] < _Settings.early_s if self._least else True
+        if latest - t > LONGEST_HELD_S or t - latest > (LONGEST_HELD_S if is_early else _Settings.ahead_s):
             return None
         self._device_s = max(device_s, self._device_s)
         self._note(device_s, latest - device_s)
@@ -172,10 +167,10 @@ class StreamClock:
 
     def _note(self, device_s: float, offset_s: float) -> None:
         least = self._least
-        if not least or device_s - self._bucket_s >= _SETTINGS.bucket_s:
+        if not least or device_s - self._bucket_s >= _Settings.bucket_s:
             self._bucket_s = device_s
             least.append((device_s, offset_s))
-            while least[-1][0] - least[0][0] > _SETTINGS.window_s:
+            while least[-1][0] - least[0][0] > _Settings.window_s:
                 least.popleft()
             self._fit()
         elif offset_s < least[-1][1]:
@@ -185,15 +180,15 @@ class StreamClock:
 
     def _fit(self) -> None:
         points = list(self._least)
-        if points[-1][0] - points[0][0] < _SETTINGS.early_s:
+        if points[-1][0] - points[0][0] < _Settings.early_s:
             self._origin_s, self._offset_s = points[-1][0], min(offset for _, offset in points[-3:])
             return
         mean = sum(device_s for device_s, _ in points) / len(points)
         (x0, y0), (x1, y1) = _edge_below(points, mean)
-        slope = min(max((y1 - y0) / (x1 - x0), -_SETTINGS.worst), _SETTINGS.worst)
+        slope = min(max((y1 - y0) / (x1 - x0), -_Settings.worst), _Settings.worst)
         self.rate, self._origin_s, self._offset_s, self._edge_s = 1.0 + slope, x0, y0, x1 - x0
         above = sorted(y - y0 - slope * (x - x0) for x, y in points)
-        self._above_s = above[min(_SETTINGS.near_edge, len(above) - 1)]
+        self._above_s = above[min(_Settings.near_edge, len(above) - 1)]
 
 
 def _edge_below(points: list[tuple[float, float]], x: float) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -23,7 +23,11 @@ class Port(Protocol):
         ...
 
     def write(self, data: bytes) -> None:
-        """Send `data`. Raise BusLost when the port is gone."""
+        """Send `data`.
+
+        Raises:
+            BusLost: the port is gone.
+        """
 
     def receive(self, until: float) -> bytes:
         """Return what has arrived, else what arrives next; empty when nothing arrives before `until` on the clock."""

@@ -58,8 +58,9 @@ class SerialLine:
     def open(cls, port: str, baud: int, now: Callable[[], float] = time.monotonic) -> SerialLine:
         """Open `port` exclusively.
 
-        Raise BusLost if there is no such port (any more). Raise SourceError if it is in use, or this user may not open
-        it.
+        Raises:
+            BusLost: there is no such port (any more).
+            SourceError: it is in use, or this user may not open it.
         """
         try:
             device = serial.Serial(port, baud, timeout=0, exclusive=True)
@@ -82,7 +83,11 @@ class SerialLine:
             raise BusLost(str(self.device.port), error) from error
 
     def write(self, data: bytes) -> None:
-        """Send `data`. Raise BusLost on failure."""
+        """Send `data`.
+
+        Raises:
+            BusLost: that fails.
+        """
         try:
             self.device.write(data)
         except (OSError, termios.error) as error:

@@ -27,7 +27,6 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.status import ChainCalibration
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the comparison of units of one type."""
 
@@ -41,8 +40,6 @@ class _Settings:
     chance: float = 0.05
     rounds: int = 20
 
-
-_SETTINGS = _Settings()
 
 # Standard error of a median of normal numbers, over that of their mean.
 MEDIAN_COSTS = math.sqrt(math.pi / 2.0)
@@ -127,15 +124,16 @@ class TypeComparison(msgspec.Struct, frozen=True):
 def common_poses(coverages: Sequence[Mapping[str, JointRange]], joints: tuple[str, ...]) -> FloatArray:
     """Return poses (n, d) [rad, m] from the median ranges of the robots.
 
-    Raise RequestError if no robot reports the ranges of its joints.
-
     One robot that hardly moved does not matter.
+
+    Raises:
+        RequestError: no robot reports the ranges of its joints.
     """
     ranges = [[(each[joint].low, each[joint].high) for joint in joints] for each in coverages]
     if not ranges:
         raise RequestError("no sampler of these robots answers, so the ranges of their joints are unknown")
     low, high = np.sort(np.median(np.array(ranges), axis=0), axis=1).T
-    return np.random.default_rng(0).uniform(low, high, (_SETTINGS.poses, len(joints)))
+    return np.random.default_rng(0).uniform(low, high, (_Settings.poses, len(joints)))
 
 
 def compared(joints: tuple[str, ...], q: FloatArray, models: Sequence[Model]) -> TypeComparison:
@@ -145,9 +143,9 @@ def compared(joints: tuple[str, ...], q: FloatArray, models: Sequence[Model]) ->
     typical = float(np.median([each.rms_mm for each in apart]))
     claimed = float(np.median([1e3 * model.sigma_m for model in models]))
     figures = _figures(models)
-    judged = len(models) >= _SETTINGS.fewest_to_judge
+    judged = len(models) >= _Settings.fewest_to_judge
     odd = [_odd(k, figures) if judged else () for k in range(len(models))]
-    far = [_SETTINGS.far * max(typical, math.hypot(1e3 * model.sigma_m, claimed)) for model in models]
+    far = [_Settings.far * max(typical, math.hypot(1e3 * model.sigma_m, claimed)) for model in models]
     units = tuple(
         Unit(
             robot=model.robot,
@@ -176,7 +174,7 @@ def median_model(positions: Sequence[FloatArray]) -> FloatArray:
         return float(np.median([np.linalg.norm(laid_on(x, other)[0] - x) for other in positions]))
 
     middle = min(positions, key=distance)
-    for _ in range(_SETTINGS.rounds):
+    for _ in range(_Settings.rounds):
         middle = np.median([laid_on(middle, x)[0] for x in positions], axis=0)
     return middle
 
@@ -207,7 +205,7 @@ def _figures(models: Sequence[Model]) -> list[_Figure]:
         numbers = np.full((2, len(models)), np.nan)
         for k, (value, half_width) in of_robots.items():
             numbers[:, k] = value, half_width
-        if len(of_robots) >= _SETTINGS.fewest_to_judge:
+        if len(of_robots) >= _Settings.fewest_to_judge:
             figures.append(_Figure(name, unit, *numbers))
     return figures
 
@@ -222,7 +220,7 @@ def _odd(robot: int, figures: Sequence[_Figure]) -> tuple[Odd, ...]:
         half_width = math.hypot(own, MEDIAN_COSTS * float(np.median(others)) / math.sqrt(len(others)))
         possible = math.hypot(half_width, _quantile(0.975) * _spread(figure.values))
         far = abs(difference) / possible if possible > 0.0 else 0.0
-        if far > _quantile(1.0 - 0.5 * _SETTINGS.chance / tried) / _quantile(0.975):
+        if far > _quantile(1.0 - 0.5 * _Settings.chance / tried) / _quantile(0.975):
             found.append((far, Odd(figure.name, difference, half_width, figure.unit)))
     return tuple(odd for _, odd in sorted(found, key=lambda each: -each[0]))
 
@@ -311,7 +309,7 @@ def sentences(comparison: TypeComparison) -> list[str]:
         f"{len(units)} robots with the joints {', '.join(comparison.joints)}, at {comparison.poses} common poses, each "
         "model laid on their median as a whole."
     ]
-    if len(units) < _SETTINGS.fewest_to_judge:
+    if len(units) < _Settings.fewest_to_judge:
         return [*said, "Of two robots, it is not possible to say which is the odd one."]
     off = [unit for unit in units if unit.is_off]
     if not off:

@@ -73,8 +73,6 @@ def diagnose_all(
 ) -> list[Diagnosed]:
     """Diagnose all recordings; a failed one is reported as such, and does not end the others.
 
-    Raise RecordingError if the folder cannot be written.
-
     Args:
         asked: settings of the diagnoses.
         out: a folder for each recording is written here.
@@ -84,6 +82,9 @@ def diagnose_all(
 
     Returns:
         The results, in the order of the jobs.
+
+    Raises:
+        RecordingError: the folder cannot be written.
     """
     from distributed import as_completed
 
@@ -116,14 +117,15 @@ def diagnose_all(
 def workers(scheduler: str | None, jobs: int, count: int | None = None) -> Iterator[Client]:
     """Yield a client of the scheduler at an address; without one, of processes on this machine.
 
-    Raise ConfigError if the scheduler does not answer, or has no workers.
-
     Dask gives each process one thread of BLAS.
 
     Args:
         scheduler: its address; None starts processes here.
         jobs: number of recordings.
         count: of processes; None: one for each core, and no more than jobs.
+
+    Raises:
+        ConfigError: the scheduler does not answer, or has no workers.
     """
     from dask import config
     from distributed import Client, LocalCluster

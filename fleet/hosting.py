@@ -19,10 +19,11 @@ from bodyschema.robot.limited import read_at_most
 def descriptions(named: Sequence[Path]) -> list[Path]:
     """Return descriptions of robots, each once: files, and of a folder those in it and in its subfolders.
 
-    Raise ConfigError if a folder has none.
-
     Of a folder's TOML files, those with a table `[robot]` count, because calibrations and other files are there too. Of
     a subfolder, its robot.toml counts.
+
+    Raises:
+        ConfigError: a folder has none.
     """
     found: list[Path] = []
     for path in named:
@@ -45,7 +46,8 @@ def _describes_a_robot(file: Path) -> bool:
 def configs_of(files: Sequence[Path], state_dir: Path | None) -> list[Config]:
     """Return the robots, with their states in `state_dir` if given, in a folder each if there are several.
 
-    Raise ConfigError if a description is wrong, or of a robot that cannot be learnt.
+    Raises:
+        ConfigError: a description is wrong, or of a robot that cannot be learnt.
     """
     configs = [Config.load(file) for file in files]
     for config in configs:
@@ -60,7 +62,8 @@ def configs_of(files: Sequence[Path], state_dir: Path | None) -> list[Config]:
 def shares(configs: Sequence[Config], processes: int) -> list[list[Config]]:
     """Distribute the robots over at most `processes` shares of similar size; robots of one endpoint stay together.
 
-    Raise ConfigError if there are fewer endpoints than processes.
+    Raises:
+        ConfigError: there are fewer endpoints than processes.
     """
     by_endpoint: dict[str, list[Config]] = {}
     for config in configs:
@@ -79,8 +82,9 @@ def shares(configs: Sequence[Config], processes: int) -> list[list[Config]]:
 def spread(configs: Sequence[Config], processes: int, options: Sequence[str]) -> None:
     """Learn in several processes, each with its share of the robots, until SIGTERM or Ctrl-C.
 
-    Raise ConfigError if they cannot be distributed, or not be served by one process. Raise BodyschemaError if a process
-    refused to start.
+    Raises:
+        ConfigError: they cannot be distributed, or not be served by one process.
+        BodyschemaError: a process refused to start.
     """
     children: list[Child] = []
     for number, share in enumerate(shares(configs, processes), 1):

@@ -33,9 +33,11 @@ class Job:
 def jobs(recordings: Sequence[Path], folder: Path | None, robot: Path | None) -> list[Job]:
     """Return the given recordings and those in a folder, each with `robot` or the robot.toml next to it.
 
-    Raise RequestError if no recording was given. Raise RecordingError if the folder does not exist, or has none.
-
     A recording has the name of its file; if two files have the same name, that of the folder and the file.
+
+    Raises:
+        RequestError: no recording was given.
+        RecordingError: the folder does not exist, or has none.
     """
     found = [*recordings, *([] if folder is None else _in(folder))]
     files = list(dict.fromkeys(found))

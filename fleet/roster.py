@@ -93,8 +93,9 @@ class Member:
 def places(endpoints: Sequence[str], files: Sequence[Path]) -> list[Place]:
     """Return the routes to search: endpoints of routers or processes, and those in descriptions of robots, each once.
 
-    Raise RequestError if something is not an endpoint, or it needs certificates, which only a description names. Raise
-    ConfigError if a description is wrong.
+    Raises:
+        RequestError: something is not an endpoint, or it needs certificates, which only a description names.
+        ConfigError: a description is wrong.
     """
     found: dict[Route, set[str]] = {}
     for endpoint in endpoints:
@@ -134,7 +135,11 @@ class Fleet:
         self._open.close()
 
     def look(self) -> list[Member]:
-        """Return the robots now, by name. Raise BusError if none of the routes can be reached."""
+        """Return the robots now, by name.
+
+        Raises:
+            BusError: none of the routes can be reached.
+        """
         members = {name: Member(name) for place in self._places for name in place.robots}
         self.unreached = []
         for place in self._places:

@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
+import msgspec
+
 from .protocols import JointSource
 
 
@@ -51,18 +53,21 @@ class ServoJoints(EncoderJoints, Protocol):
     def temperature_c(self, joint: str) -> float | None: ...
 
 
-@dataclass(frozen=True, slots=True)
-class ServoHealth:
-    """State of one servo.
+class ServoStatus(msgspec.Struct, frozen=True):
+    """One joint's servo.
 
     Attributes:
-        homing_offset, drive_mode: as stored in its EEPROM.
-        voltage_v, temperature_c: last reported; None before.
-        current_a: None where it is not measured.
-        troubles: what is wrong with it, and what to do.
+        bus: its bus in robot.toml.
+        id: on the bus.
+        model, firmware: as it reports them.
+        homing_offset: [ticks]; 0 if the model has none.
+        drive_mode: bits; 0 if the model has none.
+        voltage_v: last value [V], updated every few seconds; null before the first.
+        temperature_c: likewise [°C].
+        current_a: [A]; null if not measured.
+        troubles: problems with remedies; empty if none.
     """
 
-    joint: str
     bus: str
     id: int
     model: str
@@ -72,22 +77,23 @@ class ServoHealth:
     voltage_v: float | None
     temperature_c: float | None
     current_a: float | None
-    troubles: tuple[str, ...]
+    troubles: list[str]
 
 
-@dataclass(frozen=True, slots=True)
-class BusHealth:
-    """Statistics of one bus since the start.
+class BusStatus(msgspec.Struct, frozen=True):
+    """One bus of servos since the start.
 
     Attributes:
-        exchanges: number of requests.
-        troubles: number of failed requests, by kind of failure.
-        way: read method of its servos; empty before the first opening.
+        exchanges: requests sent.
+        answered: fraction answered correctly.
+        troubles: the others, by error.
+        way: read method, such as Sync Read; empty before the bus is open.
     """
 
     exchanges: int
-    troubles: Mapping[str, int]
-    way: str
+    answered: float
+    troubles: dict[str, int]
+    way: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,10 +5,24 @@ from __future__ import annotations
 import os
 import secrets
 import stat
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
+from bodyschema.interfaces.errors import ConfigError, RecordingError
+
 BACKUP = ".before"
+
+
+def require_target(
+    out: Path, endings: Collection[str], what: str, *, force: bool, error: type[ConfigError | RecordingError]
+) -> None:
+    """Raise `error` unless `what` can be written to `out`: one of the endings, in a folder, and no file in the way."""
+    if out.suffix.lower() not in endings:
+        raise error(f"{what} end in {', '.join(endings)}", file=out, remedy="Give another name")
+    if not out.parent.is_dir():
+        raise error(f"there is no folder {out.parent}", file=out, remedy="Make it first")
+    if out.exists() and not force:
+        raise error("the file is there already", file=out, remedy="Give another name, or --force")
 
 
 def write_whole(contents: Mapping[Path, bytes], *, mode: int | None = None) -> None:

@@ -36,7 +36,11 @@ def frozen(values: ArrayLike) -> FloatArray:
 
 
 def vector(name: str, values: ArrayLike, width: int) -> FloatArray:
-    """Return `values` as a finite float64 vector (width,). Raises ShapeError, NonFiniteError, NotNumbersError."""
+    """Return `values` as a finite float64 vector (width,).
+
+    Raises:
+        ShapeError, NonFiniteError, NotNumbersError: it is no such array.
+    """
     array = numbers(name, values)
     if array.shape != (width,):
         raise ShapeError(name, f"({width},)", array.shape)
@@ -47,7 +51,11 @@ def vector(name: str, values: ArrayLike, width: int) -> FloatArray:
 
 
 def rows(name: str, values: ArrayLike, width: int) -> FloatArray:
-    """Return `values` as finite float64 rows (n, width). Raises ShapeError, NonFiniteError, NotNumbersError."""
+    """Return `values` as finite float64 rows (n, width).
+
+    Raises:
+        ShapeError, NonFiniteError, NotNumbersError: it is no such array.
+    """
     array = numbers(name, values)
     if array.ndim != 2 or array.shape[1] != width:
         raise ShapeError(name, f"(n, {width})", array.shape)
@@ -92,3 +100,8 @@ def limits(name: str, values: ArrayLike, width: int) -> FloatArray:
     if np.isnan(array).any():
         raise NonFiniteError(name)
     return array
+
+
+def evenly_spread(count: int, most: int) -> NDArray[np.intp]:
+    """Return at most `most` of the places 0 ... count − 1, the first and the last among them."""
+    return np.linspace(0, count - 1, min(count, most)).round().astype(np.intp)

@@ -13,7 +13,6 @@ from kbmaps.arrays import FloatArray
 from kbmaps.errors import ShapeError
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the comparison of models."""
 
@@ -36,9 +35,6 @@ class _Settings:
     least: float = 1e-30
 
 
-_SETTINGS = _Settings()
-
-
 def shared_by(residuals: FloatArray) -> float:
     """Return how many neighbouring residuals carry as much information as one independent residual, at least 1.
 
@@ -47,7 +43,7 @@ def shared_by(residuals: FloatArray) -> float:
     centred: a mean is an error too.
     """
     n = len(residuals)
-    longest = int(n * _SETTINGS.longest_lag_share)
+    longest = int(n * _Settings.longest_lag_share)
     square = float(np.vdot(residuals, residuals)) / max(n, 1)
     if longest < 2 or square == 0.0:
         return 1.0
@@ -153,14 +149,14 @@ class PrequentialComparison:
 
     def compares(self, name: str) -> bool:
         """Return True if a model has predicted enough of the last pairs to be compared."""
-        return name in self._errors and _count(self._errors[name]) >= _SETTINGS.fewest
+        return name in self._errors and _count(self._errors[name]) >= _Settings.fewest
 
     def recent(self, answering: str) -> Recent:
         """Return the models' errors on the last pairs, the same pairs for all of them.
 
         A model that has predicted few of the pairs of `answering` is left out.
         """
-        last = {name: values[-_SETTINGS.lately :] for name, values in self._errors.items()}
+        last = {name: values[-_Settings.lately :] for name, values in self._errors.items()}
         seen = {name: np.isfinite(values) for name, values in last.items()}
         if answering not in seen or not seen[answering].any():
             answering = max(seen, key=lambda name: int(seen[name].sum()), default="")
@@ -185,7 +181,7 @@ class PrequentialComparison:
             present: the model that answers while too few pairs were predicted.
         """
         errors = ((name, self._errors.get(name)) for name in trusted)
-        tried = {name: values for name, values in errors if values is not None and _count(values) >= _SETTINGS.fewest}
+        tried = {name: values for name, values in errors if values is not None and _count(values) >= _Settings.fewest}
         rivals = {name: [other for rival, other in tried.items() if rival != name] for name in tried}
         lately = [name for name in tried if not any(_worse_lately(tried[name], other) for other in rivals[name])]
         for name in lately:
@@ -199,21 +195,21 @@ def _count(errors: FloatArray) -> int:
 
 
 def _worse_lately(errors: FloatArray, others: FloatArray) -> bool:
-    errors, others = errors[-_SETTINGS.lately :], others[-_SETTINGS.lately :]
+    errors, others = errors[-_Settings.lately :], others[-_Settings.lately :]
     both = np.isfinite(errors) & np.isfinite(others)
-    if both.sum() < _SETTINGS.fewest:
+    if both.sum() < _Settings.fewest:
         return False
     return (
-        float(np.sqrt(errors[both]).mean()) > _SETTINGS.worse * float(np.sqrt(others[both]).mean()) + _SETTINGS.least_m
+        float(np.sqrt(errors[both]).mean()) > _Settings.worse * float(np.sqrt(others[both]).mean()) + _Settings.least_m
     )
 
 
 def _clearly_worse(errors: FloatArray, others: FloatArray) -> bool:
     both = np.isfinite(errors) & np.isfinite(others)
     errors, others, count = errors[both], others[both], int(both.sum())
-    if count < _SETTINGS.fewest:
+    if count < _Settings.fewest:
         return False
-    cap = _SETTINGS.cap * max(min(float(np.median(errors)), float(np.median(others))), _SETTINGS.least)
+    cap = _Settings.cap * max(min(float(np.median(errors)), float(np.median(others))), _Settings.least)
     losses = np.minimum(errors, cap) - np.minimum(others, cap)
     mean = float(losses.mean())
     # Few losses may be alike by chance: their spread is widened accordingly.

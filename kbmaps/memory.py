@@ -13,7 +13,7 @@ from kbmaps.errors import SettingError
 from kbmaps.packed import count, named, number
 
 # A smaller weight next to that of a new pair has no effect on a float64 sum.
-_NOTHING = 1e-20
+_NOTHING = float(np.finfo(np.float64).eps)
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,11 @@ def describe_memory(memory: Memory) -> dict[str, float | None]:
 
 
 def parse_memory(value: Any) -> Memory:
-    """Return the memory from `describe_memory`. Raises ModelFormatError, SettingError."""
+    """Return the memory from `describe_memory`.
+
+    Raises:
+        ModelFormatError, SettingError: it does not describe one.
+    """
     described = named(value, "the memory", ("window", "forgetting"))
     window = None if described["window"] is None else count(described["window"], "the window")
     return Memory(window, number(described["forgetting"], "forgetting"))

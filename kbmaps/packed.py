@@ -49,7 +49,11 @@ def framed(magic: bytes, header: bytes, payload: bytes) -> bytes:
 
 
 def unframed(data: bytes, magic: bytes) -> tuple[bytes, memoryview]:
-    """Return header and payload of `framed`. Raises ModelFormatError."""
+    """Return header and payload of `framed`.
+
+    Raises:
+        ModelFormatError: it does not describe one.
+    """
     if not isinstance(data, bytes | bytearray | memoryview):  # pyright: ignore[reportUnnecessaryIsInstance]
         raise ModelFormatError(
             f"a stored model is bytes, as to_bytes gives them and Path.read_bytes reads them; got {type(data).__name__}"
@@ -91,7 +95,11 @@ def unpack(data: bytes, kind: str) -> tuple[dict[str, Any], dict[str, FloatArray
 
 
 def named(value: Any, what: str, keys: Sequence[str]) -> dict[str, Any]:
-    """Return `value` if it is an object with exactly these keys. Raises ModelFormatError."""
+    """Return `value` if it is an object with exactly these keys.
+
+    Raises:
+        ModelFormatError: it does not describe one.
+    """
     if not isinstance(value, dict) or set(cast(dict[str, Any], value)) != set(keys):
         raise ModelFormatError(f"{what} must be an object with the keys {', '.join(keys)}")
     return cast(dict[str, Any], value)
@@ -121,12 +129,20 @@ def complete(arrays: Mapping[str, FloatArray], always: Sequence[str], *parts: Se
 
 
 def numbers(fields: Mapping[str, Any]) -> dict[str, float]:
-    """Return fields that are all numbers. Raises ModelFormatError."""
+    """Return fields that are all numbers.
+
+    Raises:
+        ModelFormatError: it does not describe one.
+    """
     return {name: number(value, f"the field {name}") for name, value in fields.items()}
 
 
 def number(value: Any, what: str) -> float:
-    """Return `value` if it is a number. Raises ModelFormatError."""
+    """Return `value` if it is a number.
+
+    Raises:
+        ModelFormatError: it does not describe one.
+    """
     if type(value) not in (int, float):
         raise ModelFormatError(f"{what} is not a number")
     return float(value)
@@ -144,7 +160,11 @@ def count(value: Any, what: str) -> int:
 
 
 def flag(value: Any, what: str) -> bool:
-    """Return `value` if it is true or false. Raises ModelFormatError."""
+    """Return `value` if it is true or false.
+
+    Raises:
+        ModelFormatError: it does not describe one.
+    """
     if type(value) is not bool:
         raise ModelFormatError(f"{what} is neither true nor false")
     return value
@@ -156,7 +176,11 @@ def unless_infinite(value: float) -> float | None:
 
 
 def or_infinite(value: Any, what: str) -> float:
-    """Return the number from `unless_infinite`. Raises ModelFormatError."""
+    """Return the number from `unless_infinite`.
+
+    Raises:
+        ModelFormatError: it does not describe one.
+    """
     return math.inf if value is None else number(value, what)
 
 

@@ -19,7 +19,6 @@ from kbmaps.planning.expected_gain import ALL, SAME
 from kbmaps.robust import OUTLIER_SIGMAS
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the outlook."""
 
@@ -31,9 +30,6 @@ class _Settings:
     worth: float = 0.05
     # A gain below this share of the noise of a single measurement is not noticeable.
     noticed: float = 0.1
-
-
-_SETTINGS = _Settings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,11 +105,11 @@ def forecast(known: LearnerEvidence, scatter: Scatter, joints: tuple[str, ...]) 
     floor = float(np.sqrt(np.square(claim.inside).mean()))
     noise = scatter.noise_m * math.sqrt(scatter.shared)
     posterior = ChainPosterior.of_belief(known.belief, noise=max(noise, floor), floor=floor)
-    motions = candidate_motions(known.seen, lower, upper, rng, names=joints, count=_SETTINGS.poses)
-    forecast = expected_gain(posterior, known.region[: _SETTINGS.poses], motions, _SETTINGS.further, rng)
+    motions = candidate_motions(known.seen, lower, upper, rng, names=joints, count=_Settings.poses)
+    forecast = expected_gain(posterior, known.region[: _Settings.poses], motions, _Settings.further, rng)
     by_motion = {motion.motion: motion.errors for motion in forecast.motions}
     best = forecast.motions[0].motion
-    if by_motion[best][-1] > (1.0 - _SETTINGS.worth) * by_motion[SAME][-1]:
+    if by_motion[best][-1] > (1.0 - _Settings.worth) * by_motion[SAME][-1]:
         best = SAME
     claimed = _mean_error_m(claim, known.region)
     scale = claimed / forecast.now if forecast.now > 0.0 else 1.0
@@ -122,12 +118,12 @@ def forecast(known: LearnerEvidence, scatter: Scatter, joints: tuple[str, ...]) 
         pairs=known.pairs,
         error_m=claimed,
         least_error_m=scale * forecast.least,
-        anywhere_m=_mean_error_m(claim, rng.uniform(lower, upper, (_SETTINGS.poses, nominal.joints))),
-        further_pairs=list(_SETTINGS.further),
+        anywhere_m=_mean_error_m(claim, rng.uniform(lower, upper, (_Settings.poses, nominal.joints))),
+        further_pairs=list(_Settings.further),
         like_so_far_m=[scale * error for error in by_motion[SAME]],
         best_motion=_in_words(best),
         best_motion_m=[scale * error for error in by_motion[best]],
-        enough=forecast.is_enough() or gain < _SETTINGS.noticed * scatter.noise_m,
+        enough=forecast.is_enough() or gain < _Settings.noticed * scatter.noise_m,
     )
 
 

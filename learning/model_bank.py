@@ -39,6 +39,9 @@ class ModelBank:
     Between two solutions, the solved models stay as they are. Instant steps on top of them would follow the newest
     pairs, and spoil them away from their path: measured, the error a few degrees away grew from 7 to 10 mm within 20
     pairs.
+
+    Attributes:
+        delayed: map of the instant learner when the current solutions were requested; None before any.
     """
 
     def __init__(self, prior: KBMap, step_size: float) -> None:
@@ -48,12 +51,7 @@ class ModelBank:
         self._instant = NLMS(prior, step_size)
         self._instant_map: KBMap | None = prior
         self._asked: KBMap | None = None
-        self._delayed: KBMap | None = None
-
-    @property
-    def delayed(self) -> KBMap | None:
-        """Map of the instant learner when the current solutions were requested; None before any."""
-        return self._delayed
+        self.delayed: KBMap | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -117,7 +115,7 @@ class ModelBank:
             self._fixed[name] = solution
         else:
             self._residual = solution
-        self._delayed = self._asked
+        self.delayed = self._asked
 
     def start_again(self, prior: KBMap, q: FloatArray, x: FloatArray) -> None:
         """Use another prior for the same pairs, q (n, d) and x (n, 3): the instant learner learns them on top of it.
@@ -131,12 +129,12 @@ class ModelBank:
     def nets(self) -> dict[str, FloatArray]:
         """Return the nets for `restore`, without the chain with residual."""
         nets = {name: kbmap.net for name, kbmap in self.maps.items()}
-        return nets if self._delayed is None else nets | {_DELAYED: self._delayed.net}
+        return nets if self.delayed is None else nets | {_DELAYED: self.delayed.net}
 
     def restore(self, nets: Mapping[str, FloatArray], residual: LearntModel | None) -> None:
         """Resume from `nets` and the chain with residual."""
         maps = {name: KBMap(self.prior.bases, net) for name, net in nets.items()}
-        self._residual, self._delayed, self._instant_map = residual, maps.pop(_DELAYED, None), maps.pop(INSTANT)
+        self._residual, self.delayed, self._instant_map = residual, maps.pop(_DELAYED, None), maps.pop(INSTANT)
         self._fixed |= maps
         self._instant = NLMS(self._instant_map, self._step_size)
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bodyschema.effects import Motion, Simulation
 from bodyschema.interfaces.records import FloatArray, frozen_array
 from bodyschema.learning.changes.known_arm import OTHER_TOOL_M
 from bodyschema.learning.config import LearnerConfig
+from bodyschema.learning.solvers.orientation import FITTED
 from bodyschema.robot.description import RobotDescription
 from kbmaps import (
     ChainBelief,
@@ -26,12 +26,12 @@ from kbmaps import (
     learning_bases,
     with_refitted_tool,
 )
+from kbmaps.arrays import evenly_spread
 
 # Number of pairs after a tool change at which the tool is first fitted; later fits follow at doubled numbers.
 PAIRS_TO_REFIT = 5
 # A narrower stroke would make the basis needlessly stiff, and equal limits impossible.
 NARROWEST_STROKE_M = 0.1
-LARGEST_FIT = 1000
 # Maximum number of postures at which an extended simulation is evaluated for a prior.
 LARGEST_GRID = 20_000
 
@@ -172,7 +172,7 @@ class NominalModel:
         Raises:
             DegenerateDataError: the pairs do not determine it.
         """
-        chosen = _spread(len(q))
+        chosen = evenly_spread(len(q), FITTED)
         return align(self.chain, q[chosen], x[chosen], pose_known=self.pose_known, marker_known=True).chain
 
     def with_other_tool(self, kbmap: KBMap, chain: RigidChain, q: FloatArray, x: FloatArray) -> KBMap:
@@ -187,7 +187,7 @@ class NominalModel:
         Raises:
             DegenerateDataError: there are no pairs.
         """
-        chosen = _spread(len(q))
+        chosen = evenly_spread(len(q), FITTED)
         return with_refitted_tool(kbmap, chain, q[chosen], x[chosen])
 
 
@@ -203,8 +203,3 @@ def chain_tolerances(settings: LearnerConfig) -> ChainTolerances:
         base_rotation=angle,
         base_translation=place,
     )
-
-
-def _spread(pairs: int) -> NDArray[np.intp]:
-    """Return places of at most `LARGEST_FIT` out of `pairs` pairs, evenly spread."""
-    return np.linspace(0, pairs - 1, min(pairs, LARGEST_FIT)).round().astype(np.intp)

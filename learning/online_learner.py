@@ -7,25 +7,32 @@ Query threads take `snapshot`, which needs no lock.
 from __future__ import annotations
 
 import copy
+import itertools
 import threading
+from collections.abc import Sequence
 
 import numpy as np
 
-from bodyschema.interfaces.records import FloatArray, Pair
+from bodyschema.interfaces.errors import RequestError
+from bodyschema.interfaces.records import FARTHEST_M, LARGEST_Q, FloatArray, Pair
 from bodyschema.learning.changes.record import ChangeRecord
 from bodyschema.learning.config import LearnerConfig
-from bodyschema.learning.core import LearnerCore
 from bodyschema.learning.data_outlook import LearnerEvidence
 from bodyschema.learning.model_bank import PRIOR, SOLVED
 from bodyschema.learning.nominal import NominalModel, chain_tolerances
-from bodyschema.learning.regime import LOOKED_BACK, Regime
+from bodyschema.learning.regime import LOOKED_BACK, BoolArray, Regime
+from bodyschema.learning.regimes import Regimes
 from bodyschema.learning.snapshot import Snapshot
 from bodyschema.learning.solvers.solver import Solver, SolverClient
-from bodyschema.learning.state import Counters, LearningState
+from bodyschema.learning.state import Counters, Curve, LearningState
 from bodyschema.learning.status import CurvePoint, OrientationStatus
 from bodyschema.learning.uncertainty import WARM
 from kbmaps import ChainBelief, Recent
 
+# Maximum number of pairs judged together, absolute and as a share of the known ones: early pairs matter more.
+MOST_TOGETHER, TOGETHER = 25, 0.1
+# As a share of a covariance's largest eigenvalue: rounding may push the smallest this far below zero.
+ROUNDING = 1e-6
 FEED_PAIRS = 256
 REGION_RAD = np.radians(3.0)
 REGION_SAMPLES = 256
@@ -34,7 +41,10 @@ REGION_SAMPLES = 256
 class OnlineLearner:
     """Learns the forward kinematics of one robot from pairs.
 
-    The models are in its `Regimes`. This class counts, synchronises the two threads, and publishes.
+    Runs one regime after another, whose models are in `Regimes`; counts, synchronises the two threads, and publishes.
+
+    Attributes:
+        nominal: nominal model, where learning starts.
     """
 
     def __init__(
@@ -49,10 +59,16 @@ class OnlineLearner:
             together_s: maximum wait of pairs to be judged together [s], which costs a fraction of judging each. The
                 instant learner does not wait.
         """
-        self._nominal, self._settings = nominal, settings
+        self.nominal, self._settings = nominal, settings
         self._solving = SolverClient(solver, settings.solve_every)
         self._lock = threading.Lock()
-        self._core = LearnerCore(nominal, settings, together_s)
+        self._together_s = together_s
+        self._task_numbers = itertools.count(1)
+        self._before: LearningState | None = None
+        self._met_at = 0.0
+        self._counters, self._curve = Counters(), Curve()
+        self._newest_utc: str | None = None
+        self._regimes = self._at_nominal()
         self._publish()
 
     @property
@@ -63,17 +79,12 @@ class OnlineLearner:
     @property
     def belief(self) -> ChainBelief | None:
         """Posterior of the chain from the pairs with the current tool; None before the first solution."""
-        return self._core.regimes.claims.belief
-
-    @property
-    def nominal(self) -> NominalModel:
-        """Nominal model, where learning starts."""
-        return self._nominal
+        return self._regimes.claims.belief
 
     @property
     def aligning(self) -> bool:
         """True while the frame is not known."""
-        return self._core.regimes.present is None
+        return self._regimes.present is None
 
     @property
     def at_rest(self) -> bool:
@@ -82,8 +93,8 @@ class OnlineLearner:
         For the thread that calls `work`.
         """
         with self._lock:
-            regime, count = self._core.regimes.present, self._core.regimes.memory.count
-            if self._core.regimes.fitting.due(count) or self._core.regimes.looking or not self._core.settled:
+            regime, count = self._regimes.present, self._regimes.memory.count
+            if self._regimes.fitting.due(count) or self._regimes.looking or not self._settled:
                 return False
             return regime is None or (not regime.owes_replays and self._solving.has_solved(regime.task_number, count))
 
@@ -91,29 +102,29 @@ class OnlineLearner:
     def counters(self) -> Counters:
         """Copy of all counters."""
         with self._lock:
-            return copy.copy(self._core.counters)
+            return copy.copy(self._counters)
 
     @property
     def curve(self) -> list[CurvePoint]:
         """Error [m] of the answering model on the last pairs, at some numbers of pairs."""
         with self._lock:
-            return self._core.curve.points
+            return self._curve.points
 
     @property
     def change(self) -> ChangeRecord | None:
         """Last change, reported or detected; None: there was none, or it was rolled back."""
         with self._lock:
-            return self._core.regimes.change
+            return self._regimes.change
 
     @property
     def can_roll_back(self) -> bool:
         """True if the state before the last change is kept."""
-        return self._core.can_roll_back
+        return self._before is not None
 
     def recent(self) -> Recent:
         """Return the models' errors on the last pairs, each predicted before it was learnt."""
         with self._lock:
-            regime = self._core.regimes.present
+            regime = self._regimes.present
             return Recent(0, {}) if regime is None else regime.recent
 
     def claimed_error_m(self) -> float | None:
@@ -122,8 +133,8 @@ class OnlineLearner:
         The region: within a few degrees (`REGION_RAD` per joint) of the kept pairs.
         """
         with self._lock:
-            regime, snapshot = self._core.regimes.present, self._snapshot
-            answering = None if regime is None else self._core.regimes.claims.errors.get(regime.answering)
+            regime, snapshot = self._regimes.present, self._snapshot
+            answering = None if regime is None else self._regimes.claims.errors.get(regime.answering)
             if (
                 regime is None or answering is None or answering.weight < WARM / 2
             ):  # the prior expectation counts more than the errors
@@ -135,19 +146,16 @@ class OnlineLearner:
         """Return poses (n, d) [rad, m] that represent the data's region; the same for the same pairs."""
         rng = np.random.default_rng(0)
         q, _ = regime.memory.at(rng.integers(len(regime.memory), size=REGION_SAMPLES))
-        return q + rng.normal(0.0, 1.0, q.shape) * self._nominal.reach(REGION_RAD)
+        return q + rng.normal(0.0, 1.0, q.shape) * self.nominal.reach(REGION_RAD)
 
     def orientation_status(self) -> OrientationStatus | None:
         """Return the accuracy of the marker's orientation; None if no pair with the current tool has one."""
         with self._lock:
-            regime, model = self._core.regimes.present, self._snapshot.orientation
+            regime, model = self._regimes.present, self._snapshot.orientation
             if regime is None or model is None:
                 return None
-            pairs, errors, region = (
-                regime.orientations.pairs,
-                regime.orientations.prequential_rad(),
-                self._region(regime),
-            )
+            known, region = regime.orientations, self._region(regime)
+            pairs, errors = known.pairs, known.prequential_rad()
         claimed = model.expected_error(region) if pairs >= WARM / 2 else None
         return OrientationStatus(pairs, model.name, errors, claimed)
 
@@ -157,19 +165,19 @@ class OnlineLearner:
         For the thread that calls `work`.
         """
         with self._lock:
-            regime, claims = self._core.regimes.present, self._core.regimes.claims
+            regime, claims = self._regimes.present, self._regimes.claims
             if regime is None or claims.belief is None or not self._solving.works_on(regime.task_number):
                 return None
             seen, _ = regime.memory.some(regime.memory.count, LOOKED_BACK)
             q, x, _ = regime.memory.since(self._solving.fed - LOOKED_BACK, LOOKED_BACK)  # pairs that the solver knows
             return LearnerEvidence(
-                nominal=self._nominal,
+                nominal=self.nominal,
                 belief=claims.belief,
                 wide=claims.wide or claims.belief,
                 tolerances=chain_tolerances(self._settings),
                 claim=claims.of(regime.answering, regime.model.predict),
                 solved=regime.answering in SOLVED,
-                pairs=self._core.counters.since_change,
+                pairs=self._counters.since_change,
                 region=self._region(regime),
                 seen=seen,
                 q=q,
@@ -182,7 +190,7 @@ class OnlineLearner:
         Only pairs with the current tool.
         """
         with self._lock:
-            memory = self._core.regimes.memory
+            memory = self._regimes.memory
             places = np.unique(np.linspace(0, len(memory) - 1, min(limit, len(memory))).astype(np.intp))
             return memory.at(places)
 
@@ -193,35 +201,59 @@ class OnlineLearner:
             RequestError: it is not a pair of this robot and store, or not newer than the last one; nothing changed.
         """
         with self._lock:
-            self._core.learn(pair, now)
+            _check_pair(pair, self._counters, self.nominal.joints)
+            self._counters.store, self._counters.last_seq = pair.store, pair.seq
+            self._counters.pairs += 1
+            self._counters.since_change += 1
+            self._newest_utc = pair.utc
+            regime = self._regimes.present
+            if regime is None:
+                self._regimes.waiting.append(pair.q[None], pair.x[None], None if pair.R is None else pair.R[None])
+            elif self._together_s == 0.0:
+                self._judged(regime, [pair], np.array([not regime.learn(pair)]))
+            else:
+                if not regime.met:
+                    self._met_at = now
+                regime.meet(pair)
+                enough = min(MOST_TOGETHER, max(int(TOGETHER * regime.memory.count), 1))
+                if len(regime.met) >= enough or self._judge_due(now):
+                    self._judge()
             self._publish()
 
     def judge_due(self, now: float) -> None:
         """Process the pairs that have waited long enough."""
         with self._lock:
-            if self._core.judge_due(now):
-                self._core.judge()
+            if self._judge_due(now):
+                self._judge()
                 self._publish()
 
     def refuse(self) -> None:
         """Count a pair that could not be accepted."""
         with self._lock:
-            self._core.counters.refused += 1
+            self._counters.refused += 1
 
     def recovered(self, pairs: int) -> None:
         """Count pairs that had to be fetched from history."""
         with self._lock:
-            self._core.counters.gaps_recovered += pairs
+            self._counters.gaps_recovered += pairs
 
     def missed(self, pairs: int) -> None:
         """Count pairs that are lost."""
         with self._lock:
-            self._core.counters.missed += pairs
+            self._counters.missed += pairs
 
     def tool_changed(self) -> None:
         """Start with another tool: drop the pairs so far, and continue from the learnt model."""
         with self._lock:
-            self._core.tool_changed()
+            self._judge()
+            if self._regimes.present is None:
+                self._regimes = self._at_nominal()
+            else:
+                self._before = self._state_before(self._regimes.memory.count)
+                self._regimes.change_tool(self._regimes.present)
+            self._regimes.change = ChangeRecord.told(self._counters.last_seq)
+            self._counters.changes += 1
+            self._counters.since_change = 0
             self._publish()
 
     def rollback(self) -> None:
@@ -231,21 +263,29 @@ class OnlineLearner:
             RequestError: there was no change, or learning was reset since; nothing is changed.
         """
         with self._lock:
-            self._core.rollback()
+            if self._before is None:
+                raise RequestError("there was no change since learning began, so there is no older model to go back to")
+            since_change = self._before.header.counters.since_change
+            regimes = Regimes.restored(self._before, self.nominal, self._settings, self._task_numbers)
+            self._regimes, self._before, self._counters.since_change = regimes, self._before.before, since_change
             self._publish()
 
     def reset_to_prior(self, *, forget_store: bool = False) -> None:
         """Forget the learnt model. With `forget_store`, pairs may come from another store, from its first one on."""
         with self._lock:
-            self._core.reset_to_prior(forget_store=forget_store)
+            if forget_store:
+                self._counters = Counters(refused=self._counters.refused)
+                self._curve, self._newest_utc = Curve(), None
+            self._counters.since_change = 0
+            self._regimes, self._before = self._at_nominal(), None
             self._publish()
 
     def restart_solver(self) -> None:
         """Give a solver that has lost its pairs all of them again. For the thread that calls `work`."""
         self._solving.restart()
         with self._lock:
-            if self._core.regimes.present is not None:
-                self._core.regimes.present.solve_from_what_is_known()
+            if self._regimes.present is not None:
+                self._regimes.present.solve_from_what_is_known()
 
     def solve_soon(self) -> None:
         """Start the solver even with fewer than `solve_every` new pairs. For the same thread."""
@@ -258,7 +298,8 @@ class OnlineLearner:
     def state(self) -> LearningState:
         """Return everything needed to resume."""
         with self._lock:
-            return self._core.state()
+            self._judge()
+            return self._regimes.state(self._counters, self._curve).with_before(self._before)
 
     def restore(self, state: LearningState) -> None:
         """Resume from a state; the solver gets the kept pairs again in the background.
@@ -267,33 +308,86 @@ class OnlineLearner:
             StateError: it belongs to another nominal model, or to other tolerances.
         """
         with self._lock:
-            self._core.restore(state)
+            regimes, header = Regimes.restored(state, self.nominal, self._settings, self._task_numbers), state.header
+            self._regimes, self._counters, self._before = regimes, header.counters, state.before
+            self._curve = Curve(header.curve, header.curve_stride)
             self._publish()
+
+    @property
+    def _settled(self) -> bool:
+        """True if all pairs so far have been judged."""
+        return self._regimes.present is None or not self._regimes.present.met
+
+    def _judge_due(self, now: float) -> bool:
+        """Return True if pairs have waited long enough to be judged."""
+        return not self._settled and now - self._met_at >= self._together_s
+
+    def _judge(self) -> None:
+        """Process all waiting pairs: compare the models, gate outliers, look for a change, and keep the pairs."""
+        while (regime := self._regimes.present) is not None and regime.met:
+            self._judged(regime, *regime.judge())
+            if self._regimes.present is not None and self._regimes.present is not regime:
+                for pair in regime.met:
+                    self._regimes.present.meet(pair)
+
+    def _judged(self, regime: Regime, pairs: Sequence[Pair], doubted: BoolArray) -> None:
+        """Count the pairs that `regime` has learnt or gated as outliers, and follow a change that they show."""
+        error_m = regime.recent.means.get(regime.answering)
+        first = self._counters.pairs - len(regime.met) - len(pairs) + 1
+        if error_m is not None:
+            for place in np.flatnonzero(~doubted).tolist():
+                self._curve.add(first + place, error_m)
+        self._counters.doubted += int(doubted.sum())
+        if self._followed(regime, pairs[-1], learnt=not doubted[-1]):
+            self._counters.changes += 1
+            self._counters.since_change = self._regimes.memory.count + len(regime.met)
+
+    def _followed(self, regime: Regime, pair: Pair, *, learnt: bool) -> bool:
+        """Return True if the pairs up to this one show a change, and another regime has begun with it."""
+        noticed = self._regimes.noticed(regime, pair)
+        if noticed is None and (learnt or not regime.gate.perhaps_changed):
+            return False
+        since = 0 if noticed is None else sum(noticed.kept[noticed.first :])
+        before = self._state_before(regime.memory.count - since)
+        followed = noticed is not None and self._regimes.adapt(regime, noticed)
+        if not (followed or (not learnt and self._regimes.follow_change(regime, pair))):
+            return False
+        self._before = before
+        return True
+
+    def _state_before(self, first: int) -> LearningState:
+        """Return the state without the current regime's pairs from number `first` on."""
+        state = self._regimes.state_before(first, self._counters, self._curve)
+        state.header.counters.since_change -= 0 if self._regimes.present is None else len(self._regimes.present.met)
+        return state
+
+    def _at_nominal(self) -> Regimes:
+        return Regimes.at_nominal(self.nominal, self._settings, self._task_numbers)
 
     def _look_again(self) -> bool:
         """Identify the last change again, with more pairs."""
         with self._lock:
-            if not self._core.regimes.looking:
+            if not self._regimes.looking:
                 return False
-            self._core.judge()
-            if self._core.regimes.look_again():
-                self._core.counters.since_change = self._core.regimes.memory.count
+            self._judge()
+            if self._regimes.look_again():
+                self._counters.since_change = self._regimes.memory.count
                 self._publish()
         return True
 
     def _fit(self) -> bool:
         """Fit an unknown frame or a changed tool, when it is due."""
         with self._lock:
-            memory = self._core.regimes.memory
-            if not self._core.regimes.fitting.due(memory.count):
+            memory = self._regimes.memory
+            if not self._regimes.fitting.due(memory.count):
                 return False
-            count, fitting = memory.count, copy.copy(self._core.regimes.fitting)
+            count, fitting = memory.count, copy.copy(self._regimes.fitting)
             q, x = memory.all()
         fit = fitting.fit(q, x)
         with self._lock:
-            self._core.judge()
-            if memory is self._core.regimes.memory:  # else another regime has begun
-                self._core.counters.doubted += self._core.regimes.fitted(fit, count)
+            self._judge()
+            if memory is self._regimes.memory:  # else another regime has begun
+                self._counters.doubted += self._regimes.fitted(fit, count)
                 self._publish()
         return True
 
@@ -301,21 +395,21 @@ class OnlineLearner:
         """Give the solver its pairs, request solutions from time to time, take its results."""
         solving = self._solving
         with self._lock:
-            if self._core.regimes.present is None:
+            if self._regimes.present is None:
                 return False
-            task = self._core.regimes.present.task
+            task = self._regimes.present.task
         if solving.busy:
             return self._take_solution()
         if solving.begin(task):
             return True
         with self._lock:
-            regime = self._core.regimes.present
+            regime = self._regimes.present
             if regime is None or regime.task_number != task.number:
                 return True
             asking = solving.due and solving.fed == regime.memory.count
             if asking:
-                self._core.judge()  # the solver shall know everything that the instant learner knows
-                if self._core.regimes.present is not regime:
+                self._judge()  # the solver shall know everything that the instant learner knows
+                if self._regimes.present is not regime:
                     return True
                 regime.ask()
             q, x, fed = regime.memory.since(solving.fed, FEED_PAIRS)
@@ -331,7 +425,7 @@ class OnlineLearner:
         if solved is None:
             return False
         with self._lock:
-            regime = self._core.regimes.present
+            regime = self._regimes.present
             if regime is None or solved.task != regime.task_number:
                 return True
             if solved.model is not None:
@@ -343,14 +437,14 @@ class OnlineLearner:
 
     def _replay(self) -> bool:
         with self._lock:
-            replayed = 0 if self._core.regimes.present is None else self._core.regimes.present.replay()
+            replayed = 0 if self._regimes.present is None else self._regimes.present.replay()
             if replayed:
-                self._core.counters.replayed += replayed
+                self._counters.replayed += replayed
                 self._publish()
         return replayed > 0
 
     def _publish(self) -> None:
-        regime, claims = self._core.regimes.present, self._core.regimes.claims
+        regime, claims = self._regimes.present, self._regimes.claims
         answering = PRIOR if regime is None else regime.answering
         self._snapshot = Snapshot(
             answering=answering,
@@ -358,16 +452,39 @@ class OnlineLearner:
             map=None if regime is None else regime.map,
             claim=claims.of(answering, None if regime is None else regime.model.predict),
             support=claims.support,
-            pairs=self._core.counters.pairs,
-            newest_utc=self._core.newest_utc,
+            pairs=self._counters.pairs,
+            newest_utc=self._newest_utc,
             waiting_for=self._waiting_for() if regime is None else "",
             orientation=None if regime is None else regime.orientation,
         )
 
     def _waiting_for(self) -> str:
-        needed, have = self._nominal.pairs_to_align, self._core.regimes.waiting.count
+        needed, have = self.nominal.pairs_to_align, self._regimes.waiting.count
         return (
-            f"there is no model yet: robot.toml says {self._nominal.unknown}, so positions have no frame until about "
+            f"there is no model yet: robot.toml says {self.nominal.unknown}, so positions have no frame until about "
             f"{needed} pairs have come ({have} so far). Start the sampler with `bodyschema run sampler` and guide "
             "the arm"
         )
+
+
+def _check_pair(pair: Pair, counters: Counters, joints: int) -> None:
+    """Raise RequestError if a pair is of another robot or store, not new, or not a measurement."""
+    if counters.store not in (None, pair.store):
+        raise RequestError(
+            f"pair {pair.seq} comes from the store {pair.store}, this learner learnt from {counters.store}"
+        )
+    if pair.seq <= counters.last_seq:
+        raise RequestError(f"pair {pair.seq} has been learnt already; the last one was {counters.last_seq}")
+    if len(pair.q) != joints:
+        raise RequestError(f"pair {pair.seq} has {len(pair.q)} joint angles, this robot has {joints}")
+    if not all(np.isfinite(part).all() for part in (pair.q, pair.x, pair.cov)):
+        raise RequestError(f"pair {pair.seq} has a number that is not finite")
+    if np.abs(pair.x).max() > FARTHEST_M:
+        raise RequestError(f"pair {pair.seq} lies {np.abs(pair.x).max():.0f} m away; positions are in metres")
+    if np.abs(pair.q).max() > LARGEST_Q:
+        raise RequestError(f"pair {pair.seq} has the joint angle {np.abs(pair.q).max():.3g}; angles are in radians")
+    if np.abs(pair.cov).max() > FARTHEST_M**2:
+        raise RequestError(f"pair {pair.seq} says that it may be {np.sqrt(np.abs(pair.cov).max()):.3g} m wrong")
+    spread = np.linalg.eigvalsh(pair.cov)
+    if spread[0] < -ROUNDING * max(spread[-1], 0.0):
+        raise RequestError(f"pair {pair.seq} has a cov that is no covariance: a variance of {spread[0]:.3g} m²")

@@ -13,7 +13,7 @@ import numpy as np
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.model_bank import EXACT, PRIOR, RIGID
 from bodyschema.learning.solvers.orientation import OrientationSolution
-from bodyschema.learning.uncertainty import DISCOUNT
+from bodyschema.learning.uncertainty import DISCOUNT, WARM
 from bodyschema.learning.variance_terms import unexplained
 from kbmaps import (
     ChainBelief,
@@ -77,8 +77,8 @@ class AngleMemory(msgspec.Struct):
     @property
     def surprise(self) -> float:
         """Ratio of the errors to the predicted ones, at least 1."""
-        few = max(10.0 - self.weight, 0.0)
-        return math.sqrt(max((self.ratio + few) / max(self.weight, 10.0), 1.0))
+        few = max(WARM - self.weight, 0.0)
+        return math.sqrt(max((self.ratio + few) / max(self.weight, WARM), 1.0))
 
 
 class OrientationState(msgspec.Struct, kw_only=True):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +28,6 @@ from kbmaps import ChainBelief, KBMap, Recent, follow_a_path
 LOOKED_BACK = 500
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of a regime."""
 
@@ -42,8 +40,6 @@ class _Settings:
     judged_anew: float = 0.25
     looked_back_in_replay: int = 4
 
-
-_SETTINGS = _Settings()
 
 NO_TURN = (math.nan,) * 4
 
@@ -248,9 +244,9 @@ class Regime:
         """Take some of the replay steps that are due; return their number."""
         if not self.owes_replays:
             return 0
-        places = self._order.take(min(_SETTINGS.replay_steps, int(self._replays_due)), len(self.memory))
+        places = self._order.take(min(_Settings.replay_steps, int(self._replays_due)), len(self.memory))
         q, x = self.memory.at(places)
-        seen = slice(_SETTINGS.looked_back_in_replay)
+        seen = slice(_Settings.looked_back_in_replay)
         self._claims.replayed(x[seen] - self.models.predict(INSTANT, q[seen]))
         self.models.replay(q, x)
         self._replays_due -= len(places)
@@ -276,9 +272,9 @@ class Regime:
         """Replace the prior by another one fitted to the same pairs."""
         q, x = self.memory.all()
         self.models.start_again(prior, q, x)
-        self._claims.prior_changed(x[-_SETTINGS.recent :] - prior.predict(q[-_SETTINGS.recent :]))
+        self._claims.prior_changed(x[-_Settings.recent :] - prior.predict(q[-_Settings.recent :]))
         self._choose_map()
-        self._replays_due += self._replays_per_pair * min(len(q), _SETTINGS.recent)
+        self._replays_due += self._replays_per_pair * min(len(q), _Settings.recent)
 
     def ask(self) -> None:
         """Record that the solver works on all pairs so far."""
@@ -350,14 +346,14 @@ class Regime:
 
     def _judge_late(self, name: str, model: LearntModel, pairs: int, fed: int) -> None:
         """Compare a solution on the pairs received while the solver worked: it has not learnt them."""
-        q, x, _ = self.memory.since(max(pairs, self.memory.count - _SETTINGS.judged_late))
+        q, x, _ = self.memory.since(max(pairs, self.memory.count - _Settings.judged_late))
         if len(q) == 0:
             return
         instant = np.full(x.shape, math.nan)
         new = min(max(self.memory.count - fed, 0), len(q))
         if new and self.models.delayed is not None:
             instant[-new:] = x[-new:] - self.models.delayed.predict(q[-new:])
-        anew = len(q) >= _SETTINGS.judged_anew * pairs
+        anew = len(q) >= _Settings.judged_anew * pairs
         self._claims.predicted_late(name, model.predict, q, x - model.predict(q), instant, anew=anew)
 
     def _learn_turn(self, q: FloatArray, turn: FloatArray | None, cov: FloatArray | None = None) -> None:

@@ -76,13 +76,21 @@ class Snapshot:
         return self.model.digest if self.model is not None else ""
 
     def require_model(self) -> LearntModel:
-        """Return the model. Raises NoFrameError: there is none yet."""
+        """Return the model.
+
+        Raises:
+            NoFrameError: there is none yet.
+        """
         if self.model is None:
             raise NoFrameError(self.waiting_for)
         return self.model
 
     def require_map(self) -> KBMap:
-        """Return the best KB-Map, with the planes of e1, e2, e3 if learnt. Raises NoFrameError: there is none yet."""
+        """Return the best KB-Map, with the planes of e1, e2, e3 if learnt.
+
+        Raises:
+            NoFrameError: there is none yet.
+        """
         if self.map is None:
             raise NoFrameError(self.waiting_for)
         turned = self.orientation

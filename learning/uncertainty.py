@@ -162,6 +162,11 @@ class UncertaintyTracker:
     Args:
         bases: bases of the learnt maps.
         expected_m: expected RMS distance between prior and reality before there are errors [m].
+
+    Attributes:
+        belief: posterior of the chain from the pairs with the current tool; None before a solution was requested.
+        wide: posterior without the selection of narrower tolerances: the one to update with pairs of another tool.
+        residual: posterior of the arm as a chain with residual, with the current tool; None before its first solution.
     """
 
     def __init__(self, bases: Sequence[JointBasis], expected_m: float) -> None:
@@ -180,9 +185,9 @@ class UncertaintyTracker:
         self._asked: SupportSet | None = None
         self._solved: dict[str, SupportSet | None] = {}
         self._expected: ChainBelief | None = None
-        self._belief: ChainBelief | None = None
-        self._wide: ChainBelief | None = None
-        self._residual: ResidualModel | None = None
+        self.belief: ChainBelief | None = None
+        self.wide: ChainBelief | None = None
+        self.residual: ResidualModel | None = None
 
     def best(self, present: str) -> str:
         """Return the model that shall answer; `present` while there is nothing to compare."""
@@ -206,21 +211,6 @@ class UncertaintyTracker:
         """Noise of the measurements: RMS distance from the truth [m], as claimed with them."""
         return float(np.sqrt(self.errors[PRIOR].noise_variance.sum()))
 
-    @property
-    def belief(self) -> ChainBelief | None:
-        """Posterior of the chain from the pairs with the current tool; None before a solution was requested."""
-        return self._belief
-
-    @property
-    def wide(self) -> ChainBelief | None:
-        """Posterior without the selection of narrower tolerances: the one to update with pairs of another tool."""
-        return self._wide
-
-    @property
-    def residual(self) -> ResidualModel | None:
-        """Posterior of the arm as a chain with residual, with the current tool; None before its first solution."""
-        return self._residual
-
     def change_tool(self, expected_m: float, answered: str = PRIOR) -> None:
         """Reset the models' errors for another tool; `expect` sets the posterior of the arm.
 
@@ -237,7 +227,7 @@ class UncertaintyTracker:
 
     def fitted(self, belief: ChainBelief) -> None:
         """Set the posterior of the chain from the first pairs, before any solution."""
-        self._belief = self._wide = belief
+        self.belief = self.wide = belief
 
     def untried(self, name: str) -> bool:
         """Return True if this model has a solution that has predicted too few pairs to be compared."""
@@ -302,9 +292,9 @@ class UncertaintyTracker:
         self.errors.setdefault(name, ErrorMemory(self._expected_m))
         self._solved[name] = self._asked
         if isinstance(belief, ResidualModel):
-            self._residual = belief
+            self.residual = belief
         elif belief is not None:
-            self._belief, self._wide = belief, wide or belief
+            self.belief, self.wide = belief, wide or belief
         noise = self.errors[PRIOR].noise_variance
         before = self._misfits_before.get(name, self._misfits_before.get(RIGID, np.zeros(3)))
         scatter = 0.0 if belief is None else belief.noise
@@ -352,12 +342,12 @@ class UncertaintyTracker:
             predict: its positions (n, 3) [m] at q (n, d) [rad]; None before the model exists.
         """
         memory = self.errors.get(name, ErrorMemory(self._expected_m))
-        belief = self._belief or self._expected
+        belief = self.belief or self._expected
         if belief is None or predict is None:
             return PredictiveUncertainty(memory.sigma)
         none = np.zeros(3)
         if name in SOLVED:
-            chain = self._residual if name == RESIDUAL and self._residual is not None else belief
+            chain = self.residual if name == RESIDUAL and self.residual is not None else belief
             return PredictiveUncertainty(
                 self._misfits.get(name, none), (ChainTerm(chain), self._rest(name)), memory.surprise
             )
@@ -384,9 +374,9 @@ class UncertaintyTracker:
             residuals=self._residuals,
             misfits={name: _triple(missed) for name, missed in self._misfits.items()},
             misfits_before={name: _triple(missed) for name, missed in self._misfits_before.items()},
-            belief=None if self._belief is None else self._belief.to_bytes(),
-            wide=None if self._wide is None else self._wide.to_bytes(),
-            residual=None if self._residual is None else self._residual.to_bytes(),
+            belief=None if self.belief is None else self.belief.to_bytes(),
+            wide=None if self.wide is None else self.wide.to_bytes(),
+            residual=None if self.residual is None else self.residual.to_bytes(),
         )
 
     def arrays(self) -> dict[str, FloatArray]:
@@ -404,9 +394,9 @@ class UncertaintyTracker:
         self._misfits = {name: np.array(missed) for name, missed in state.misfits.items()}
         self._trusted = state.trusted
         self._misfits_before = {name: np.array(missed) for name, missed in state.misfits_before.items()}
-        self._belief = None if state.belief is None else ChainBelief.from_bytes(state.belief)
-        self._wide = None if state.wide is None else ChainBelief.from_bytes(state.wide)
-        self._residual = None if state.residual is None else ResidualModel.from_bytes(state.residual)
+        self.belief = None if state.belief is None else ChainBelief.from_bytes(state.belief)
+        self.wide = None if state.wide is None else ChainBelief.from_bytes(state.wide)
+        self.residual = None if state.residual is None else ResidualModel.from_bytes(state.residual)
         self._asked = self._support.view
         self._solved = dict.fromkeys(self._misfits, self._asked)
 

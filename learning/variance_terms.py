@@ -104,16 +104,14 @@ class GrowingSupport:
 
     Args:
         bases: bases of the learnt maps.
+
+    Attributes:
+        view: copy that later pairs do not change; None before any.
     """
 
     def __init__(self, bases: Sequence[JointBasis]) -> None:
         self._growing = SupportSet(bases)
-        self._view: SupportSet | None = None
-
-    @property
-    def view(self) -> SupportSet | None:
-        """Copy that later pairs do not change; None before any."""
-        return self._view
+        self.view: SupportSet | None = None
 
     @property
     def configurations(self) -> FloatArray:
@@ -125,4 +123,4 @@ class GrowingSupport:
         # A configuration that is already explained cannot join after others have joined.
         new = q[self._growing.unexplained(q) > self._growing.threshold]
         if sum(self._growing.add(row) for row in new):
-            self._view = copy.deepcopy(self._growing)
+            self.view = copy.deepcopy(self._growing)

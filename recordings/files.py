@@ -12,6 +12,7 @@ import numpy as np
 
 from bodyschema.interfaces.errors import RecordingError
 from bodyschema.interfaces.records import Pair
+from bodyschema.interfaces.whole_files import require_target
 from bodyschema.recordings.recording import CSV, PARQUET, Recording, joints_in
 
 from .mcap_export import write_mcap
@@ -140,12 +141,7 @@ def check_target(out: Path, *, force: bool) -> None:
     """Raise RecordingError unless a recording can be written to `out`: known ending, no file in the way."""
     if out.suffix.lower() == URDF:
         raise RecordingError("a URDF is of a robot, not of pairs", file=out, remedy="`bodyschema calibrate` learns one")
-    if out.suffix.lower() not in _WRITERS:
-        raise RecordingError(f"recordings end in {', '.join(_WRITERS)}", file=out, remedy="Give another name")
-    if not out.parent.is_dir():
-        raise RecordingError(f"there is no folder {out.parent}", file=out, remedy="Make it first")
-    if out.exists() and not force:
-        raise RecordingError("the file is there already", file=out, remedy="Give another name, or --force")
+    require_target(out, _WRITERS, "recordings", force=force, error=RecordingError)
 
 
 def write(recording: Recording, out: Path, devices: Sequence[Devices] = (), scene: Scene | None = None) -> None:

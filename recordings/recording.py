@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -165,7 +166,11 @@ class Recording:
         return Table(names, np.hstack([values for _, values in blocks]))
 
     def write_csv(self, file: Path) -> None:
-        """Write CSV; reading it gives every number back exactly. Raises RecordingError: the file cannot be written."""
+        """Write CSV; reading it gives every number back exactly.
+
+        Raises:
+            RecordingError: the file cannot be written.
+        """
         try:
             with file.open("w", encoding="utf-8", newline="\n") as out:
                 self.write_csv_to(out)
@@ -173,7 +178,11 @@ class Recording:
             raise RecordingError(f"cannot be written: {error.strerror or error}", file=file) from error
 
     def write_csv_to(self, out: TextIO) -> None:
-        """Write CSV to an open file. Raise OSError if that fails."""
+        """Write CSV to an open file.
+
+        Raises:
+            OSError: that fails.
+        """
         table = self.to_table()
         integers = frozenset(i for i, name in enumerate(table.names) if name in INTEGER_COLUMNS)
         out.write(",".join(table.names) + "\n")
@@ -237,17 +246,9 @@ def read_table(file: Path, joints: tuple[str, ...]) -> Table:
     Raises:
         RecordingError: the file cannot be read; the message names line, column and remedy.
     """
-    readers = {CSV: read_csv_table, PARQUET: read_parquet_table}
-    reader = readers.get(file.suffix.lower())
-    if reader is None:
-        raise RecordingError(f"recordings end in {CSV} or {PARQUET}", file=file, remedy="Rename or convert it")
-    try:
-        table = reader(file, joints)
+    with _explained(file):
+        table = {CSV: read_csv_table, PARQUET: read_parquet_table}[file.suffix.lower()](file, joints)
         check_values(table)
-    except Fault as fault:
-        raise _located(fault, file) from None
-    except OSError as error:
-        raise _unreadable(file, error) from error
     return table
 
 
@@ -257,21 +258,26 @@ def joints_in(file: Path) -> tuple[str, ...]:
     Raises:
         RecordingError: the file cannot be read.
     """
-    readers = {CSV: csv_columns, PARQUET: parquet_columns}
-    reader = readers.get(file.suffix.lower())
-    if reader is None:
-        raise RecordingError(f"recordings end in {CSV} or {PARQUET}", file=file, remedy="Rename or convert it")
-    try:
-        names = reader(file)
-    except Fault as fault:
-        raise _located(fault, file) from None
-    except OSError as error:
-        raise _unreadable(file, error) from error
+    with _explained(file):
+        names = {CSV: csv_columns, PARQUET: parquet_columns}[file.suffix.lower()](file)
     others = {prefix + name for prefix in EXTRA_PREFIXES for name in names}
     joints = tuple(name for name in names if name not in RESERVED and name not in others)
     if not joints:
         raise RecordingError("no column is a joint's", file=file, remedy="Name a recording of joints and positions")
     return joints
+
+
+@contextmanager
+def _explained(file: Path) -> Iterator[None]:
+    """Convert errors of reading `file` to RecordingError, after a look at its ending."""
+    if file.suffix.lower() not in (CSV, PARQUET):
+        raise RecordingError(f"recordings end in {CSV} or {PARQUET}", file=file, remedy="Rename or convert it")
+    try:
+        yield
+    except Fault as fault:
+        raise _located(fault, file) from None
+    except OSError as error:
+        raise _unreadable(file, error) from error
 
 
 def _unreadable(file: Path, error: OSError) -> RecordingError:

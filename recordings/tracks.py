@@ -17,7 +17,6 @@ from .recording import Recording
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the interpolation of a recording's tracks."""
 
@@ -29,9 +28,6 @@ class _Settings:
     max_sigma: float = np.radians(0.2)
     # A chord of the double interval misses its middle reading by four times what one of the single interval does.
     chord: float = 0.25
-
-
-_SETTINGS = _Settings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +87,7 @@ def joined(names: tuple[str, ...], joints: JointTrack, marker: MarkerTrack, file
     rows = np.concatenate([rows for rows, _, _ in parts])
     q = np.concatenate([angles for _, angles, _ in parts])
     sigma = np.concatenate([sigma for _, _, sigma in parts])
-    sure = sigma <= _SETTINGS.max_sigma
+    sure = sigma <= _Settings.max_sigma
     if not sure.any():
         raise RecordingError(
             f"the joints move too fast for how often they were read: {np.degrees(np.median(sigma)):.2g}° (1-sigma)",
@@ -128,7 +124,7 @@ def _interpolated(
     after = np.where(exact & (after == 0), 1, after)
     between = (after > 0) & (after < len(t))
     after, rows = after[between], rows[between]
-    near = t[after] - t[after - 1] <= _SETTINGS.max_gap_s
+    near = t[after] - t[after - 1] <= _Settings.max_gap_s
     after, rows = after[near], rows[near]
     share = ((at[rows] - t[after - 1]) / (t[after] - t[after - 1]))[:, None]
     found = q[after - 1] + share * (q[after] - q[after - 1])
@@ -141,12 +137,12 @@ def _bend(t: FloatArray, q: FloatArray) -> FloatArray:
     bend = np.zeros(len(t))
     if len(t) > 2:
         share = ((t[1:-1] - t[:-2]) / (t[2:] - t[:-2]))[:, None]
-        bend[1:-1] = _SETTINGS.chord * np.abs(q[:-2] + share * (q[2:] - q[:-2]) - q[1:-1]).max(axis=1)
+        bend[1:-1] = _Settings.chord * np.abs(q[:-2] + share * (q[2:] - q[:-2]) - q[1:-1]).max(axis=1)
     return bend
 
 
 def _segments(t: FloatArray, run: NDArray[np.int64]) -> NDArray[np.int64]:
-    begins = (np.diff(run) != 0) | (np.diff(t) > _SETTINGS.segment_gap_s)
+    begins = (np.diff(run) != 0) | (np.diff(t) > _Settings.segment_gap_s)
     return np.concatenate([[0], np.cumsum(begins)]).astype(np.int64)
 
 
@@ -162,7 +158,7 @@ def _tell(positions: int, between: int, sure: NDArray[np.bool_], sigma: FloatArr
 
 def _apart(joints: JointTrack, marker: MarkerTrack) -> str:
     return (
-        f"no marker position lies between two joint readings at most {_SETTINGS.max_gap_s:g} s apart: the joints are "
+        f"no marker position lies between two joint readings at most {_Settings.max_gap_s:g} s apart: the joints are "
         f"from {joints.t.min():.3f} to {joints.t.max():.3f} s, "
         f"the marker from {marker.t.min():.3f} to {marker.t.max():.3f} s"
     )

@@ -42,8 +42,6 @@ def write_calibrated(
 ) -> Path:
     """Write `robot` with another geometry as a URDF and a robot.toml into `folder`, which is made if need be.
 
-    Raise ConfigError if one of the files is there already, or they cannot be written.
-
     Meshes stay where they are; their relative names are made to lead there, names with a scheme are left. Store and
     checkpoint will be kept in a folder of their own.
 
@@ -53,6 +51,9 @@ def write_calibrated(
 
     Returns:
         The path of the robot.toml.
+
+    Raises:
+        ConfigError: one of the files is there already, or they cannot be written.
     """
     urdf, toml = folder / robot.tree.file.name, folder / ROBOT_FILE
     texts = {
@@ -135,7 +136,8 @@ def _relative(path: str | Path, old: Path, new: Path) -> str:
 def tables_elsewhere(robot: RobotDescription, folder: Path) -> dict[str, Any]:
     """Return the tables of a robot.toml in `folder` with the same URDF and a store of its own.
 
-    Raise ConfigError if the original robot.toml can no longer be read.
+    Raises:
+        ConfigError: the original robot.toml can no longer be read.
     """
     tables, _ = read_toml(robot.file)
     tables["daemon"] = tables.get("daemon", {}) | {"state_dir": STATE_DIR}

@@ -116,8 +116,9 @@ class RobotDescription:
     def load(cls, file: Path) -> RobotDescription:
         """Read robot.toml and its URDF; the tables other than [robot] and [camera] are the daemon's to check.
 
-        Raise ConfigError if robot.toml cannot be read, or has an unknown, missing or wrong key (with its line). Raise
-        RobotError if URDF and robot.toml do not fit each other.
+        Raises:
+            ConfigError: robot.toml cannot be read, or has an unknown, missing or wrong key (with its line).
+            RobotError: URDF and robot.toml do not fit each other.
         """
         tables, text = read_toml(file)
         return cls.from_tables(tables, text, file)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
@@ -15,7 +17,8 @@ if TYPE_CHECKING:
     from bodyschema.interfaces.records import FloatArray
 
 LAUNCH = "hand_eye.launch.py"
-_STEP = 1e-6  # of the numerical derivative of a pose [m, rad]
+# Of the numerical derivative of a pose [m, rad]: truncation and rounding are of the same size.
+_STEP = math.sqrt(sys.float_info.epsilon)
 _PUBLISHER = "static_transform_publisher"
 
 
@@ -148,7 +151,8 @@ def pose_covariance(pose: Callable[[FloatArray], FloatArray], values: FloatArray
 def write_launch_file(pose: HandEye, folder: Path) -> Path:
     """Write a ROS 2 launch file that publishes the pose on /tf_static; an older one is replaced.
 
-    Raise ConfigError if it cannot be written.
+    Raises:
+        ConfigError: it cannot be written.
     """
     from bodyschema.interfaces.whole_files import write_whole
 

@@ -122,10 +122,11 @@ Calibrations = Mapping[str, MotorCalibration]
 def read_calibration(file: Path, motors: Sequence[str] = ()) -> dict[str, MotorCalibration]:
     """Read LeRobot's calibration of an arm, by motor.
 
-    Raise ConfigError if it cannot be read, is of an older LeRobot, or a number in it cannot be.
-
     Args:
         motors: those that have to be there.
+
+    Raises:
+        ConfigError: it cannot be read, is of an older LeRobot, or a number in it cannot be.
     """
     again = "Let `lerobot-calibrate` write it again"
     try:
@@ -199,9 +200,10 @@ def corrections(
 ) -> list[Correction]:
     """Return what becomes of the homing offsets when `offsets_rad` are added to the joints' readings.
 
-    Raise KeyError if a joint of `servos` with an offset is not among the motors.
-
     The ends of the ranges stay, and so do LeRobot's 0° and −100…100: their places in the arm move by the offset.
+
+    Raises:
+        KeyError: a joint of `servos` with an offset is not among the motors.
     """
     found: list[Correction] = []
     for servo in servos:

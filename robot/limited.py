@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import resource
 import stat
@@ -11,7 +12,6 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-_PIECE = 2**20
 # For text written by a person or a command: over ten times the size of any URDF, log or table of ours.
 MOST_TEXT_BYTES = 2**24
 # What reading one file may take: 20 million joint states of some 200 bytes. A file of 256 kB can unpack to 8 GiB.
@@ -31,8 +31,9 @@ class UnfitFile(OSError):
 def check_regular(file: Path) -> None:
     """Check that `file` can be given to a library that reads it to its end.
 
-    Raise UnfitFile if it is a device, a pipe or a socket, which may have no end. Raise OSError if it is a folder, or
-    cannot be examined.
+    Raises:
+        UnfitFile: it is a device, a pipe or a socket, which may have no end.
+        OSError: it is a folder, or cannot be examined.
     """
     _require_regular(os.stat(file).st_mode)
 
@@ -41,10 +42,12 @@ def check_regular(file: Path) -> None:
 def opened(file: Path, most: int) -> Iterator[BinaryIO]:
     """Open a regular file for reading.
 
-    Raise UnfitFile if it is larger, or a device, a pipe or a socket. Raise OSError if it cannot be read.
-
     Args:
         most: largest plausible size of its kind [bytes].
+
+    Raises:
+        UnfitFile: it is larger, or a device, a pipe or a socket.
+        OSError: it cannot be read.
     """
     check_regular(file)  # before it is opened: opening a port or a watchdog has side effects
     with open(file, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK)) as stream:
@@ -59,7 +62,7 @@ def read_at_most(file: Path, most: int = MOST_TEXT_BYTES) -> bytes:
     """Return the bytes of a regular file. Raise the errors of `opened`."""
     data = bytearray()
     with opened(file, most) as stream:
-        while piece := stream.read(_PIECE):  # files of /proc report no size
+        while piece := stream.read(io.DEFAULT_BUFFER_SIZE):  # files of /proc report no size
             data += piece
             if len(data) > most:
                 raise _too_large(most)

@@ -161,7 +161,8 @@ class MeshError(Exception):
 def read_mesh(file: Path) -> FloatArray:
     """Return the triangles (n, 3, 3) of a mesh file, n at least 1, in metres if the file states its unit.
 
-    Raise MeshError if it cannot be read, is malformed or empty, or has numbers that are not finite.
+    Raises:
+        MeshError: it cannot be read, is malformed or empty, or has numbers that are not finite.
     """
     try:
         data = read_at_most(file, LARGEST_MESH_BYTES)

@@ -49,7 +49,8 @@ class PluginConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 def load(group: Group, name: str) -> Any:
     """Return the object of the entry point `name` of `group`.
 
-    Raise ConfigError if no installed package has it, or it cannot be imported.
+    Raises:
+        ConfigError: no installed package has it, or it cannot be imported.
     """
     try:
         return _entry(group, name).load()

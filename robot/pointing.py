@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,7 +10,6 @@ from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray, frozen_array
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the step towards the marker."""
 
@@ -20,9 +18,6 @@ class _Settings:
     longest_step: float = 0.4
     nearest_m: float = 0.05
     nudge: float = 1e-6
-
-
-_SETTINGS = _Settings()
 
 
 Positions = Callable[[FloatArray], FloatArray]
@@ -51,19 +46,19 @@ class Pointing:
     def step(self, q: FloatArray, positions: Positions) -> FloatArray:
         """Return damped least-squares steps (n, g) of the gazing joints from q (n, d) towards the centre [rad]."""
         # Derivative by finite differences: one batch of positions costs less than a Jacobian.
-        nudged = q[:, None] + _SETTINGS.nudge * np.eye(q.shape[1])[self._joints]
+        nudged = q[:, None] + _Settings.nudge * np.eye(q.shape[1])[self._joints]
         rows = np.concatenate([q, nudged.reshape(-1, q.shape[1])])
         # Tangents (n, 2) of the angles to the image centre, seen from the middle of the baseline.
         x = positions(rows) - self._half_baseline
-        missed = x[:, :2] / np.maximum(x[:, 2:], _SETTINGS.nearest_m) - self._centre
+        missed = x[:, :2] / np.maximum(x[:, 2:], _Settings.nearest_m) - self._centre
         off_centre = missed[: len(q)]
         changed = missed[len(q) :].reshape(*nudged.shape[:2], 2)
-        J = ((changed - off_centre[:, None]) / _SETTINGS.nudge).swapaxes(1, 2)
+        J = ((changed - off_centre[:, None]) / _Settings.nudge).swapaxes(1, 2)
         step = _damped_step(J, off_centre)
         # A joint that is blocked by its limit is excluded; the others take over.
         angles = q[:, self._joints]
         stuck = ((angles <= self._lower) & (step < 0)) | ((angles >= self._upper) & (step > 0))
-        return np.clip(_damped_step(J * ~stuck[:, None], off_centre), -_SETTINGS.longest_step, _SETTINGS.longest_step)
+        return np.clip(_damped_step(J * ~stuck[:, None], off_centre), -_Settings.longest_step, _Settings.longest_step)
 
     def clipped(self, angles: FloatArray) -> FloatArray:
         """Return angles (…, g) within the limits."""
@@ -72,5 +67,5 @@ class Pointing:
 
 def _damped_step(J: FloatArray, error: FloatArray) -> FloatArray:
     """Return Levenberg-Marquardt steps (n, g) for Jacobians (n, 2, g) and errors (n, 2)."""
-    damped = J @ J.swapaxes(1, 2) + _SETTINGS.damping * np.eye(2)
+    damped = J @ J.swapaxes(1, 2) + _Settings.damping * np.eye(2)
     return -(J.swapaxes(1, 2) @ np.linalg.solve(damped, error[..., None]))[..., 0]

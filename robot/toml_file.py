@@ -49,11 +49,14 @@ _PLACE = re.compile(r"(?P<what>.*?) - at `\$(?P<path>[^`]*)`$", re.DOTALL)
 def read_toml(
     file: Path, *, written_by: str = "`bodyschema init` writes one", damaged: str = ""
 ) -> tuple[dict[str, Any], str]:
-    """Return the tables of `file` and its text. Raise ConfigError with the line when it cannot be read.
+    """Return the tables of `file` and its text.
 
     Args:
         written_by: the command that writes such a file, as the remedy if it does not exist.
         damaged: the remedy for invalid text in a file not written by hand; by default that for a robot.toml.
+
+    Raises:
+        ConfigError: it cannot be read; the message has the line.
     """
     try:
         data = read_at_most(file, MOST_BYTES)
@@ -121,10 +124,13 @@ def _decoded(data: bytes, file: Path, remedy: str) -> str:
 
 
 def convert(tables: object, kind: type[T], *, file: Path, text: str, prefix: tuple[str, ...] = ()) -> T:
-    """Convert `tables` to the struct `kind`. Raise ConfigError with the line of an unknown, missing or wrong key.
+    """Convert `tables` to the struct `kind`.
 
     Args:
         prefix: the keys of `tables` in the file.
+
+    Raises:
+        ConfigError: a key is unknown, missing or wrong; the message has its line.
     """
     for keys, what in _unusable(tables, prefix):
         raise ConfigError(f"{'.'.join(keys)}: {what}", file=file, line=line_of(text, keys))

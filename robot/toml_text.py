@@ -32,9 +32,10 @@ def toml_value(value: object) -> str:
 def with_values(file: Path, table: str, values: Mapping[str, Any]) -> str:
     """Return the text of a TOML file with values in a table, which has to be there; in the first of several.
 
-    Raise ConfigError if the file cannot be read, has no such table, or is written in a way that cannot be edited.
-
     Each line keeps its end, a new one takes that of the line before; a byte order mark stays.
+
+    Raises:
+        ConfigError: the file cannot be read, has no such table, or is written in a way that cannot be edited.
     """
     expected, _ = read_toml(file)
     text = file.read_bytes().decode()
@@ -80,7 +81,8 @@ def difference(file: Path, edited: str) -> list[str]:
 def write_edited(file: Path, edited: str) -> Path:
     """Replace a file by its edited text; return the name under which the old one is kept.
 
-    Raise ConfigError if nothing could be written.
+    Raises:
+        ConfigError: nothing could be written.
     """
     try:
         return replace_kept(file, edited.encode())

@@ -89,7 +89,8 @@ class UrdfTree:
     def load(cls, file: Path) -> UrdfTree:
         """Read `file`.
 
-        Raise RobotError if the file is missing, not XML, not a URDF, or its links do not form a tree.
+        Raises:
+            RobotError: the file is missing, not XML, not a URDF, or its links do not form a tree.
         """
         root = parse_urdf(file)
         links = _by_name(root, "link", file)
@@ -102,7 +103,11 @@ class UrdfTree:
         return tree
 
     def joint(self, name: str) -> UrdfJoint:
-        """Return the joint called `name`. Raise RobotError with a suggestion when there is none."""
+        """Return the joint called `name`.
+
+        Raises:
+            RobotError: there is none; the message suggests another.
+        """
         if name not in self.joints:
             raise RobotError(f"there is no joint {name!r} in {self.file.name}", remedy=did_you_mean(name, self.joints))
         return self.joints[name]
@@ -173,8 +178,6 @@ def chain_between(
 ) -> RigidChain:
     """Return the rigid chain from the measurement frame to the marker.
 
-    Raise RobotError if a joint does not lie between the links, or the order along the path is another one.
-
     Args:
         joints: names in the order of q; each has to lie between the two links.
         held_at: positions [rad or m] of the other joints on the path; 0 where not named.
@@ -185,6 +188,9 @@ def chain_between(
 
     Returns:
         A chain whose joints are `joints`, in this order, which is also their order along the path.
+
+    Raises:
+        RobotError: a joint does not lie between the links, or the order along the path is another one.
     """
     way = tree.path(start, end)
     mimicking = next((joint for joint, _ in way if joint.mimics), None)

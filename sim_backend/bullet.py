@@ -34,7 +34,11 @@ class PhysicsUrdf(msgspec.Struct, frozen=True):
 
 
 def load_pybullet() -> Any:
-    """Import and return the module pybullet. Raise ConfigError if it is not installed."""
+    """Import and return the module pybullet.
+
+    Raises:
+        ConfigError: it is not installed.
+    """
     try:
         with _quiet():
             return importlib.import_module("pybullet")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +17,6 @@ from .sight import Sight
 from .truth import TrueRobot
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the simulated hand that guides the arm."""
 
@@ -43,13 +41,8 @@ class _Settings:
     friction_time_s: float = 0.15
 
 
-_SETTINGS = _Settings()
-
-
 class GuidePath:
     """Postures along the path, at constant speed in the joint space of all learnt joints.
-
-    Raise ConfigError if the ball is visible at hardly any posture.
 
     Args:
         lower, upper: joint limits (d,); guided joints stay within.
@@ -58,6 +51,9 @@ class GuidePath:
 
     Attributes:
         waypoints: visible postures (n, d) between which the path runs; it begins at the first.
+
+    Raises:
+        ConfigError: the ball is visible at hardly any posture.
     """
 
     def __init__(
@@ -70,7 +66,7 @@ class GuidePath:
         rng: np.random.Generator,
     ) -> None:
         self._sight, self._guided, self._step, self._rng = sight, list(guided), step, rng
-        margin = _SETTINGS.limit_margin * (upper - lower)
+        margin = _Settings.limit_margin * (upper - lower)
         self._lower, self._upper = lower + margin, upper - margin
         self.waypoints = self._visible_postures()
         self._unvisited = list(range(1, len(self.waypoints)))
@@ -97,7 +93,7 @@ class GuidePath:
     def _curve(self, start: FloatArray, end: FloatArray, after: FloatArray) -> FloatArray:
         """Return a cubic from start to end with Catmull-Rom tangents, so that the path is smooth at its end."""
         leave, arrive = (end - self._before) / 2, (after - start) / 2
-        count = max(2, int(np.linalg.norm((end - start)[self._guided]) / _SETTINGS.spacing))
+        count = max(2, int(np.linalg.norm((end - start)[self._guided]) / _Settings.spacing))
         s = np.linspace(0.0, 1.0, count + 1)[1:, None]
         return (
             (2 * s**3 - 3 * s**2 + 1) * start
@@ -121,10 +117,10 @@ class GuidePath:
             self.waypoints = self._visible_postures()
             self._unvisited = list(range(len(self.waypoints)))
         hops = self.waypoints[self._unvisited] - start
-        nearest = np.argsort(np.linalg.norm(hops[:, self._guided], axis=1), kind="stable")[: _SETTINGS.candidates]
+        nearest = np.argsort(np.linalg.norm(hops[:, self._guided], axis=1), kind="stable")[: _Settings.candidates]
         best, best_share = int(nearest[0]), -1.0
         for candidate in nearest:
-            between = self._sight.gazed(start + np.array(_SETTINGS.checks)[:, None] * hops[candidate])
+            between = self._sight.gazed(start + np.array(_Settings.checks)[:, None] * hops[candidate])
             share = float(self._sight.visible(between).mean())
             if share > best_share:
                 best, best_share = int(candidate), share
@@ -135,17 +131,17 @@ class GuidePath:
     def _visible_postures(self) -> FloatArray:
         """Sample postures (n, d) uniformly over the guided joints' ranges, and return those with a visible ball."""
         found: list[FloatArray] = []
-        for _ in range(_SETTINGS.most_batches):
-            q = np.tile((self._lower + self._upper) / 2, (_SETTINGS.batch, 1))
+        for _ in range(_Settings.most_batches):
+            q = np.tile((self._lower + self._upper) / 2, (_Settings.batch, 1))
             q[:, self._guided] = self._rng.uniform(
-                self._lower[self._guided], self._upper[self._guided], (_SETTINGS.batch, len(self._guided))
+                self._lower[self._guided], self._upper[self._guided], (_Settings.batch, len(self._guided))
             )
-            for few in np.split(q, _SETTINGS.batch // _SETTINGS.at_once):
+            for few in np.split(q, _Settings.batch // _Settings.at_once):
                 few = self._sight.gazed(few)
                 for posture in few[self._sight.in_images(few)]:
                     if self._sight.clear(posture):
                         found.append(posture)
-                    if len(found) == _SETTINGS.postures:
+                    if len(found) == _Settings.postures:
                         return np.array(found)
         if len(found) < 2:
             raise ConfigError(
@@ -179,7 +175,7 @@ class VirtualHand:
         inertias = _Inertias(body, roles, (self._wrist, self._elbow), postures - truth.offsets)
         self._wrist_mass, self._elbow_mass = inertias.masses
         self._wrist_inertia = inertias.turning
-        self.friction = inertias.joints / _SETTINGS.friction_time_s
+        self.friction = inertias.joints / _Settings.friction_time_s
 
     def goals(self, postures: FloatArray) -> Goals:
         """Return the hand's targets along the postures (n, d), given by reported angles."""
@@ -196,7 +192,7 @@ class VirtualHand:
         self._force(self._wrist, T[:3, 3], self._spring(self._wrist_mass, x_goal - T[:3, 3], v_goal - v))
         error = turn_between(T[:3, :3], goals.wrist[k, :3, :3])
         torque = self._wrist_inertia * (
-            _SETTINGS.frequency**2 * error - 2 * _SETTINGS.damping_ratio * _SETTINGS.frequency * spin
+            _Settings.frequency**2 * error - 2 * _Settings.damping_ratio * _Settings.frequency * spin
         )
         self._torque(self._wrist, torque)
         T, v, _ = self._body.link_motion(self._elbow)
@@ -204,7 +200,7 @@ class VirtualHand:
         self._force(self._elbow, T[:3, 3], self._spring(self._elbow_mass, goals.elbow[k] - T[:3, 3], v_goal - v))
 
     def _spring(self, mass: float, error: FloatArray, error_rate: FloatArray) -> FloatArray:
-        return mass * (_SETTINGS.frequency**2 * error + 2 * _SETTINGS.damping_ratio * _SETTINGS.frequency * error_rate)
+        return mass * (_Settings.frequency**2 * error + 2 * _Settings.damping_ratio * _Settings.frequency * error_rate)
 
     def _force(self, link: str, x: FloatArray, force: FloatArray) -> None:
         self._body.bullet.applyExternalForce(

@@ -34,8 +34,8 @@ MOST_LINKS = 120  # pybullet's messages hold 128 joints
 _LONGEST_NAME = 1000  # pybullet's messages hold 1024 bytes
 FARTHEST_M = 100.0
 HEAVIEST_KG = 1e4
-# A rod in the place of a mesh: its radius as a share of its length, and within what [m].
-_ROD_SHARE, _ROD_RADII_M, _SHORTEST_ROD_M = 0.1, (0.005, 0.04), 0.01
+# A rod in the place of a mesh: its radius as a share of its length, and within what; the shortest one [m].
+_ROD_SHARE, ROD_RADIUS_M, _WIDEST_ROD_M, SHORTEST_ROD_M = 0.1, 0.005, 0.04, 0.01
 _ROD_RGBA = "0.55 0.57 0.6 1"
 _SIZES = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length"), "capsule": ("radius", "length")}
 # TinyRenderer takes 0.3 µs for a triangle, and a stereo frame is four pictures: 8,000 cost some 10 ms of CPU a frame.
@@ -45,11 +45,12 @@ MOST_TRIANGLES = 8_000
 def physics_urdf(truth: TrueRobot) -> PhysicsUrdf:
     """Return the URDF of `truth`: joint frames replaced by the true ones, joints that are not learnt locked.
 
-    Raise RobotError if the robot has more links than pybullet takes, or joints too far apart.
-
     Meshes have few triangles. What cannot be drawn is left out, and links whose meshes are missing or malformed are
     rods between their joints. Links that state no inertia get a small one. Textures are left out: no other file of the
     machine's is read because a URDF names it.
+
+    Raises:
+        RobotError: the robot has more links than pybullet takes, or joints too far apart.
     """
     return _Writer(truth).written()
 
@@ -175,10 +176,10 @@ class _Writer:
         for joint in self._truth.tree.joints.values():
             end = joint.T_parent_joint[:3, 3]
             length = float(np.linalg.norm(end))
-            if joint.parent != link or length < _SHORTEST_ROD_M or joint.child not in self._moving:
+            if joint.parent != link or length < SHORTEST_ROD_M or joint.child not in self._moving:
                 continue
             rod = _shape_at(kind, (end / 2).tolist(), rpy_of(turn_of_z(end / length)).tolist())
-            radius = float(np.clip(_ROD_SHARE * length, *_ROD_RADII_M))
+            radius = float(np.clip(_ROD_SHARE * length, ROD_RADIUS_M, _WIDEST_ROD_M))
             ElementTree.SubElement(
                 ElementTree.SubElement(rod, "geometry"), "cylinder", radius=repr(radius), length=repr(length)
             )

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import threading
 from contextlib import ExitStack
-from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -36,7 +35,6 @@ log = logging.getLogger(__name__)
 PERIOD_S = 1.0
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the search for postures."""
 
@@ -49,13 +47,8 @@ class _Settings:
     wander: float = np.radians(20.0)
 
 
-_SETTINGS = _Settings()
-
-
 class PosedWorld:
     """A robot that stands still in given postures when its encoders are read and its frames are taken.
-
-    Raise ConfigError if [camera] has no stereo calibration, or pybullet is not installed (both on entering).
 
     Each posture gives one reading and one frame with the same time. The same arguments reproduce them bit by bit.
 
@@ -64,6 +57,9 @@ class PosedWorld:
         postures: reported joint angles (n, d) [rad or m] to go to; encoders report them in whole ticks.
         extension: the robot with effects, to which the random errors are added; None: no effects. Camera latency has
             no influence on a robot that stands still.
+
+    Raises:
+        ConfigError: [camera] has no stereo calibration, or pybullet is not installed (both on entering).
     """
 
     def __init__(
@@ -121,7 +117,11 @@ class PosedWorld:
                 self._ask_ahead()
 
     def next_reading(self, timeout_s: float) -> JointReading:  # noqa: ARG002 - nothing to wait for
-        """Return the encoders' reading in the next posture. Raise SourceEnded after the last one."""
+        """Return the encoders' reading in the next posture.
+
+        Raises:
+            SourceEnded: there are no more.
+        """
         if self._read == len(self._postures):
             raise SourceEnded("the encoders were read in all postures")
         q = self._encoders.read(self._postures[self._read] - self._truth.offsets)
@@ -129,7 +129,11 @@ class PosedWorld:
         return JointReading(self._read * PERIOD_S, frozen_array(q))
 
     def next_frame(self, timeout_s: float) -> StereoFrame | None:
-        """Return the next posture's frame, None if it is not rendered in time. Raise SourceEnded after the last one."""
+        """Return the next posture's frame, None if it is not rendered in time.
+
+        Raises:
+            SourceEnded: there are no more.
+        """
         with self._fetching:
             if self._delivered == len(self._postures):
                 raise SourceEnded("all postures were seen")
@@ -141,7 +145,7 @@ class PosedWorld:
             return stereo_frame(self.now(), images)
 
     def _ask_ahead(self) -> None:
-        while self._asked < min(self._delivered + _SETTINGS.ahead, len(self._postures)):
+        while self._asked < min(self._delivered + _Settings.ahead, len(self._postures)):
             self._renderer.request(self._asked, self.scene(self._asked))
             self._asked += 1
 
@@ -171,16 +175,16 @@ def visible_postures(
     with Body(physics_urdf(truth), robot.joints) as body:
         looking = Gaze(robot, calibration, roles.gaze, config.guide.gaze_speed_rad_s)
         sight = Sight(truth, calibration, roles, looking, body, config.camera)
-        for _ in range(_SETTINGS.most_batches):
-            q = np.tile((robot.lower + robot.upper) / 2, (_SETTINGS.batch, 1))
-            q[:, guided] = rng.uniform(robot.lower[guided], robot.upper[guided], (_SETTINGS.batch, len(guided)))
+        for _ in range(_Settings.most_batches):
+            q = np.tile((robot.lower + robot.upper) / 2, (_Settings.batch, 1))
+            q[:, guided] = rng.uniform(robot.lower[guided], robot.upper[guided], (_Settings.batch, len(guided)))
             q = sight.gazed(q)
-            q[:, gaze] += rng.uniform(-_SETTINGS.wander, _SETTINGS.wander, (_SETTINGS.batch, len(gaze)))
+            q[:, gaze] += rng.uniform(-_Settings.wander, _Settings.wander, (_Settings.batch, len(gaze)))
             q = np.clip(q, robot.lower, robot.upper)
             found += list(q[sight.visible(q)])
             if len(found) >= count:
                 return np.array(found[:count])
     raise ConfigError(
-        f"the cameras see the marker in only {len(found)} of {_SETTINGS.batch * _SETTINGS.most_batches} postures",
+        f"the cameras see the marker in only {len(found)} of {_Settings.batch * _Settings.most_batches} postures",
         remedy="Check [camera] xyz and rpy, marker_xyz and the joint limits",
     )

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from bodyschema.interfaces.camera import StereoCalibration
@@ -20,7 +18,6 @@ from .config import CameraConfig
 from .truth import TrueRobot
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the search for a line of sight."""
 
@@ -35,9 +32,6 @@ class _Settings:
     # Rays begin this far from the eye [m], outside of the head's own shape, and go to the ball's middle and rim.
     ray_start_m: float = 0.06
     rim: float = 0.8
-
-
-_SETTINGS = _Settings()
 
 
 class Gaze:
@@ -66,7 +60,7 @@ class Gaze:
         """Return q (n, d) with the gazing joints turned to the marker, each within its limits."""
         q = q.copy()
         if self._joints:
-            for _ in range(_SETTINGS.solve_steps):
+            for _ in range(_Settings.solve_steps):
                 step = self._pointing.step(q, self._chain.positions)
                 q[:, self._joints] = self._pointing.clipped(q[:, self._joints] + step)
         return q
@@ -75,7 +69,7 @@ class Gaze:
         """Return the next command (g,) to the gazing joints' servos, from the reading q (d,) and the last command."""
         if not self._joints:
             return command
-        step = _SETTINGS.track_gain * self._pointing.step(q[None], self._chain.positions)[0]
+        step = _Settings.track_gain * self._pointing.step(q[None], self._chain.positions)[0]
         return self._pointing.clipped(command + np.clip(step, -self._speed * dt, self._speed * dt))
 
 
@@ -126,10 +120,10 @@ class Sight:
         x = T[:, :3, 3]
         deep = np.maximum(x[:, 2], 1e-3)
         pixels = self._calibration.project(np.column_stack([x[:, :2], deep]))
-        border = _SETTINGS.margin_px + self._calibration.focal_px * self._radius / deep
+        border = _Settings.margin_px + self._calibration.focal_px * self._radius / deep
         size = np.tile(self._calibration.image_size_px, 2)
         inside = ((pixels > border[:, None]) & (pixels < size - 1 - border[:, None])).all(axis=1)
-        return inside & (x[:, 2] > _SETTINGS.nearest_m) & (x[:, 2] < _SETTINGS.farthest_m) & self._faced(T)
+        return inside & (x[:, 2] > _Settings.nearest_m) & (x[:, 2] < _Settings.farthest_m) & self._faced(T)
 
     def _faced(self, T: FloatArray) -> np.ndarray:
         """Return a mask (n,) of the marker's poses (n, 4, 4) with a tag that faces the midpoint between the eyes."""
@@ -138,7 +132,7 @@ class Sight:
         away = T[:, :3, 3] - [0.5 * self._calibration.baseline_m, 0.0, 0.0]
         to_eyes = -away / np.linalg.norm(away, axis=1, keepdims=True)
         cosines = np.einsum("nij,kj,ni->nk", T[:, :3, :3], self._facing, to_eyes)
-        return cosines.max(axis=1) > np.cos(_SETTINGS.most_oblique)
+        return cosines.max(axis=1) > np.cos(_Settings.most_oblique)
 
     def clear(self, q: FloatArray) -> bool:
         """Return True if, at one posture (d,), nothing hides the ball from the eyes and the arm touches nothing."""
@@ -163,8 +157,8 @@ class Sight:
             across = cross_matrix(away) @ (0.0, 1.0, 0.0)
             up = cross_matrix(away) @ across
             for rim in (np.zeros(3), across, -across, up, -up):
-                starts.append(eye + _SETTINGS.ray_start_m * away)
-                ends.append(x + self._radius * (_SETTINGS.rim * rim - away))
+                starts.append(eye + _Settings.ray_start_m * away)
+                ends.append(x + self._radius * (_Settings.rim * rim - away))
         starts, ends = (
             np.array(points) @ T_world_camera[:3, :3].T + T_world_camera[:3, 3] for points in (starts, ends)
         )

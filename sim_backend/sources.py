@@ -62,7 +62,8 @@ class SimJoints:
     def read(self, timeout_s: float) -> JointReading | None:
         """Return the next reading; None if the world waits longer for the camera to be read.
 
-        Raise SourceEnded if the world was closed.
+        Raises:
+            SourceEnded: the world was closed.
         """
         return self._world.next_reading(timeout_s)
 
@@ -83,7 +84,9 @@ class SimStereoCamera:
     def read(self, timeout_s: float) -> StereoFrame | None:
         """Return the next frame; None if none arrived within `timeout_s`.
 
-        Raise SourceEnded if the world was closed. Raise SourceLost if the renderer's process died.
+        Raises:
+            SourceEnded: the world was closed.
+            SourceLost: the renderer's process died.
         """
         return self._world.next_frame(timeout_s)
 

@@ -48,8 +48,6 @@ class WorldStats:
 class SimWorld:
     """Simulated robot guided by hand, with its encoders and stereo cameras.
 
-    Raise ConfigError if [camera] has no stereo calibration, or pybullet is not installed (both on entering).
-
     Every read advances the world; nothing happens between reads. Simulated time therefore passes as fast as the
     readers read. The world never runs more than two frames, or a second of joint readings, ahead of an open source,
     so two threads may read joints and camera each at its own pace. The same description and configuration reproduce
@@ -58,6 +56,9 @@ class SimWorld:
     Args:
         robot: the robot as described; it needs a stereo calibration.
         extension: the robot with effects, to which the random errors are added; None: no effects.
+
+    Raises:
+        ConfigError: [camera] has no stereo calibration, or pybullet is not installed (both on entering).
     """
 
     def __init__(self, robot: RobotDescription, config: SimConfig, extension: Simulation | None = None) -> None:
@@ -247,7 +248,11 @@ def true_chain(
 
 
 def stereo_calibration(robot: RobotDescription) -> StereoCalibration:
-    """Return the calibration of the stereo pair, or single camera, in [camera]. Raise ConfigError if there is none."""
+    """Return the calibration of the stereo pair, or single camera, in [camera].
+
+    Raises:
+        ConfigError: there is none.
+    """
     if robot.calibration is None:
         raise ConfigError(
             "the simulation renders images, but [camera] does not describe how the cameras see",
@@ -285,11 +290,12 @@ def guided_path(
 ) -> FloatArray:
     """Return noise-free encoder readings (n, d) [rad or m], `config.encoders.rate_hz` rows a second.
 
-    Raise ConfigError if [camera] describes no stereo pair (the hand keeps the marker in its view), or pybullet is not
-    installed.
-
     Args:
         tell: called with the simulated seconds done so far.
+
+    Raises:
+        ConfigError: [camera] describes no stereo pair (the hand keeps the marker in its view), or pybullet is not
+            installed.
     """
     calibration = stereo_calibration(robot)
     config = exact_encoders(config)

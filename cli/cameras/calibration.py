@@ -198,10 +198,13 @@ def from_images(images: Images, board: Board, tell: Tell) -> Gathered:
 
 
 def calibrated(found: Gathered, known: KnownCameras, tell: Tell, serials: Sequence[str] = ("", "")) -> Calibrated:
-    """Calibrate from the views. Raise CalibrationError with the reasons if the result is not good enough.
+    """Calibrate from the views.
 
     Args:
         serials: those of the cameras; what is `known` takes precedence.
+
+    Raises:
+        CalibrationError: the result is not good enough; the message has the reasons.
     """
     given = (known.left_serial, known.right_serial)
     asked = Asked(
@@ -288,7 +291,11 @@ def checked(file: Path, images: Images, board: Board) -> tuple[CheckFile, str]:
 
 
 def pair_in(file: Path) -> StereoRig:
-    """Return the stereo calibration in `file`. Raise CalibrationError if it is of one camera only."""
+    """Return the stereo calibration in `file`.
+
+    Raises:
+        CalibrationError: it is of one camera only.
+    """
     rig = read_rig(file)
     if isinstance(rig, OneEyeRig):
         raise CalibrationError(

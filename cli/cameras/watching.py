@@ -11,15 +11,12 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, Protocol, Self
 
-import cv2
-
 from bodyschema.daemon.service.local_web import HEADERS, LOOPBACK, host_refusal
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError, SourceEnded
 from bodyschema.interfaces.protocols import Clock, Source
 from bodyschema.interfaces.records import ImageArray
-
-QUALITY = 85
+from bodyschema.vision.images import jpeg
 
 
 class Pictures(Source, Protocol):
@@ -86,7 +83,7 @@ class Watching:
         if picture is not None and now >= self._next_s:
             self._next_s = now + self._every_s
             self._left -= 1
-            self._show(cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes())
+            self._show(jpeg(picture))
         return True
 
     @property

@@ -29,6 +29,7 @@ from bodyschema.diagnosis.report.plot import HEIGHT, WIDTH, Plot
 from bodyschema.interfaces.errors import BusError
 from bodyschema.interfaces.interpreter import module_command
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.learning.online_learner import REGION_RAD
 from bodyschema.learning.status import Outlook
 from bodyschema.robot.description import RobotDescription
 from kbmaps import RigidChain, nearest_rotation, rotation_matrices, rotation_vectors
@@ -114,7 +115,6 @@ def _page(plot: str, legend: dict[str, str]) -> str:
 
 
 POSES = 300
-JITTER_DEG = 3.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,7 +185,7 @@ class Judge:
         if not len(region):
             return None
         poses = region[self._rng.integers(len(region), size=POSES)]
-        poses = poses + self._rng.normal(0.0, np.radians(JITTER_DEG), poses.shape)
+        poses = poses + self._rng.normal(0.0, REGION_RAD, poses.shape)
         poses = np.clip(poses, self._robot.lower, self._robot.upper)
         truth = self.truth()
         x_true = truth.positions(poses)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from contextlib import ExitStack
-from dataclasses import dataclass
 from typing import Self
 
 import msgspec
@@ -27,7 +26,6 @@ from bodyschema.robot.urdf import chain_between
 from kbmaps import RigidChain
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the watch on joints."""
 
@@ -40,8 +38,6 @@ class _Settings:
     # a marker that moved less shows no direction
     seen_m: float = 0.01
 
-
-_SETTINGS = _Settings()
 
 TEMPERATURE_EVERY_S = 0.5  # one servo in turn
 WORDS = (("forward", "back"), ("left", "right"), ("up", "down"))  # REP 103: x, y, z
@@ -171,7 +167,7 @@ class JointsWatch:
             high=high,
             lower=lower,
             upper=upper,
-            within_limits=lower - _SETTINGS.beyond <= low and high <= upper + _SETTINGS.beyond,
+            within_limits=lower - _Settings.beyond <= low and high <= upper + _Settings.beyond,
         )
 
 
@@ -200,7 +196,7 @@ class Speeds:
     def take(self, t: float, q: FloatArray) -> None:
         """Add the joint angles `q` (d,) [rad] at `t` [s]."""
         passed = t - self._t
-        if passed < _SETTINGS.speed_over_s:
+        if passed < _Settings.speed_over_s:
             return
         if math.isfinite(passed):
             self.v, self.are_known = (q - self._q) / passed, True
@@ -224,13 +220,13 @@ class SignCheck:
         """Add the joint angles `q` (d,) [rad] at `t` [s]."""
         if self._begin is None:
             self._begin = q
-        if self._rest is None or np.abs(q - self._rest[1]).max() > _SETTINGS.still_rad:
+        if self._rest is None or np.abs(q - self._rest[1]).max() > _Settings.still_rad:
             self._rest = t, q
         moved = q - self._begin
         place = int(np.abs(moved).argmax())
-        if abs(moved[place]) > _SETTINGS.moved_rad:
+        if abs(moved[place]) > _Settings.moved_rad:
             self.said = self._sentence(place, self._begin, float(moved[place]))
-        if t - self._rest[0] > _SETTINGS.still_s:  # at rest: what follows is another move
+        if t - self._rest[0] > _Settings.still_s:  # at rest: what follows is another move
             self._begin = q
 
     def _sentence(self, place: int, begin: FloatArray, moved: float) -> str:
@@ -239,7 +235,7 @@ class SignCheck:
         end[place] += moved
         went = self._chain.positions(end[None])[0] - self._chain.positions(begin[None])[0]
         axis = int(np.abs(went).argmax())
-        if abs(went[axis]) < _SETTINGS.seen_m:
+        if abs(went[axis]) < _Settings.seen_m:
             way = "counter-clockwise" if moved > 0 else "clockwise"
             return f"{joint} {turn}: by the URDF it turned {way}, its axis pointing at you"
         word, sign = WORDS[axis][int(went[axis] < 0)], "+-"[int(went[axis] < 0)]

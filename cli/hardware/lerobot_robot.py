@@ -84,7 +84,11 @@ def lerobot_robot_toml(arm: LeRobotArm, urdf: Path, robot: Path, calibration: Pa
 
 
 def lerobot_port(arm: LeRobotArm, scan: Scan) -> str:
-    """Return the only port that has all motors of `arm`. Raises ConfigError: none or more than one has."""
+    """Return the only port that has all motors of `arm`.
+
+    Raises:
+        ConfigError: none or more than one has.
+    """
     wanted = {(arm.id(name), arm.models[name]) for name in arm.joints}
     scanned = scan([BAUD])
     found = [bus.port for bus in scanned if wanted <= {(servo.id, servo.model) for servo in bus.servos}]

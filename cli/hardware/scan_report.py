@@ -68,7 +68,11 @@ class ScanReport:
 
 
 def report_of(ports: Sequence[ScannedBus], config: Config | None) -> ScanReport:
-    """Return the report; without `config`, of the ports alone. Raises ConfigError: robot.toml has no servos."""
+    """Return the report; without `config`, of the ports alone.
+
+    Raises:
+        ConfigError: robot.toml has no servos.
+    """
     if config is None:
         return ScanReport(ports)
     servos, found = require_servos(config), [servo for port in ports for servo in port.servos]

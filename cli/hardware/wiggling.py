@@ -119,7 +119,11 @@ def collected(sources: Sources, duration_s: float, tell: Callable[[float], None]
 
 
 def wiggle_of(readings: Sequence[JointReading], fixes: Sequence[MarkerFix]) -> Wiggle:
-    """Return readings and fixes as arrays. Raise LatencyError if either is missing."""
+    """Return readings and fixes as arrays.
+
+    Raises:
+        LatencyError: either is missing.
+    """
     if not readings or not fixes:
         who = "the encoders" if not readings else "the cameras"
         raise LatencyError(f"{who} gave nothing: `bodyschema doctor`, and for the marker `bodyschema watch cameras`")

@@ -59,7 +59,11 @@ Choose = Callable[[str, Sequence[Candidate]], Candidate | None]
 
 
 def candidates_in(json: bytes, file: object) -> list[Candidate]:
-    """Return the servos of a saved scan. Raises ConfigError: it is not a scan."""
+    """Return the servos of a saved scan.
+
+    Raises:
+        ConfigError: it is not a scan.
+    """
     try:
         scan = msgspec.json.decode(json, type=_Scan)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -75,7 +79,11 @@ def first_of(_joint: str, left: Sequence[Candidate]) -> Candidate | None:
 
 
 def fit(joints: Sequence[str], candidates: Sequence[Candidate], choose: Choose) -> Fitting:
-    """Assign a servo to each joint. Raises ConfigError: none of them can be used, or no joint got one."""
+    """Assign a servo to each joint.
+
+    Raises:
+        ConfigError: none of them can be used, or no joint got one.
+    """
     left = sorted((c for c in candidates if c.is_usable), key=lambda c: (c.port, c.id))
     if not left:
         raise ConfigError(

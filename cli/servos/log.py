@@ -53,7 +53,11 @@ class ServoLog:
         self.file = folder / FILE
 
     def append(self, entries: Sequence[LoggedWrite]) -> None:
-        """Append lines; they are on disk when this returns. Raises ConfigError: the file cannot be written."""
+        """Append lines; they are on disk when this returns.
+
+        Raises:
+            ConfigError: the file cannot be written.
+        """
         try:
             self.file.parent.mkdir(parents=True, exist_ok=True)
             with self.file.open("ab") as stream:

@@ -67,7 +67,11 @@ class Asked:
 
     @classmethod
     def of(cls, only: str | None, without: str | None, seed: int) -> Asked:
-        """Parse comma-separated names. Raise RequestError if an effect is unknown, or none remains."""
+        """Parse comma-separated names.
+
+        Raises:
+            RequestError: an effect is unknown, or none remains.
+        """
         asked = cls(_names(only, "--effects"), _names(without, "--exclude"), seed)
         if set(asked.only or EFFECT_TYPES) <= set(asked.without):
             raise RequestError("--effects and --exclude leave nothing to look for. Exclude fewer")
@@ -263,7 +267,11 @@ def require_writable(folder: Path) -> None:
 
 
 def written(found: Found, folder: Path) -> None:
-    """Write the files of DIR. Raises ConfigError, RecordingError: they cannot be written."""
+    """Write the files of DIR.
+
+    Raises:
+        ConfigError, RecordingError: they cannot be written.
+    """
     about = About(found.source.name, found.robot.name, version("bodyschema"))
     heading = f"Found by bodyschema {about.version} in {len(found.source.recording)} pairs of {about.recording}"
     extended = found.diagnosis.stored.written

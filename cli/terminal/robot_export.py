@@ -26,6 +26,7 @@ from bodyschema.effects.files import EXTENDED_FILE
 from bodyschema.effects.joint_errors import JointErrors
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.whole_files import require_target
 from bodyschema.recordings.recording import Recording
 from bodyschema.robot.calibrated_files import CAMERA_LINK, MARKER_LINK
 from bodyschema.robot.limited import read_at_most
@@ -177,12 +178,7 @@ _WITHOUT_MUJOCO = "Not replayed: MuJoCo is not installed (pip install mujoco)"
 
 def check_target(out: Path, *, force: bool) -> None:
     """Raise ConfigError unless a robot can be written to `out`: its ending is known and no file is in the way."""
-    if out.suffix.lower() not in _WRITERS:
-        raise ConfigError(f"a robot's files end in {', '.join(_WRITERS)}", file=out, remedy="Give another name")
-    if not out.parent.is_dir():
-        raise ConfigError(f"there is no folder {out.parent}", file=out, remedy="Make it first")
-    if out.exists() and not force:
-        raise ConfigError("the file is there already", file=out, remedy="Give another name, or --force")
+    require_target(out, _WRITERS, "a robot's files", force=force, error=ConfigError)
 
 
 def write(simulation: Simulation, out: Path) -> list[str]:

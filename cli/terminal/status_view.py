@@ -19,10 +19,11 @@ from bodyschema.daemon.service.remedies import as_typed
 from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.identity import Route
 from bodyschema.daemon.transport.keys import Keys
-from bodyschema.daemon.transport.status import UNDECIDED, BusStatus, LearnerStatus, SamplerStatus, ServoStatus
+from bodyschema.daemon.transport.status import UNDECIDED, LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import decode
 from bodyschema.daemon.transport.zenoh_config import PROCESSES
 from bodyschema.interfaces.errors import BusError, RequestError
+from bodyschema.interfaces.servos import BusStatus, ServoStatus
 from bodyschema.interfaces.waits import ANSWER_LIMIT_S, STATUS_EVERY_S
 from bodyschema.learning.status import OrientationStatus
 

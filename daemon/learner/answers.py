@@ -50,7 +50,11 @@ class Answers:
         self._inverse: tuple[LearntModel, InverseKinematics] | None = None
 
     def predict(self, request: Request) -> bytes:
-        """Return positions, 1-sigma and support. Raise RequestError for a bad request, or before there is a model."""
+        """Return positions, 1-sigma and support.
+
+        Raises:
+            RequestError: a bad request, or before there is a model.
+        """
         q = joint_angles(decode(request.payload, JointsRequest, request.encoding), self._joints)
         snapshot = self._learning.snapshot
         prediction = snapshot.predict(q)
@@ -68,14 +72,22 @@ class Answers:
         return encode(reply, request.encoding)
 
     def jacobian(self, request: Request) -> bytes:
-        """Return the Jacobians dx/dq. Raise RequestError as `predict` does."""
+        """Return the Jacobians dx/dq.
+
+        Raises:
+            RequestError: as `predict` does.
+        """
         q = joint_angles(decode(request.payload, JointsRequest, request.encoding), self._joints)
         snapshot = self._learning.snapshot
         jacobians = snapshot.require_model().jacobian(q)
         return encode(JacobianReply(jacobians.tolist(), snapshot.digest, snapshot.pairs), request.encoding)
 
     def ik(self, request: Request) -> bytes:
-        """Return joint angles that put the marker at the requested position. Raise RequestError as `predict` does."""
+        """Return joint angles that put the marker at the requested position.
+
+        Raises:
+            RequestError: as `predict` does.
+        """
         wanted = decode(request.payload, IkRequest, request.encoding)
         x = position("x", wanted.x)
         start = None if wanted.start is None else joint_vector("start", wanted.start, self._joints)

@@ -64,7 +64,8 @@ class _Header(msgspec.Struct, frozen=True):
 def write_checkpoint(file: Path, state: LearningState, *, robot: str, utc: str) -> None:
     """Replace the checkpoint `file` by `state`; the old one is kept as the previous checkpoint.
 
-    Raise CheckpointError if the disk is full or read-only, or the state is unusable; the old checkpoint is still there.
+    Raises:
+        CheckpointError: the disk is full or read-only, or the state is unusable; the old checkpoint is still there.
     """
     poisoned = state.poisoned()
     if poisoned is not None:
@@ -86,7 +87,8 @@ def write_checkpoint(file: Path, state: LearningState, *, robot: str, utc: str) 
 def read_checkpoint(file: Path, *, robot: str) -> LearningState | None:
     """Return the state in `file`; None if there is no such file.
 
-    Raise CheckpointError if the file cannot be read, is damaged, or belongs to another robot.
+    Raises:
+        CheckpointError: the file cannot be read, is damaged, or belongs to another robot.
     """
     if not os.path.lexists(file):
         return None
@@ -107,7 +109,8 @@ def read_checkpoint(file: Path, *, robot: str) -> LearningState | None:
 def checkpoint_bytes(file: Path) -> bytes:
     """Return the contents of the file.
 
-    Raise CheckpointError if the file cannot be read, is larger than a checkpoint can be, or is a device.
+    Raises:
+        CheckpointError: the file cannot be read, is larger than a checkpoint can be, or is a device.
     """
     try:
         return read_at_most(file, LARGEST_BYTES)
@@ -204,14 +207,15 @@ DOES_NOT_FIT = (ArithmeticError, LookupError, TypeError, ValueError)
 def go_on(new: Callable[[], OnlineLearner], checkpoint: Path, robot: str) -> tuple[OnlineLearner, str | None]:
     """Restore the learner from the newest usable checkpoint.
 
-    Raise CheckpointError if an unusable checkpoint cannot be moved aside.
-
     Args:
         new: creates a learner without data.
         checkpoint: the newest; an unusable one is kept next to it under another name.
 
     Returns:
         The learner, and a message about what was wrong, or None.
+
+    Raises:
+        CheckpointError: an unusable checkpoint cannot be moved aside.
     """
     said: list[str] = []
     for file in generations(checkpoint):

@@ -49,6 +49,9 @@ class Findings:
     """Computes calibration and outlook whenever there is a new chain, or another model answers.
 
     Only the background thread may call it. Any thread may read the results.
+
+    Attributes:
+        doubts: reasons to suspect that the pairs are of another robot: exchanged columns, reversed joints.
     """
 
     def __init__(
@@ -71,12 +74,7 @@ class Findings:
         self._found_of: tuple[ChainBelief | None, str] = None, ""
         self._due_at = clock.now()
         self._found: tuple[ChainCalibration | None, Outlook | None] = None, None
-        self._checked, self._doubts = 0, ()
-
-    @property
-    def doubts(self) -> tuple[str, ...]:
-        """Reasons to suspect that the pairs are of another robot: exchanged columns, reversed joints."""
-        return self._doubts
+        self._checked, self.doubts = 0, ()
 
     @property
     def calibration(self) -> ChainCalibration | None:
@@ -124,12 +122,12 @@ class Findings:
         """Check the pairs with the present tool once there are enough, and again whenever their number has doubled."""
         begin, count = self._clock.now(), self._learning.counters.since_change
         if count < self._checked:
-            self._checked, self._doubts = 0, ()
+            self._checked, self.doubts = 0, ()
         if count < max(FEWEST_ROWS, 2 * self._checked) or begin < self._turns.due_at:
             return
         q, x = self._learning.kept(ROWS)
         self._checked = count
-        self._doubts = plausibility(self._robot, q, x, chain=self._learning.nominal.chain).sentences
+        self.doubts = plausibility(self._robot, q, x, chain=self._learning.nominal.chain).sentences
         self._turns.took(begin, self._clock.now() - begin)
 
 

@@ -103,12 +103,14 @@ SWITCH_INTERVAL_S = 2e-4
 def run_learners(configs: Sequence[Config], clock: Clock, wishes: SignalFlags, notifier: Notifier) -> None:
     """Learn and answer for all robots until `wishes` requests the end.
 
-    Raise ConfigError if the robots cannot be served by one process. Raise BusError if a learner's port is in use. Raise
-    StoreError if another learner has the same state. Raise CheckpointError if an unusable checkpoint cannot be moved
-    aside.
-
     Args:
         notifier: is notified once everything is up, that every loop works, and of the learners' states.
+
+    Raises:
+        ConfigError: the robots cannot be served by one process.
+        BusError: a learner's port is in use.
+        StoreError: another learner has the same state.
+        CheckpointError: an unusable checkpoint cannot be moved aside.
     """
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     loops = LOOPS if len(configs) == 1 else (*(_loop(config) for config in configs), *LOOPS[1:])
@@ -154,7 +156,8 @@ def alone(config: Config) -> Iterator[None]:
 def session_settings(configs: Sequence[Config]) -> dict[str, Any]:
     """Return zenoh's configuration of the one session of all robots.
 
-    Raise ConfigError if two have the same name, or their tables [zenoh] name different routers or certificates.
+    Raises:
+        ConfigError: two have the same name, or their tables [zenoh] name different routers or certificates.
     """
     settings = configs[0].zenoh_settings("learner")
     if len(configs) == 1:

@@ -300,7 +300,8 @@ class Learner:
     def reload(self) -> str:
         """Read robot.toml again; return a message about the result.
 
-        Raise ConfigError if robot.toml is invalid; nothing changed.
+        Raises:
+            ConfigError: robot.toml is invalid; nothing changed.
         """
         found = reload(self._config, TABLES, CHANGEABLE)
         self._config, self._settings = found.config, found.config.tables.learner

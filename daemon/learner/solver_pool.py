@@ -31,7 +31,8 @@ class SolverPool:
     def attend(self) -> None:
         """Collect the process's answers, and give the turn to the robot with the greatest need.
 
-        Raise SolverLostError if the process has ended; all seats are empty.
+        Raises:
+            SolverLostError: the process has ended; all seats are empty.
         """
         try:
             if self._solving is not None and (solved := self._process.poll()) is not None:

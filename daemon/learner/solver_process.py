@@ -17,7 +17,8 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
-from typing import IO, Self
+from dataclasses import fields
+from typing import IO, Any, Self
 
 import msgspec
 import numpy as np
@@ -26,7 +27,6 @@ from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.interpreter import module_command
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.interfaces.waits import END_LIMIT_S
-from bodyschema.learning.model_bank import RESIDUAL
 from bodyschema.learning.solvers.orientation import OrientationSolution
 from bodyschema.learning.solvers.solver import DirectSolver, Solved, Task
 from kbmaps import ChainBelief, ChainTolerances, KBMap, OrientedChain, ResidualModel
@@ -42,15 +42,10 @@ class SolverLostError(BodyschemaError):
     """The solver's process has ended; `start` starts a new one."""
 
 
-class StartTask(msgspec.Struct, frozen=True, tag="start"):
-    """Discard all pairs and start this task."""
+class Start(msgspec.Struct, frozen=True, tag="start"):
+    """Discard all pairs and start a task, given by its fields."""
 
-    number: int
-    prior: bytes
-    belief: bytes
-    residual: bytes | None
-    prior_stays: bool
-    tolerances: ChainTolerances | None
+    task: dict[str, Any]
     robot: int = 0
 
 
@@ -70,33 +65,28 @@ class Solve(msgspec.Struct, frozen=True, tag="solve"):
     robot: int = 0
 
 
-class Oriented(msgspec.Struct, frozen=True):
-    """An `OrientationSolution`, its models as bytes."""
-
-    pairs: int
-    chain: bytes
-    map: bytes | None
-    map_noise: float
+# A model travels as an extension of MessagePack, whose code is its place here.
+_MODELS = (KBMap, ChainBelief, ResidualModel, OrientedChain)
 
 
-class Solution(msgspec.Struct, frozen=True):
-    """One answer to `Solve`; the model is missing if there is no solution.
-
-    A `ResidualModel` contains the arm's estimate, and is sent alone.
-    """
-
-    task: int
-    pairs: int
-    name: str
-    model: bytes | None
-    belief: bytes | None
-    last: bool
-    wide: bytes | None
-    orientation: Oriented | None = None
+def _fields(record: Task | Solved | OrientationSolution | ChainTolerances) -> dict[str, Any]:
+    """Return a record as MessagePack takes it."""
+    return {field.name: _packed(getattr(record, field.name)) for field in fields(record)}
 
 
-_orders = msgspec.msgpack.Decoder(StartTask | Learn | Solve)
-_solutions = msgspec.msgpack.Decoder(Solution)
+def _packed(value: object) -> object:
+    for code, kind in enumerate(_MODELS):
+        if isinstance(value, kind):
+            return msgspec.msgpack.Ext(code, value.to_bytes())
+    return _fields(value) if isinstance(value, OrientationSolution | ChainTolerances) else value
+
+
+def _unpacked(code: int, data: memoryview) -> object:
+    return _MODELS[code].from_bytes(bytes(data))
+
+
+_orders = msgspec.msgpack.Decoder(Start | Learn | Solve, ext_hook=_unpacked)
+_solutions = msgspec.msgpack.Decoder(dict[str, Any], ext_hook=_unpacked)
 
 
 class SolverProcess:
@@ -136,17 +126,7 @@ class SolverProcess:
                 )
             except OSError as error:  # out of memory, or too many open files
                 raise SolverLostError(f"the solver cannot be started: {error.strerror}; it is tried again") from error
-        self._send(
-            StartTask(
-                number=task.number,
-                prior=task.prior.to_bytes(),
-                belief=task.belief.to_bytes(),
-                residual=None if task.residual is None else task.residual.to_bytes(),
-                prior_stays=task.prior_stays,
-                tolerances=task.tolerances,
-                robot=robot,
-            )
-        )
+        self._send(Start(_fields(task), robot))
 
     def learn(self, q: FloatArray, x: FloatArray, turns: FloatArray | None = None, robot: int = 0) -> None:
         """Send more pairs, q (n, d) [rad], x (n, 3) [m] and orientations (n, 4), NaN where a pair has none."""
@@ -194,11 +174,12 @@ class SolverProcess:
         end = _LENGTH.size + _LENGTH.unpack_from(self._received)[0]
         if len(self._received) < end:
             return None
-        solution = _solutions.decode(bytes(self._received[_LENGTH.size : end]))
+        solved = _solutions.decode(bytes(self._received[_LENGTH.size : end]))
         del self._received[:end]
-        return _unpacked(solution)
+        turned = solved.pop("orientation")
+        return Solved(**solved, orientation=None if turned is None else OrientationSolution(**turned))
 
-    def _send(self, order: StartTask | Learn | Solve) -> None:
+    def _send(self, order: Start | Learn | Solve) -> None:
         if self._child is None or self._child.stdin is None:
             raise SolverLostError("the solver has not been started")
         try:
@@ -227,41 +208,15 @@ class SolverProcess:
             child.stdout.close()
 
 
-def _unpacked(solution: Solution) -> Solved:
-    model = belief = None
-    if solution.model is not None and solution.name == RESIDUAL:
-        model = belief = ResidualModel.from_bytes(solution.model)
-    elif solution.model is not None:
-        model, belief = KBMap.from_bytes(solution.model), _belief(solution.belief)
-    turned = None if solution.orientation is None else _orientation_from(solution.orientation)
-    wide = _belief(solution.wide)
-    return Solved(solution.task, solution.pairs, solution.name, model, belief, solution.last, wide, turned)
-
-
-def _orientation_from(packed: Oriented) -> OrientationSolution:
-    kbmap = None if packed.map is None else KBMap.from_bytes(packed.map)
-    return OrientationSolution(packed.pairs, OrientedChain.from_bytes(packed.chain), kbmap, packed.map_noise)
-
-
-def _packed_orientation(solution: OrientationSolution) -> Oriented:
-    kbmap = None if solution.map is None else solution.map.to_bytes()
-    return Oriented(solution.pairs, solution.chain.to_bytes(), kbmap, solution.map_noise)
-
-
-def _belief(data: bytes | None) -> ChainBelief | None:
-    return None if data is None else ChainBelief.from_bytes(data)
-
-
 def serve(orders: IO[bytes], solutions: IO[bytes]) -> None:
     """Carry out orders until they end; before another solve, rest for as long as the last one took."""
     solvers: defaultdict[int, DirectSolver] = defaultdict(DirectSolver)
     rested_at = 0.0
     while (order := _read(orders)) is not None:
         solver = solvers[order.robot]
-        if isinstance(order, StartTask):
-            prior, belief = KBMap.from_bytes(order.prior), ChainBelief.from_bytes(order.belief)
-            residual = None if order.residual is None else ResidualModel.from_bytes(order.residual)
-            solver.start(Task(order.number, prior, belief, residual, order.prior_stays, order.tolerances))
+        if isinstance(order, Start):
+            tolerances = order.task.pop("tolerances")
+            solver.start(Task(**order.task, tolerances=None if tolerances is None else ChainTolerances(**tolerances)))
             rested_at = 0.0  # a new task starts with few pairs, and its first result is awaited
         elif isinstance(order, Learn):
             solver.learn(
@@ -278,21 +233,17 @@ def _solve(solver: DirectSolver, solutions: IO[bytes]) -> float:
     """Solve, and send each solution as it is found; return the processor time used [s]."""
     begin = time.process_time()  # on a busy machine most of the wall time is waiting, which is rest enough
     for solved in solver.solutions():
-        learnt = None if solved.model is None else solved.model.to_bytes()
-        belief = solved.belief.to_bytes() if isinstance(solved.belief, ChainBelief) else None
-        wide = None if solved.wide is None else solved.wide.to_bytes()
-        turned = None if solved.orientation is None else _packed_orientation(solved.orientation)
-        _write(solutions, Solution(solved.task, solved.pairs, solved.name, learnt, belief, solved.last, wide, turned))
+        _write(solutions, _fields(solved))
     return time.process_time() - begin
 
 
-def _write(stream: IO[bytes], message: msgspec.Struct) -> None:
+def _write(stream: IO[bytes], message: Start | Learn | Solve | dict[str, Any]) -> None:
     payload = msgspec.msgpack.encode(message)
     stream.write(_LENGTH.pack(len(payload)) + payload)
     stream.flush()
 
 
-def _read(stream: IO[bytes]) -> StartTask | Learn | Solve | None:
+def _read(stream: IO[bytes]) -> Start | Learn | Solve | None:
     """Return the next order; None if the parent has gone, even in the middle of one."""
     head = stream.read(_LENGTH.size)
     if len(head) < _LENGTH.size:

@@ -16,10 +16,9 @@ from bodyschema.daemon.sampler.align import JointBuffer
 from bodyschema.daemon.sampler.gate import Gate
 from bodyschema.daemon.sampler.sources import TellsHealth
 from bodyschema.daemon.service.reload import reload
-from bodyschema.daemon.transport.status import BusStatus, ServoStatus
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.protocols import Clock, JointSource
-from bodyschema.interfaces.servos import BusHealth, ServoHealth
+from bodyschema.interfaces.servos import BusStatus, ServoStatus
 from bodyschema.recordings.store.retention import Keep
 from bodyschema.recordings.store.store import PairStore, Session
 from bodyschema.robot.limited import read_at_most
@@ -156,8 +155,9 @@ class SamplerRules:
     def reload(self) -> str:
         """Read robot.toml again and return a message about the result; sampling continues meanwhile.
 
-        Raise ConfigError if robot.toml is invalid; nothing changed. Raise StoreError if the new session cannot be
-        stored; nothing changed.
+        Raises:
+            ConfigError: robot.toml is invalid; nothing changed.
+            StoreError: the new session cannot be stored; nothing changed.
         """
         with self._one_at_a_time:
             found = reload(self._config, TABLES, CHANGEABLE)
@@ -168,7 +168,8 @@ class SamplerRules:
     def trim(self) -> None:
         """Delete a batch of the pairs that are no longer kept, if there are any.
 
-        Raise StoreError if the disk is full or broken.
+        Raises:
+            StoreError: the disk is full or broken.
         """
         rules = self._config.tables.daemon
         most_bytes = None if rules.keep_mb is None else 1e6 * rules.keep_mb
@@ -192,9 +193,9 @@ class Servos(TellsHealth, Protocol):
     """Encoders that are servos; see `bodyschema.drivers.servos.joints.ServoJoints`."""
 
     @property
-    def servo_health(self) -> Sequence[ServoHealth]: ...
+    def servo_health(self) -> Mapping[str, ServoStatus]: ...
     @property
-    def bus_health(self) -> Mapping[str, BusHealth]: ...
+    def bus_health(self) -> Mapping[str, BusStatus]: ...
 
 
 @runtime_checkable
@@ -214,42 +215,19 @@ def complaints_of(joints: JointSource) -> list[str]:
 
 def servos_of(joints: JointSource) -> dict[str, ServoStatus]:
     """Return each joint's servo."""
-    if not isinstance(joints, Servos):
-        return {}
-    return {
-        servo.joint: ServoStatus(
-            bus=servo.bus,
-            id=servo.id,
-            model=servo.model,
-            firmware=servo.firmware,
-            homing_offset=servo.homing_offset,
-            drive_mode=servo.drive_mode,
-            voltage_v=None if servo.voltage_v is None else round(servo.voltage_v, 1),
-            temperature_c=servo.temperature_c,
-            current_a=None if servo.current_a is None else round(servo.current_a, 3),
-            troubles=list(servo.troubles),
-        )
-        for servo in joints.servo_health
-    }
+    return dict(joints.servo_health) if isinstance(joints, Servos) else {}
 
 
 def buses_of(joints: JointSource) -> dict[str, BusStatus]:
     """Return each bus's statistics since the start."""
-    if not isinstance(joints, Servos):
-        return {}
-    return {name: _bus(bus) for name, bus in joints.bus_health.items()}
-
-
-def _bus(bus: BusHealth) -> BusStatus:
-    failed = sum(bus.troubles.values())
-    answered = 1.0 - failed / bus.exchanges if bus.exchanges else 0.0
-    return BusStatus(bus.exchanges, round(answered, 5), dict(bus.troubles), bus.way)
+    return dict(joints.bus_health) if isinstance(joints, Servos) else {}
 
 
 def accept_turns(encoders: object) -> str:
     """Set lost turn counts to the turns nearest to the last positions; return a message.
 
-    Raise RequestError if no turn count was lost.
+    Raises:
+        RequestError: no turn count was lost.
     """
     if not isinstance(encoders, AsksForTurns) or not encoders.asks_for_turns:
         raise RequestError("no joint has lost its turn count: there is nothing to accept")

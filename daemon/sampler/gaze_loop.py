@@ -70,7 +70,11 @@ class GazeLoop:
     """Aims the head in a separate thread. If the thread fails, the target becomes stale and the head stands still."""
 
     def __init__(self, robot: RobotDescription, head: Head, model: HandModel) -> None:
-        """Store the settings; nothing is started yet. Raise ConfigError if [camera] describes no stereo pair."""
+        """Store the settings; nothing is started yet.
+
+        Raises:
+            ConfigError: [camera] describes no stereo pair.
+        """
         if robot.calibration is None:
             raise ConfigError(
                 "gaze needs to know how the cameras see", file=robot.file, remedy="Describe the stereo pair in [camera]"

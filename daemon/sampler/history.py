@@ -47,7 +47,8 @@ class _Numbered(msgspec.Struct, frozen=True):
 def read_page(payload: bytes) -> Page:
     """Return the page in a JSON reply of the sampler.
 
-    Raise RequestError if it is not a page, or has a pair without a number.
+    Raises:
+        RequestError: it is not a page, or has a pair without a number.
     """
     page = decode(payload, _RawPage)
     return Page(page.store, page.last_seq, [_read(bytes(raw)) for raw in page.pairs])
@@ -64,7 +65,8 @@ def _read(raw: bytes) -> PairMessage | Unreadable:
 def answer_pairs(reader: PairReader, request: Request) -> bytes:
     """Answer `pairs?from=SEQ;to=SEQ` with at most `LARGEST_REPLY` stored pairs, bounds inclusive and optional.
 
-    Raise RequestError for an unknown parameter, or one that is not a sequence number.
+    Raises:
+        RequestError: an unknown parameter, or one that is not a sequence number.
     """
     unknown = [name for name in request.parameters if name not in ("from", "to")]
     if unknown:

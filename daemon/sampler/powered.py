@@ -24,7 +24,8 @@ def find_powered(drives: Iterable[object], name: str, file: Path) -> Powered:
 def asked(drive: Powered, *, on: bool) -> str:
     """Send a request to the reading thread and wait for its answer; cancel it on a timeout.
 
-    Raise RequestError if it is refused, or the servos are not being read.
+    Raises:
+        RequestError: it is refused, or the servos are not being read.
     """
     answer = drive.ask(on)
     try:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Generic, Protocol, Self, TypeVar
 
+from bodyschema.daemon.service.logs import REPEATED_S
 from bodyschema.interfaces.errors import SourceError, SourceLost, StoreUnwritable
 from bodyschema.interfaces.protocols import Clock, Source
 from bodyschema.interfaces.records import FloatArray, MarkerFix, Pair
@@ -80,7 +81,8 @@ class ReconnectingSource(Generic[R_co]):
     def read(self, timeout_s: float) -> R_co | None:
         """Read like the source's `read`; also return None while the source is lost.
 
-        Raise SourceError if it came back as a device that only a new process may open.
+        Raises:
+            SourceError: it came back as a device that only a new process may open.
         """
         if not self._is_open and not self._try_again(timeout_s):
             return None
@@ -132,8 +134,6 @@ class ReconnectingSource(Generic[R_co]):
 
 # A disk that takes longer per pair costs frames [s].
 SLOW_S = 0.5
-# How long a slow write stays in the complaints [s].
-SLOW_TOLD_S = 60.0
 
 T = TypeVar("T")
 
@@ -153,14 +153,15 @@ class ResilientWriter:
         said: list[str] = []
         if self._refused is not None:
             said.append(f"{self._refused}. No pairs are taken until the disk does ({self._lost} frames so far)")
-        if self._slow is not None and self._wall.now() - self._slow[0] < SLOW_TOLD_S:
+        if self._slow is not None and self._wall.now() - self._slow[0] < REPEATED_S:
             said.append(f"the disk of {self._store.file} is slow: a pair took {self._slow[1]:.1f} s")
         return said
 
     def append(self, segment: int, q: FloatArray, fix: MarkerFix) -> Pair | None:
         """Return the committed pair; None if the disk did not accept it.
 
-        Raise StoreError if the store is damaged, or no longer a store.
+        Raises:
+            StoreError: the store is damaged, or no longer a store.
         """
         pair = self.attempt(lambda: self._store.append(segment, self._wall.utc(), q, fix))
         if pair is not None and self._refused is not None:
@@ -169,7 +170,11 @@ class ResilientWriter:
         return pair
 
     def attempt(self, write: Callable[[], T]) -> T | None:
-        """Return the result of `write`; None if the disk did not accept it. Raise StoreError as `append` does."""
+        """Return the result of `write`; None if the disk did not accept it.
+
+        Raises:
+            StoreError: as `append` does.
+        """
         begun = self._wall.now()
         try:
             return write()

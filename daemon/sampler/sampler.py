@@ -70,11 +70,12 @@ class Sampler:
     ) -> None:
         """Prepare a sampler over an open bus and an open store; `run` opens the sources.
 
-        Raise ConfigError if the encoders' joints differ from robot.toml's.
-
         Args:
             exit_at_end: return from `run` when the sources end, instead of continuing to serve the history.
             service: is notified once everything is up, that `LOOPS` work, and of the sampler's state.
+
+        Raises:
+            ConfigError: the encoders' joints differ from robot.toml's.
         """
         if sources.joints.joints != config.robot.joints:
             raise ConfigError(
@@ -133,8 +134,9 @@ class Sampler:
     def run(self) -> None:
         """Sample until `stop`, or with `exit_at_end` until the sources end.
 
-        Raise StoreError if the store is damaged; the pair was not published, and no pair followed. Raise SourceError if
-        a source could not be opened at the start.
+        Raises:
+            StoreError: the store is damaged; the pair was not published, and no pair followed.
+            SourceError: a source could not be opened at the start.
         """
         self._service.tell("opening encoders and cameras")
         with ExitStack() as stack:

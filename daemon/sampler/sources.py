@@ -200,7 +200,8 @@ class TruthReply(msgspec.Struct, frozen=True):
 def answer_simulation(world: GroundTruth, clock: Clock, request: Request) -> bytes:
     """Answer an empty request with the ground truth; change the tool on a `ToolRequest`.
 
-    Raise RequestError if the tool is not three finite numbers, or is longer than `LONGEST_TOOL_M`.
+    Raises:
+        RequestError: the tool is not three finite numbers, or is longer than `LONGEST_TOOL_M`.
     """
     if not request.payload:
         chain = world.true_chain()

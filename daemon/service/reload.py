@@ -41,12 +41,15 @@ class Reload:
 
 
 def reload(config: Config, tables: Collection[str], changeable: Collection[Key]) -> Reload:
-    """Read the robot.toml of `config` again. Raise ConfigError if robot.toml is invalid now; nothing changed.
+    """Read the robot.toml of `config` again.
 
     Args:
         config: the configuration in force; settings overridden on the command line stay overridden.
         tables: those that the process uses.
         changeable: table and key of settings that may change while it runs.
+
+    Raises:
+        ConfigError: robot.toml is invalid now; nothing changed.
     """
     found = Config.load(config.file)
     if config.given_state_dir is not None:

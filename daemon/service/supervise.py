@@ -39,7 +39,8 @@ class Child:
     def tend(self) -> None:
         """Start the process if it is not running and its waiting time is over.
 
-        Raise BodyschemaError if it refused to start.
+        Raises:
+            BodyschemaError: it refused to start.
         """
         now = time.monotonic()
         if self._process is None:
@@ -96,7 +97,8 @@ class Supervisor:
     def run(self) -> None:
         """Keep the children running until `stop`.
 
-        Raise BodyschemaError if one of them refused to start; the others were ended.
+        Raises:
+            BodyschemaError: one of them refused to start; the others were ended.
         """
         try:
             while not self._stopping:

@@ -188,8 +188,9 @@ class ZenohSession:
     def ask_one(self, key: str, payload: bytes = b"", *, encoding: str = JSON, timeout_s: float = 5.0) -> bytes:
         """Return the one reply to a query.
 
-        Raise BusError if there is no answer under this key, or not in time. Raise RequestError if the request was
-        refused.
+        Raises:
+            BusError: there is no answer under this key, or not in time.
+            RequestError: the request was refused.
         """
         replies = self.ask(key, payload, encoding=encoding, timeout_s=timeout_s)
         if not replies:

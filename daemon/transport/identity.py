@@ -61,7 +61,8 @@ class Identity:
     def of(cls, tls: TlsConfig, login: LoginConfig | None, users_file: str | None, folder: Path) -> Identity:
         """Read the tables of a file in `folder`.
 
-        Raise ConfigError if a certificate lacks its key, a file is missing, or a secret is readable by other users.
+        Raises:
+            ConfigError: a certificate lacks its key, a file is missing, or a secret is readable by other users.
         """
         if (tls.certificate is None) != (tls.key is None):
             raise ConfigError("tls names a certificate or a key", remedy="Name both: each is useless alone")
@@ -94,7 +95,11 @@ class Identity:
         return self.users_file is not None
 
     def settings(self) -> dict[str, Any]:
-        """Return zenoh's configuration of links and users. Raise ConfigError if the password cannot be read."""
+        """Return zenoh's configuration of links and users.
+
+        Raises:
+            ConfigError: the password cannot be read.
+        """
         tls: dict[str, Any] = {
             "root_ca_certificate": str(self.ca),
             "enable_mtls": self.certificate is not None and not self.by_user,

@@ -70,10 +70,11 @@ class QueryLimiter(Generic[T]):
     def admit(self, source: str, size: int, query: T) -> None:
         """Queue a query.
 
-        Raise RequestError if it is too large, or its source asks too much; the message says how much is allowed.
-
         Args:
             size: size of its payload [bytes].
+
+        Raises:
+            RequestError: it is too large, or its source asks too much; the message says how much is allowed.
         """
         limits = self._limits
         if size > limits.request_bytes:

@@ -6,6 +6,7 @@ import math
 
 import msgspec
 
+from bodyschema.interfaces.servos import BusStatus, ServoStatus
 from bodyschema.learning.status import ChainCalibration, CurvePoint, OrientationStatus, Outlook
 
 from .wire import SCHEMA
@@ -24,49 +25,6 @@ class JointRange(msgspec.Struct, frozen=True):
     high: float
     lower_limit: float
     upper_limit: float
-
-
-class ServoStatus(msgspec.Struct, frozen=True):
-    """One joint's servo.
-
-    Attributes:
-        bus: its bus in robot.toml.
-        id: on the bus.
-        model, firmware: as it reports them.
-        homing_offset: [ticks]; 0 if the model has none.
-        drive_mode: bits; 0 if the model has none.
-        voltage_v: last value [V], updated every few seconds; null before the first.
-        temperature_c: likewise [°C].
-        current_a: [A]; null if not measured.
-        troubles: problems with remedies; empty if none.
-    """
-
-    bus: str
-    id: int
-    model: str
-    firmware: int
-    homing_offset: int
-    drive_mode: int
-    voltage_v: float | None
-    temperature_c: float | None
-    current_a: float | None
-    troubles: list[str]
-
-
-class BusStatus(msgspec.Struct, frozen=True):
-    """One bus of servos since the start.
-
-    Attributes:
-        exchanges: requests sent.
-        answered: fraction answered correctly.
-        troubles: the others, by error.
-        way: read method, such as Sync Read; empty before the bus is open.
-    """
-
-    exchanges: int
-    answered: float
-    troubles: dict[str, int]
-    way: str = ""
 
 
 class SamplerStatus(msgspec.Struct, frozen=True, kw_only=True):

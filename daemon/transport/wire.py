@@ -225,7 +225,11 @@ def encode(message: object, encoding: str = JSON) -> bytes:
 
 
 def decode(payload: bytes, kind: type[M], encoding: str = JSON) -> M:
-    """Return the message in `payload`. Raise RequestError if it is not of this type; the message says where."""
+    """Return the message in `payload`.
+
+    Raises:
+        RequestError: it is not of this type; the message says where.
+    """
     try:
         decoder: Any = msgspec.msgpack if encoding == MSGPACK else msgspec.json
         return decoder.decode(payload, type=kind)
@@ -280,7 +284,8 @@ def _as_message(pair: Pair, pose: MarkerPose) -> PairMessage:
 def pair_from_wire(message: PairMessage, joints: int) -> Pair:
     """Return a message as a pair.
 
-    Raise RequestError if it has another number of joints, a non-finite number, or an invalid quaternion.
+    Raises:
+        RequestError: it has another number of joints, a non-finite number, or an invalid quaternion.
     """
     import numpy as np
 
@@ -318,7 +323,8 @@ def _four(turn: FloatArray) -> tuple[float, float, float, float]:
 def position(name: str, values: Sequence[float]) -> FloatArray:
     """Return a requested position, shape (3,) [m].
 
-    Raise RequestError if a number is not finite, or too large to be in metres.
+    Raises:
+        RequestError: a number is not finite, or too large to be in metres.
     """
     import numpy as np
 
@@ -338,7 +344,8 @@ def position(name: str, values: Sequence[float]) -> FloatArray:
 def joint_vector(name: str, values: Sequence[float], joints: tuple[str, ...]) -> FloatArray:
     """Return one number for each joint, shape (d,) [rad].
 
-    Raise RequestError if the count is wrong, or a value is impossible for its joint.
+    Raises:
+        RequestError: the count is wrong, or a value is impossible for its joint.
     """
     import numpy as np
 
@@ -354,7 +361,8 @@ def joint_vector(name: str, values: Sequence[float], joints: tuple[str, ...]) ->
 def joint_angles(request: JointsRequest, joints: tuple[str, ...]) -> FloatArray:
     """Return the request's joint angles, shape (n, d) [rad].
 
-    Raise RequestError as `joint_rows` does, or if a value is impossible for a joint.
+    Raises:
+        RequestError: as `joint_rows` does, or if a value is impossible for a joint.
     """
     import numpy as np
 
@@ -366,7 +374,8 @@ def joint_angles(request: JointsRequest, joints: tuple[str, ...]) -> FloatArray:
 def joint_rows(request: JointsRequest, joints: tuple[str, ...]) -> list[list[float]]:
     """Return the rows of the request.
 
-    Raise RequestError if a row has the wrong length, or the batch is empty or too large.
+    Raises:
+        RequestError: a row has the wrong length, or the batch is empty or too large.
     """
     if not request.q:
         raise RequestError("q is empty; send one vector of joint angles or a list of them")

@@ -54,7 +54,11 @@ class Motion:
 
 
 def require_on_ports(config: Config) -> OnPorts:
-    """Return the servos or encoders of robot.toml. Raise ConfigError if it has none."""
+    """Return the servos or encoders of robot.toml.
+
+    Raises:
+        ConfigError: it has none.
+    """
     match config.tables.drivers.hardware:
         case DynamixelConfig() | FeetechConfig() | SerialLinesConfig() as hardware:
             return hardware
@@ -99,7 +103,8 @@ def open_bench(
 ) -> DryRun:
     """Return the arm of robot.toml behind `port` (several buses: each at `port`-NAME), not opened yet.
 
-    Raise ConfigError if no servos or encoders are configured, a fault is invalid, or a port's path is occupied.
+    Raises:
+        ConfigError: no servos or encoders are configured, a fault is invalid, or a port's path is occupied.
     """
     hardware = require_on_ports(config)
     make = _arm_of(hardware)
@@ -164,7 +169,8 @@ def _require_free(link: Path) -> None:
 def bench_robot_file(config: Config, bench: DryRun, port: Path) -> Path:
     """Write a copy of robot.toml beside `port`, with the bench's ports and its own state.
 
-    Raise ConfigError if another file is there, or it cannot be written.
+    Raises:
+        ConfigError: another file is there, or it cannot be written.
     """
     file = port.with_name(f"{port.name}.toml")
     tables, _ = read_toml(config.file)
@@ -192,7 +198,11 @@ def bench_robot_file(config: Config, bench: DryRun, port: Path) -> Path:
 
 
 def require_bench(config: Config) -> OnPorts | Ros2Config:
-    """Return the driver settings for reading the simulation's joints. Raise ConfigError if robot.toml has none."""
+    """Return the driver settings for reading the simulation's joints.
+
+    Raises:
+        ConfigError: robot.toml has none.
+    """
     robot = config.tables.drivers.ros2
     return require_on_ports(config) if robot is None else robot
 

@@ -46,7 +46,11 @@ def cameras_of(config: Config) -> CamerasConfig | None:
 
 
 def require_cameras(config: Config) -> CamerasConfig:
-    """Return the cameras configured in robot.toml. Raise ConfigError if it has none."""
+    """Return the cameras configured in robot.toml.
+
+    Raises:
+        ConfigError: it has none.
+    """
     cameras = cameras_of(config)
     if cameras is None:
         raise ConfigError(
@@ -58,7 +62,8 @@ def require_cameras(config: Config) -> CamerasConfig:
 def open_eyes(config: Config, clock: Clock) -> Eyes:
     """Return the cameras of robot.toml with unprocessed images, not opened yet.
 
-    Raise ConfigError if no cameras are configured.
+    Raises:
+        ConfigError: no cameras are configured.
     """
     return eyes_of(require_cameras(config), config.file.parent, clock)
 
@@ -82,7 +87,8 @@ def names_calibration(config: Config) -> bool:
 def camera_of(config: Config, eyes: Eyes) -> StereoCamera:
     """Return `eyes` with rectified images, not opened yet: by the calibration file, else by [camera].
 
-    Raise ConfigError if there is no calibration, or the file cannot be read.
+    Raises:
+        ConfigError: there is no calibration, or the file cannot be read.
     """
     cameras = require_cameras(config)
     if cameras.calibration is not None:
@@ -113,7 +119,8 @@ def _of_files(rig: Rig, cameras: CamerasConfig) -> Rig:
 def tracked_video(config: Config, file: Path) -> TrackedCamera:
     """Return a video of one camera with its tracker, not opened yet; lens and marker are those of robot.toml.
 
-    Raise ConfigError if there is no calibration of the camera, or the marker cannot be.
+    Raises:
+        ConfigError: there is no calibration of the camera, or the marker cannot be.
     """
     return _tracked(config, videos=VideosConfig(left=str(file.absolute()), speed=0.0))
 
@@ -265,7 +272,11 @@ def _told(figures: CameraFigures) -> str:
 
 
 def camera_lines(config: Config) -> Iterator[str]:
-    """Yield lines on the source of the images. Raise ConfigError if the calibration cannot be read."""
+    """Yield lines on the source of the images.
+
+    Raises:
+        ConfigError: the calibration cannot be read.
+    """
     yield from _lines_of(require_cameras(config), config.file.parent)
     for further in config.tables.vision.further_cameras:
         for line in _lines_of(further, config.file.parent):

@@ -68,7 +68,8 @@ class Wanted:
 def configured(config: Config, joints: Sequence[str], bus: str | None) -> list[Wanted]:
     """Return the servos of robot.toml that move `joints`, or all of a bus; all servos if neither is given.
 
-    Raise ConfigError if there are none, or no such joint or bus.
+    Raises:
+        ConfigError: there are none, or no such joint or bus.
     """
     tables = config.tables.drivers
     table = "dynamixel" if tables.dynamixel is not None else "feetech"

@@ -36,7 +36,8 @@ _IMAGES = 20  # images during the observation
 def learnt_colour_table(images: Sequence[Path], at: tuple[float, float] | None) -> str:
     """Return the table [vision.colour] of the ball at pixel `at` of the first image, or of the moving one.
 
-    Raise ColourUnlearnt if there is no such ball; the message says why.
+    Raises:
+        ColourUnlearnt: there is no such ball; the message says why.
     """
     from bodyschema.vision.ball.colour_model import colour_at, colour_of_the_moving, colour_table, read_images
 
@@ -47,11 +48,13 @@ def learnt_colour_table(images: Sequence[Path], at: tuple[float, float] | None) 
 def moving_colour_table(eyes: StereoEyes, clock: Clock, seconds: float, tell: Callable[[str], None]) -> str:
     """Return the table [vision.colour] of the ball that moves in the left image during `seconds` [s].
 
-    Raise ColourUnlearnt if nothing colourful moved. Raise SourceError if the cameras cannot be opened.
-
     Args:
         eyes: cameras that are not open; they are closed again afterwards.
         tell: called with instructions and with problems of the cameras.
+
+    Raises:
+        ColourUnlearnt: nothing colourful moved.
+        SourceError: the cameras cannot be opened.
     """
     from bodyschema.vision.ball.colour_model import colour_of_the_moving, colour_table
 
@@ -114,8 +117,9 @@ class ClusterFile(msgspec.Struct):
 def measured(images: Images, calibration: Path, wanted: Wanted, tell: Callable[[str], None]) -> MeasuredCluster:
     """Measure the poses of the tags in images of calibrated cameras.
 
-    Raise ConfigError if the calibration is damaged. Raise CalibrationError if images or tags are unsuitable, or the
-    squares have another side.
+    Raises:
+        ConfigError: the calibration is damaged.
+        CalibrationError: images or tags are unsuitable, or the squares have another side.
     """
     rig, files = read_rig(calibration), images.files()
     if len(rig.serials) < 2:
@@ -145,7 +149,11 @@ def measured(images: Images, calibration: Path, wanted: Wanted, tell: Callable[[
 
 
 def sides_of(text: str) -> dict[int, float]:
-    """Parse sides [m] of tags by ID from a text like 7=25,8=25 [mm]. Raise ConfigError if it is invalid."""
+    """Parse sides [m] of tags by ID from a text like 7=25,8=25 [mm].
+
+    Raises:
+        ConfigError: it is invalid.
+    """
     found: dict[int, float] = {}
     for part in text.split(","):
         told = _SIDE.fullmatch(part.strip())

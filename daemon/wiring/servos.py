@@ -83,7 +83,8 @@ def scanned_bauds() -> list[int]:
 def ports_to_scan(given: Sequence[str], config: Config | None) -> list[str]:
     """Return the given ports; else those of robot.toml and all USB serial ports, each once.
 
-    Raise ConfigError if there are none.
+    Raises:
+        ConfigError: there are none.
     """
     if given:
         return list(given)

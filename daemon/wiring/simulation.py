@@ -27,7 +27,8 @@ _APART_S = 60.0  # a tracker has forgotten what it saw then
 def simulation_settings(config: Config) -> SimConfig:
     """Return the table [sim], with the marker that [vision] looks for in the hand unless [sim.camera] has another.
 
-    Raise ConfigError if the tracker does not find what the simulation would show.
+    Raises:
+        ConfigError: the tracker does not find what the simulation would show.
     """
     from bodyschema.sim_backend.config import CameraConfig
 

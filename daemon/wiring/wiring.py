@@ -68,8 +68,9 @@ Hardware = DynamixelConfig | FeetechConfig | SerialLinesConfig | Ros2Config | Pl
 def open_sources(config: Config, *, sim: bool) -> Iterator[Sources]:
     """Yield the sources configured in robot.toml; with `sim`, the simulation instead.
 
-    Raise ConfigError if no driver or no cameras are configured, or the simulation cannot be made of this description.
-    Raise RecordingError if the configured recording cannot be read.
+    Raises:
+        ConfigError: no driver or no cameras are configured, or the simulation cannot be made of this description.
+        RecordingError: the configured recording cannot be read.
     """
     _require_source(config, sim=sim)
     recording = config.tables.drivers.recording
@@ -91,7 +92,8 @@ def check_sources(config: Config, *, sim: bool) -> None:
 def open_joints(config: Config, clock: Clock) -> EncoderJoints:
     """Return only the encoders of the arm described in robot.toml, not opened yet.
 
-    Raise ConfigError if no servos and no ROS 2 robot are configured, or zero-force or gaze do not fit the robot.
+    Raises:
+        ConfigError: no servos and no ROS 2 robot are configured, or zero-force or gaze do not fit the robot.
     """
     hardware = config.tables.drivers.hardware
     if hardware is None:
@@ -294,7 +296,11 @@ def _tracked(camera: StereoCamera, config: Config) -> TrackedCamera:
 
 
 def open_streams(config: Config, clock: Clock) -> list[MarkerStream]:
-    """Return the marker sources of robot.toml, not opened yet. Raise ConfigError if it has none."""
+    """Return the marker sources of robot.toml, not opened yet.
+
+    Raises:
+        ConfigError: it has none.
+    """
     if not config.tables.marker_source:
         raise ConfigError(
             "no marker source is configured",
@@ -346,7 +352,8 @@ def _simulated(config: Config) -> Iterator[Sources]:
 def open_postures(config: Config, count: int) -> Iterator[Sources]:
     """Yield the simulation's sources with the robot at rest in `count` independently sampled postures.
 
-    Raise ConfigError if the simulation cannot be made of this description.
+    Raises:
+        ConfigError: the simulation cannot be made of this description.
     """
     require_simulation()
     from bodyschema.sim_backend.posed import PosedWorld, visible_postures
@@ -395,7 +402,8 @@ def stream_of(table: AnySource, clock: Clock) -> MarkerStream:
 def holding_torques(robot: RobotDescription) -> Callable[[FloatArray], FloatArray]:
     """Return a function from joint angles [rad] (d,) to gravity torques [N·m] (d,), by the URDF's masses.
 
-    Raise ConfigError if the URDF states no masses that a joint bears.
+    Raises:
+        ConfigError: the URDF states no masses that a joint bears.
     """
     load = GravityLoad(robot)
     if not load.known:
@@ -410,7 +418,8 @@ def holding_torques(robot: RobotDescription) -> Callable[[FloatArray], FloatArra
 def open_drives(config: Config, servos: DynamixelConfig, clock: Clock) -> tuple[ZeroForce | Gaze, ...]:
     """Return the drives that may move the joints: those that robot.toml names, inactive until a person asks.
 
-    Raise ConfigError if the URDF states no masses, or robot.toml says that the arm is held in another way.
+    Raises:
+        ConfigError: the URDF states no masses, or robot.toml says that the arm is held in another way.
     """
     joints, drives = config.robot.joints, []
     _check_hold(config, servos)

@@ -60,9 +60,12 @@ class AskedFault:
 
     @classmethod
     def parsed(cls, text: str, joints: Collection[str], kinds: FaultKinds) -> AskedFault:
-        """Parse `KIND[@JOINT][=SHARE]`. Raise ConfigError for an unknown kind or joint, or a share.
+        """Parse `KIND[@JOINT][=SHARE]`.
 
         A wire fault with a joint affects every answer of its servo; without a joint it affects 2 % of all answers.
+
+        Raises:
+            ConfigError: an unknown kind or joint, or a share.
         """
         named, _, share = text.partition("=")
         kind, _, joint = named.partition("@")

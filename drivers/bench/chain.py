@@ -78,7 +78,11 @@ class ServoChain(OnlyAnswers, ABC, Generic[ServoT]):
         self._byte_s = 0.0
 
     def servo(self, id: int) -> ServoT:
-        """Return the first servo with this ID. Raise KeyError if there is none."""
+        """Return the first servo with this ID.
+
+        Raises:
+            KeyError: there is none.
+        """
         for servo in self.servos:
             if servo.id == id:
                 return servo

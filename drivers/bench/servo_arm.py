@@ -6,7 +6,6 @@ import math
 import time
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from random import Random
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -23,7 +22,6 @@ from .device import Faults
 from .dry_run import BenchArm
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the emulated arm."""
 
@@ -35,9 +33,6 @@ class _Settings:
     share_of_range: float = 0.35
     # shaft angle of a second servo with the same ID
     twin_rad: float = 0.1
-
-
-_SETTINGS = _Settings()
 
 
 def played(path: FloatArray, rate_hz: float, begin_s: float) -> list[Angle]:
@@ -64,9 +59,9 @@ def swinging(limits: Sequence[tuple[float, float]], begin_s: float) -> list[Angl
     def joint(place: int, lower: float, upper: float) -> Angle:
         bounded = math.isfinite(lower) and math.isfinite(upper)
         middle = (lower + upper) / 2 if bounded else 0.0
-        width = min(_SETTINGS.share_of_range * (upper - lower), _SETTINGS.widest_rad)  # infinite where not bounded
-        pace = 2 * math.pi / (_SETTINGS.slowest_s * (0.6 + 0.4 / (place + 1)))
-        return lambda t: middle + width * math.sin(pace * (t - begin_s) + _SETTINGS.phase_rad * place)
+        width = min(_Settings.share_of_range * (upper - lower), _Settings.widest_rad)  # infinite where not bounded
+        pace = 2 * math.pi / (_Settings.slowest_s * (0.6 + 0.4 / (place + 1)))
+        return lambda t: middle + width * math.sin(pace * (t - begin_s) + _Settings.phase_rad * place)
 
     return [joint(place, lower, upper) for place, (lower, upper) in enumerate(limits)]
 
@@ -165,7 +160,7 @@ class ServoArm(BenchArm, Generic[ServoT, ConfigT]):
             self._change_rate(servo)
         elif kind == "double":
             entry = next(entry for entry in self._config.servos if entry.joint == joint)
-            self.chains[self._config.bus_of(entry)].servos.append(self._servo(entry, lambda _: _SETTINGS.twin_rad))
+            self.chains[self._config.bus_of(entry)].servos.append(self._servo(entry, lambda _: _Settings.twin_rad))
         elif kind == "torque":
             servo["torque"] = 1
 

@@ -9,7 +9,7 @@ from typing import Any, Self
 
 from bodyschema.interfaces.protocols import JointSource
 from bodyschema.interfaces.records import JointReading, frozen_array
-from bodyschema.interfaces.servos import BusHealth, ServoHealth
+from bodyschema.interfaces.servos import BusStatus, ServoStatus
 
 from .dry_run import Angle
 
@@ -66,12 +66,12 @@ class ThroughDriver:
         return self._of_driver("health", ())
 
     @property
-    def servo_health(self) -> Sequence[ServoHealth]:
+    def servo_health(self) -> Mapping[str, ServoStatus]:
         """Servo health as reported by the driver, if it reads servos."""
-        return self._of_driver("servo_health", ())
+        return self._of_driver("servo_health", {})
 
     @property
-    def bus_health(self) -> Mapping[str, BusHealth]:
+    def bus_health(self) -> Mapping[str, BusStatus]:
         """Bus health as reported by the driver, if it reads servos."""
         return self._of_driver("bus_health", {})
 

@@ -103,12 +103,20 @@ class Guard:
         self._why, self._checked_s = None, now
 
     def check(self, now: float, motion: Motion | None) -> None:
-        """Check one cycle at `now` [s]; `motion` is None when the reading was rejected. Raise Drop on a violation."""
+        """Check one cycle at `now` [s]; `motion` is None when the reading was rejected.
+
+        Raises:
+            Drop: it violates a limit.
+        """
         with self._lasting():
             self._check(now, motion)
 
     def check_servo(self, joint: str, state: ServoState) -> None:
-        """Check the reported state of one servo, at intervals. Raise Drop on a violation."""
+        """Check the reported state of one servo, at intervals.
+
+        Raises:
+            Drop: it violates a limit.
+        """
         with self._lasting():
             self._check_servo(joint, state)
 
@@ -226,7 +234,8 @@ class Currents:
     def at(self, now: float, torques: FloatArray) -> FloatArray:
         """Return the currents [A] (n,) for the torques that hold the arm [N·m] (n,).
 
-        Raise Drop if the torques are not finite.
+        Raises:
+            Drop: the torques are not finite.
         """
         if torques.shape != self._limit.shape or not np.isfinite(torques).all():
             raise Drop("the model gives no torque for where the arm is. Look at the URDF's masses and joint limits")

@@ -203,7 +203,8 @@ KINDS: Mapping[str, type[AnySource]] = {
 def source_tables(raw: object, file: Path, text: str) -> tuple[AnySource, ...]:
     """Return the sources of the value `raw` of marker_source.
 
-    Raise ConfigError if a kind is unknown, a key unknown or wrong, or two sources have the same name.
+    Raises:
+        ConfigError: a kind is unknown, a key unknown or wrong, or two sources have the same name.
     """
     entries = raw if isinstance(raw, list) else [raw]
     found: list[AnySource] = []

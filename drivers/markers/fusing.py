@@ -23,7 +23,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the fusion of several marker sources."""
 
@@ -43,8 +42,6 @@ class _Settings:
     # the positions have to span so much in two directions for the transform to be known
     spread_m: float = 0.02
 
-
-_SETTINGS = _Settings()
 
 LONGEST_WAIT_S = 0.1  # for the other sources' positions of the same time
 LONGEST_GAP_S = 0.12  # between two positions that are interpolated: three frames at 30 Hz, of which one is missing
@@ -88,7 +85,7 @@ class Member:
 
         self.name, self.source, self.pose = name, source, pose
         self._turn = Rotation.from_matrix(pose[:3, :3])
-        self.common: deque[Common] = deque(maxlen=_SETTINGS.judged)
+        self.common: deque[Common] = deque(maxlen=_Settings.judged)
         self.forget()
 
     def forget(self) -> None:
@@ -118,18 +115,18 @@ class Member:
         share = (t - first.t) / gap_s
         velocity = (second.x - first.x) / gap_s
         late_m = velocity * math.hypot(sigma_s, first.t_sigma, second.t_sigma)
-        bend_m = 0.5 * _SETTINGS.hand_m_s2 * share * (1 - share) * gap_s**2
+        bend_m = 0.5 * _Settings.hand_m_s2 * share * (1 - share) * gap_s**2
         cov = (1 - share) ** 2 * first.cov + share**2 * second.cov + np.outer(late_m, late_m) + bend_m**2 * np.eye(3)
         return first.x + share * (second.x - first.x), cov
 
     def verdict(self, leader: str) -> str | None:
         """Return what its positions disagree in with the leader's, with the remedy; None if they agree."""
         common = list(self.common)  # another thread may add to it
-        if len(common) < _SETTINGS.fewest_judged:
+        if len(common) < _Settings.fewest_judged:
             return None
         chi2 = np.array([pair.chi2 for pair in common])
         share = float((chi2 > CHI2_999).mean())
-        if share < _SETTINGS.many:
+        if share < _Settings.many:
             return None
         apart = float(np.median([np.linalg.norm(pair.other - pair.lead) for pair in common]))
         return (
@@ -141,10 +138,10 @@ class Member:
     def _remedy(self, common: Sequence[Common]) -> str:
         lead, other = (np.array([getattr(pair, side) for pair in common]) for side in ("lead", "other"))
         T, spread = _rigid(other, lead)
-        if spread < _SETTINGS.spread_m:
+        if spread < _Settings.spread_m:
             return "move the marker through the whole workspace; then this message says what would make them agree"
         fitted = [replace(pair, other=T[:3, :3] @ pair.other + T[:3, 3]).chi2 for pair in common]
-        if float(np.median(fitted)) > _SETTINGS.well_fitted * CHI2_MEDIAN:
+        if float(np.median(fitted)) > _Settings.well_fitted * CHI2_MEDIAN:
             return (
                 "one of them follows another marker, or its latency_s or sigma_m is wrong; look at each alone, with "
                 "`bodyschema watch marker` and `bodyschema calibrate latency`"
@@ -209,7 +206,7 @@ class FusedMarkers:
         ended = 0
         for member in self.members:
             try:
-                seen = member.source.read(_SETTINGS.slice_s)
+                seen = member.source.read(_Settings.slice_s)
             except SourceEnded:
                 ended += 1
                 continue
@@ -219,12 +216,12 @@ class FusedMarkers:
                 missed = seen
         if ended == len(self.members):
             raise SourceEnded
-        is_seen = any(self._clock.now() - member.fixed_at < _SETTINGS.leads_for_s for member in self.members)
+        is_seen = any(self._clock.now() - member.fixed_at < _Settings.leads_for_s for member in self.members)
         return None if is_seen else missed
 
     def _next(self) -> MarkerFix | MarkerMiss | None:
         now = self._clock.now()
-        seeing = [member for member in self.members if now - member.fixed_at < _SETTINGS.leads_for_s]
+        seeing = [member for member in self.members if now - member.fixed_at < _Settings.leads_for_s]
         if not seeing:
             return None
         leader, *others = seeing

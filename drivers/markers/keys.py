@@ -86,7 +86,11 @@ class KeyReceiver:
         self._link: ZenohLink | None = None
 
     def open(self) -> None:
-        """Subscribe. Raise SourceLost when the router is not there."""
+        """Subscribe.
+
+        Raises:
+            SourceLost: the router is not there.
+        """
         try:
             session = open_session(self._table.router)
         except SourceLost as error:

@@ -7,13 +7,12 @@ import math
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Hashable, Iterable, Iterator
-from dataclasses import dataclass
 from typing import Protocol, Self
 
 import numpy as np
 
 from bodyschema.drivers.checks import Check, warned
-from bodyschema.drivers.markers.config import SourceTable
+from bodyschema.drivers.markers.config import UNKNOWN_LATENCY_SIGMA_S, SourceTable
 from bodyschema.drivers.markers.report import ADVICE, Fault, Packet, Report, Unusable
 from bodyschema.drivers.ros2.cdr import Malformed
 from bodyschema.drivers.ros2.senders import Refusal, Sender
@@ -23,7 +22,6 @@ from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss, Rea
 from bodyschema.interfaces.waits import POLL_S, RIVAL_AFTER_S, SILENT_AFTER_S
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the checks of a stream of positions."""
 
@@ -33,8 +31,6 @@ class _Settings:
     many: float = 0.02
     # The first messages of a clock that is not known yet may be refused.
     worth_a_word: int = 4
-    # of a position without a stamp: the sender's computation and the network
-    arrival_sigma_s: float = 0.005
     # with unit = "mm": metres, divided by 1000, are all nearer to the origin
     nearest_m: float = 0.005
     # a wider covariance is in mm², or useless
@@ -46,8 +42,6 @@ class _Settings:
     restart: int = 3
     few_per_s: float = 15.0
 
-
-_SETTINGS = _Settings()
 
 USED = "used"
 
@@ -68,22 +62,22 @@ class Ledger:
     def note(self, t: float, what: Fault | str, detail: str = "", count: int = 1) -> bool:
         """Count messages at time `t` [s]; return True once there are enough of this fault to tell a person."""
         with self._lock:
-            if not self._buckets or t - self._buckets[-1][0] >= _SETTINGS.bucket_s:
+            if not self._buckets or t - self._buckets[-1][0] >= _Settings.bucket_s:
                 self._buckets.append((t, Counter()))
-                while t - self._buckets[0][0] > _SETTINGS.lately_s:
+                while t - self._buckets[0][0] > _Settings.lately_s:
                     self._buckets.popleft()
             self._buckets[-1][1][what] += count
             self.total[what] += count
             if isinstance(what, Fault) and detail:
                 self._details[what] = detail
-            return self.total[what] - count < _SETTINGS.worth_a_word <= self.total[what]
+            return self.total[what] - count < _Settings.worth_a_word <= self.total[what]
 
     def lately(self, now: float) -> Counter[str]:
         """Return the counts of the last seconds."""
         counts: Counter[str] = Counter()
         with self._lock:
             for t, bucket in self._buckets:
-                if now - t <= _SETTINGS.lately_s:
+                if now - t <= _Settings.lately_s:
                     counts += bucket
         return counts
 
@@ -94,7 +88,7 @@ class Ledger:
         usual = {Fault.NOT_TRACKED} | ({Fault.OTHER_BODY} if counts[USED] or counts[Fault.NOT_TRACKED] else set())
         whole = sum(count for what, count in counts.items() if what not in usual)
         for fault in Fault:
-            if fault in usual or counts[fault] <= _SETTINGS.many * whole:
+            if fault in usual or counts[fault] <= _Settings.many * whole:
                 continue
             yield f"{name}: {counts[fault]} of the last {whole} messages {self.explained(fault)}"
 
@@ -117,13 +111,21 @@ class Receiver(Protocol):
     """The wire that messages come over."""
 
     def open(self) -> None:
-        """Open it. Raise SourceError if that is not possible."""
+        """Open it.
+
+        Raises:
+            SourceError: that is not possible.
+        """
 
     def close(self) -> None:
         """Close it; again does no harm."""
 
     def receive(self, until: float) -> Packet | None:
-        """Return the next message; None when none arrives by `until` [s]. Raise SourceLost if the other end is gone."""
+        """Return the next message; None when none arrives by `until` [s].
+
+        Raises:
+            SourceLost: the other end is gone.
+        """
 
     def silence(self) -> str:
         """Return why nothing may be coming, and what to do."""
@@ -282,7 +284,7 @@ class MarkerStream:
     def _time(self, report: Report, arrived: float) -> tuple[float, float]:
         """Return the time of the measurement and its 1-sigma [s]."""
         if report.stamp_ns is None:
-            return arrived - self._table.latency_s, math.hypot(_SETTINGS.arrival_sigma_s, self._table.sigma_s)
+            return arrived - self._table.latency_s, math.hypot(UNKNOWN_LATENCY_SIGMA_S, self._table.sigma_s)
         times_set = self._clock_of.times_set
         t = self._clock_of.time_of(report.stamp_ns, (0,), arrived)
         if self._clock_of.times_set != times_set:
@@ -309,7 +311,7 @@ class MarkerStream:
         x = self._table.metres * np.array(sent)
         if float(np.linalg.norm(x)) > FARTHEST_M:
             raise Unusable(Fault.UNIT, f"{float(np.linalg.norm(x)):.4g} m")
-        if self._table.unit == "mm" and float(np.linalg.norm(x)) < _SETTINGS.nearest_m:
+        if self._table.unit == "mm" and float(np.linalg.norm(x)) < _Settings.nearest_m:
             raise Unusable(Fault.SMALL_UNIT, f"{1e3 * float(np.linalg.norm(x)):.2g} mm")
         return frozen_array(x)
 
@@ -321,7 +323,7 @@ class MarkerStream:
         size = math.isqrt(len(report.cov))
         whole = np.array(report.cov).reshape(size, size)
         cov = self._table.metres**2 * self._proper(whole[:3, :3])
-        if float(np.linalg.eigvalsh(cov)[-1]) > _SETTINGS.widest_sigma_m**2:
+        if float(np.linalg.eigvalsh(cov)[-1]) > _Settings.widest_sigma_m**2:
             raise Unusable(Fault.COVARIANCE, f"1-sigma {math.sqrt(float(np.linalg.eigvalsh(cov)[-1])):.3g} m")
         turn = whole[3:, 3:] if size == 6 and whole[3:, 3:].any() else None
         return frozen_array(cov), None if turn is None else frozen_array(self._proper(turn))
@@ -329,7 +331,7 @@ class MarkerStream:
     @staticmethod
     def _proper(cov: FloatArray) -> FloatArray:
         """Return a covariance that is symmetric and positive definite."""
-        if not np.isfinite(cov).all() or np.abs(cov - cov.T).max() > _SETTINGS.asymmetry * np.abs(cov).max():
+        if not np.isfinite(cov).all() or np.abs(cov - cov.T).max() > _Settings.asymmetry * np.abs(cov).max():
             raise Unusable(Fault.COVARIANCE, "not symmetric, or not finite")
         if float(np.linalg.eigvalsh(cov)[0]) <= 0.0:
             raise Unusable(Fault.COVARIANCE, "not positive definite")
@@ -340,7 +342,7 @@ class MarkerStream:
         if turn is None or not any(turn):
             return None
         length = math.sqrt(sum(part * part for part in turn))
-        if not abs(length - 1.0) < _SETTINGS.unit_length:
+        if not abs(length - 1.0) < _Settings.unit_length:
             raise Unusable(Fault.TURN, f"length {length:.3g}")
         if self._first_turn is None:
             self._first_turn = turn
@@ -362,7 +364,7 @@ class _Numbers:
             self._newest, self._lower = seq, 0
             return 0 if before is None else seq - before - 1, None
         self._lower += seq < before
-        if self._lower >= _SETTINGS.restart:
+        if self._lower >= _Settings.restart:
             self._newest, self._lower = seq, 0
             return 0, None
         return 0, Fault.DUPLICATE if seq == before else Fault.OUT_OF_ORDER
@@ -408,4 +410,4 @@ def _of_fixes(subject: str, fixes: list[MarkerFix]) -> Iterator[Check]:
     sigma = 1e3 * float(np.sqrt(np.linalg.eigvalsh(last.cov)[-1]))
     said = f"{rate:.0f} positions/s, last at ({place}) mm ± {sigma:.2g} mm, time known to {1e3 * last.t_sigma:.1f} ms"
     fix = "let the source send more often: 30 to 100 a second"
-    yield warned(subject, said, fix, when=rate < _SETTINGS.few_per_s)
+    yield warned(subject, said, fix, when=rate < _Settings.few_per_s)

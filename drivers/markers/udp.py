@@ -23,10 +23,13 @@ LONGEST_WAIT_S = 60.0  # in the kernel's buffer; more shows that the wall clock 
 
 
 def listening(host: str, port: int, *, shared: bool = False) -> socket.socket:
-    """Return a socket on host and port, whose datagrams the kernel dates. Raise OSError if that is not possible.
+    """Return a socket on host and port, whose datagrams the kernel dates.
 
     Args:
         shared: other programs may listen there too, as is usual for multicast.
+
+    Raises:
+        OSError: that is not possible.
     """
     found = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
@@ -70,7 +73,11 @@ class UdpReceiver:
         self._strangers = 0
 
     def open(self) -> None:
-        """Listen. Raise SourceLost if another program does so already, or the address is not this machine's."""
+        """Listen.
+
+        Raises:
+            SourceLost: another program does so already, or the address is not this machine's.
+        """
         try:
             self._socket = listening(self._table.host, self._table.port)
         except OSError as error:

@@ -20,7 +20,8 @@ class CdrReader:
     def __init__(self, data: bytes) -> None:
         """Start behind the encapsulation header.
 
-        Raise Malformed if the header is invalid, the representation unsupported, or the message absurdly long.
+        Raises:
+            Malformed: the header is invalid, the representation unsupported, or the message absurdly long.
         """
         if len(data) > LARGEST_MESSAGE:
             raise Malformed(f"{len(data)} bytes are more than a message of joints has")

@@ -247,7 +247,8 @@ class Ros2Joints:
     def read(self, timeout_s: float) -> JointReading | None:
         """Return the next reading; see `JointSource.read`.
 
-        Raise SourceLost if the router is gone, or a joint jumped.
+        Raises:
+            SourceLost: the router is gone, or a joint jumped.
         """
         if self._link is None:
             raise SourceError("the robot's joint states are not open; use them in a with statement")

@@ -79,7 +79,8 @@ def session_config(mode: str, *, listen: Sequence[str] = (), connect: Sequence[s
 def open_session(router: str, start: str = "ros2 run rmw_zenoh_cpp rmw_zenohd") -> zenoh.Session:
     """Open a session with this router only: it neither listens nor scouts. `start` is the command that starts it.
 
-    Raise SourceLost if the router is not there.
+    Raises:
+        SourceLost: the router is not there.
     """
     try:
         return zenoh.open(session_config("client", connect=[router]))
@@ -137,7 +138,8 @@ class ZenohLink:
 def open_zenoh(config: Ros2Config, clock: Clock) -> Link:
     """Subscribe to the joint states of the configured robot. The type's hash is a wildcard, so any ROS 2 version works.
 
-    Raise SourceLost if the router is not there.
+    Raises:
+        SourceLost: the router is not there.
     """
     key = rmw.topic_key(config.domain, config.topic, JOINT_STATE, rmw.ANY)
     if config.via == "ros2dds":

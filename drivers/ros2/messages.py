@@ -137,7 +137,11 @@ def encode_transform(header: Header, child: str, x: tuple[float, ...], quaternio
 
 
 def read_header(reader: CdrReader) -> Header:
-    """Read std_msgs/Header. Raise Malformed for an invalid stamp."""
+    """Read std_msgs/Header.
+
+    Raises:
+        Malformed: an invalid stamp.
+    """
     seconds, nanoseconds = reader.int32(), reader.uint32()
     if nanoseconds >= NANO:
         raise Malformed(f"{nanoseconds} nanoseconds in a stamp")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import StrEnum
 from statistics import median
 
@@ -15,7 +14,6 @@ from bodyschema.drivers.turns import SpeedGate
 TICK_S = 1e-9
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the fit of a sender's clock."""
 
@@ -43,9 +41,6 @@ class _Settings:
     stall_s: float = 5.0
 
 
-_SETTINGS = _Settings()
-
-
 class StampClock:
     """Estimate of the host's time at which a message was stamped.
 
@@ -58,7 +53,7 @@ class StampClock:
         self._max_delay_s = max_delay_s
         self._last: tuple[int, float] | None = None  # stamp and time
         self._early: list[float] = []
-        self._delays: deque[float] = deque(maxlen=_SETTINGS.lately)
+        self._delays: deque[float] = deque(maxlen=_Settings.lately)
         self._least_s = self._began = math.inf
         self._begin(0)
 
@@ -82,7 +77,7 @@ class StampClock:
             return None
         t = bounds[1]
         if self._last is not None:
-            t = max(t, self._last[1] + _SETTINGS.steady * (stamp_ns - self._last[0]) * TICK_S)
+            t = max(t, self._last[1] + _Settings.steady * (stamp_ns - self._last[0]) * TICK_S)
         self._last = stamp_ns, t
         self._heard += 1
         self._delays.append(arrived - t)
@@ -97,7 +92,7 @@ class StampClock:
         `max_delay_s`, so the fastest of n messages is expected to have taken that divided by n + 1.
         """
         unseen_s = self._max_delay_s / (self._heard + 1)
-        return math.hypot(_SETTINGS.quickest_sigma_s, unseen_s, median(self._delays) if self._delays else 0.0)
+        return math.hypot(_Settings.quickest_sigma_s, unseen_s, median(self._delays) if self._delays else 0.0)
 
     def lateness_s(self, stamp_ns: int, arrived: float) -> float:
         """Return how much later a message arrived than the fastest would have [s]; infinite before any."""
@@ -111,10 +106,10 @@ class StampClock:
         This is done at the start only. Later on, when all are late, the network is slow.
         """
         self._least_s = min(self._least_s, delay_s) if arrived > self._began else math.inf
-        if arrived - self._began < _SETTINGS.late_for_s:
+        if arrived - self._began < _Settings.late_for_s:
             return
         self._began = math.inf
-        if self._least_s > _SETTINGS.late_s:
+        if self._least_s > _Settings.late_s:
             self._begin(stamp_ns)
 
     def _is_early(self, stamp_ns: int, arrived: float) -> bool:
@@ -124,18 +119,18 @@ class StampClock:
             self._began = arrived
             return False
         passed_s = (stamp_ns - self._last[0]) * TICK_S
-        if self.lateness_s(stamp_ns, arrived) >= -_SETTINGS.early_s - _SETTINGS.worst_drift * abs(passed_s):
+        if self.lateness_s(stamp_ns, arrived) >= -_Settings.early_s - _Settings.worst_drift * abs(passed_s):
             self._early.clear()
             return False
         offset_s = arrived - (stamp_ns - self._first_ns) * TICK_S
         self._early = [early for early in self._early if abs(early - offset_s) < self._max_delay_s] + [offset_s]
-        if len(self._early) < _SETTINGS.sure_after:
+        if len(self._early) < _Settings.sure_after:
             return True
         self._begin(stamp_ns)
         return False
 
     def _begin(self, stamp_ns: int) -> None:
-        self._device, self._first_ns, self._last = DeviceClock(TICK_S, _SETTINGS.ticks), stamp_ns, None
+        self._device, self._first_ns, self._last = DeviceClock(TICK_S, _Settings.ticks), stamp_ns, None
         self._early.clear()
         self._delays.clear()
         self._heard = 0
@@ -204,9 +199,9 @@ class Sender:
         off_s = self._clock.lateness_s(stamp_ns, arrived)
         if self._astray and abs(off_s - self._astray[0][1]) > self._max_delay_s:
             self._astray.clear()
-        self._astray = [*self._astray[: _SETTINGS.anew_after - 1], (arrived, off_s)]
-        patience_s = ANEW_AFTER_STALL_S if 0 < off_s < _SETTINGS.stall_s else ANEW_AFTER_S
-        if len(self._astray) == _SETTINGS.anew_after and arrived - self._astray[0][0] > patience_s:
+        self._astray = [*self._astray[: _Settings.anew_after - 1], (arrived, off_s)]
+        patience_s = ANEW_AFTER_STALL_S if 0 < off_s < _Settings.stall_s else ANEW_AFTER_S
+        if len(self._astray) == _Settings.anew_after and arrived - self._astray[0][0] > patience_s:
             self._clock, self._newest_ns, self._astray = StampClock(self._max_delay_s), {}, []
             self.times_set += 1
         return refusal

@@ -26,7 +26,6 @@ from .lines import ASK_HEADER, Header
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the reading of an encoder board."""
 
@@ -38,8 +37,6 @@ class _Settings:
     slack_ticks_part: int = 1000
     few_per_s: float = 50.0
 
-
-_SETTINGS = _Settings()
 
 ASK_EVERY_S = 0.5
 LARGEST_SIGMA_S = 5e-3  # of a reading's time
@@ -188,7 +185,8 @@ class SerialLineJoints:
     def read(self, timeout_s: float) -> JointReading | None:
         """Return the next reading; see `JointSource.read`.
 
-        Raise SourceLost if the port is gone, no intact lines arrive, or the board was restarted.
+        Raises:
+            SourceLost: the port is gone, no intact lines arrive, or the board was restarted.
         """
         if self._port is None:
             raise SourceError("the encoders are not open; use them in a with statement")
@@ -214,7 +212,7 @@ class SerialLineJoints:
         self._failing.clear()
         self._gate = SpeedGate(
             [math.radians(self._config.max_speed_deg_s) / encoder.rad_per_tick for encoder in self.encoders],
-            [2 + encoder.ticks_per_turn / _SETTINGS.slack_ticks_part for encoder in self.encoders],
+            [2 + encoder.ticks_per_turn / _Settings.slack_ticks_part for encoder in self.encoders],
         )
         self._anchor(port)
         self._believed_s = self._heard_s = self._clock.now()
@@ -222,7 +220,7 @@ class SerialLineJoints:
 
     def _introduced(self, port: Port) -> Header:
         """Return the board's header. Request it until it arrives."""
-        end, heard = self._clock.now() + _SETTINGS.header_s, 0
+        end, heard = self._clock.now() + _Settings.header_s, 0
         while self._clock.now() < end:
             port.write(ASK_HEADER)
             ask_again = min(end, self._clock.now() + ASK_EVERY_S)
@@ -251,7 +249,7 @@ class SerialLineJoints:
 
     def _anchor(self, port: Port) -> None:
         """Find the turn of each joint from two consistent readings; wait until the times are accurate."""
-        end, believed = self._clock.now() + _SETTINGS.anchor_s, 0
+        end, believed = self._clock.now() + _Settings.anchor_s, 0
         self._why = "no line"
         while self._clock.now() < end:
             while (timed := self._board.next()) is not None:
@@ -275,7 +273,7 @@ class SerialLineJoints:
 
     def _hear(self, port: Port, deadline: float) -> None:
         lost_at = self._believed_s + LOST_AFTER_S
-        data = port.receive(min(deadline, max(lost_at, self._clock.now() + LOST_AFTER_S / _SETTINGS.few_attempts)))
+        data = port.receive(min(deadline, max(lost_at, self._clock.now() + LOST_AFTER_S / _Settings.few_attempts)))
         garbled = self.counts.garbled
         self._board.hear(data, self._clock.now())
         if self._board.restarted:
@@ -287,7 +285,7 @@ class SerialLineJoints:
         elif self._clock.now() - self._heard_s > LOST_AFTER_S:
             self._why = "no line"
         self._attempts += 1
-        if self._clock.now() > lost_at and self._attempts >= _SETTINGS.few_attempts and not self._board.is_waiting:
+        if self._clock.now() > lost_at and self._attempts >= _Settings.few_attempts and not self._board.is_waiting:
             raise SourceLost(f"the encoders cannot be read: {self._why}", retry_s=RETRY_S)
 
     def _raw(self, timed: Timed) -> list[int] | None:
@@ -358,7 +356,7 @@ def encoder_checks(
                 readings += encoders.read(end - clock.now()) is not None
             rate_hz, counts = readings / read_s, encoders.counts
             fix = "a higher rate of the UART, fewer other things that the board does"
-            yield warned("rate", f"{rate_hz:.0f} readings/s come", fix, when=rate_hz < _SETTINGS.few_per_s)
+            yield warned("rate", f"{rate_hz:.0f} readings/s come", fix, when=rate_hz < _Settings.few_per_s)
             lost = counts.garbled + counts.missing
             said = f"{lost} of {counts.lines + lost} lines were garbled or missing"
             fix = "look at the cable, and whether the board keeps the rate exactly"

@@ -6,11 +6,12 @@ header is `H,1,boot,n,name1,ticks1,...,nameN,ticksN`, a reading is `seq,t_us,a1,
 
 from __future__ import annotations
 
+import binascii
 import re
 from dataclasses import dataclass
 
 VERSION = 1
-POLYNOMIAL, INITIAL = 0x1021, 0xFFFF  # CRC-16/CCITT-FALSE: "123456789" gives 29B1
+INITIAL = 0xFFFF  # of CRC-16/CCITT-FALSE, whose polynomial is 0x1021: "123456789" gives 29B1
 SEQUENCES = 2**16
 STAMPS, STAMP_S = 2**32, 1e-6
 LONGEST = 256  # bytes of a line with its line feed
@@ -56,22 +57,9 @@ class Reading:
     ticks: tuple[int | None, ...]
 
 
-def _remainder(byte: int) -> int:
-    crc = byte << 8
-    for _ in range(8):
-        crc = (crc << 1) ^ POLYNOMIAL if crc & 0x8000 else crc << 1
-    return crc & 0xFFFF
-
-
-_TABLE = tuple(_remainder(byte) for byte in range(256))
-
-
 def crc_ccitt(data: bytes) -> int:
     """Return the checksum of a line's content."""
-    crc = INITIAL
-    for byte in data:
-        crc = ((crc << 8) & 0xFF00) ^ _TABLE[(crc >> 8) ^ byte]
-    return crc
+    return binascii.crc_hqx(data, INITIAL)
 
 
 def with_checksum(content: str) -> bytes:
@@ -81,7 +69,11 @@ def with_checksum(content: str) -> bytes:
 
 
 def parse(line: bytes) -> Header | Reading:
-    """Parse a line without its line feed. Raise GarbledLine if it is not intact."""
+    """Parse a line without its line feed.
+
+    Raises:
+        GarbledLine: it is not intact.
+    """
     found = _LINE.fullmatch(line)
     if found is None or crc_ccitt(found[1]) != int(found[2], 16):
         raise GarbledLine

@@ -21,7 +21,6 @@ RETURN_DELAY_UNIT_S = 2e-6
 LARGEST_RETURN_DELAY_S = 0xFF * RETURN_DELAY_UNIT_S
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the timing of a servo bus."""
 
@@ -33,8 +32,6 @@ class _Settings:
     # number of recent requests whose size is avoided
     asked_lately: int = 4
 
-
-_SETTINGS = _Settings()
 
 LONGEST_NOISE_S = 0.25
 MOST_SPARE = 10  # bytes: from the end of a reading's block to that of the documented registers of the X and P series
@@ -212,7 +209,7 @@ class Bus(ABC):
     def send(self, request: Request) -> None:
         """Send a request. If overdue answers could pass for its answers, wait first until they can no longer arrive."""
         is_weak = self.is_weak(request)
-        lately = self._asked_lately.setdefault(request.ids, deque(maxlen=_SETTINGS.asked_lately)) if is_weak else ()
+        lately = self._asked_lately.setdefault(request.ids, deque(maxlen=_Settings.asked_lately)) if is_weak else ()
         size = self._owed.size_for(request, self._clock.now(), lately)
         if size is None and is_weak:
             until = self._owed.until(request)
@@ -260,7 +257,7 @@ class Bus(ABC):
 
     def settle(self) -> None:
         """Wait until the line has been silent for a while."""
-        quiet_s = max(_SETTINGS.quiet_s, 2 * self._latency_s)
+        quiet_s = max(_Settings.quiet_s, 2 * self._latency_s)
         end = self._clock.now() + LONGEST_NOISE_S
         while self._clock.now() < end and self._port.receive(self._clock.now() + quiet_s):
             pass
@@ -327,7 +324,7 @@ class Bus(ABC):
 
     def _note_owed(self, request: Request, ids: Iterable[int]) -> None:
         for id in ids:
-            self._owed.add(request.protocol, id, self._asked_size, self._clock.now() + _SETTINGS.owed_s)
+            self._owed.add(request.protocol, id, self._asked_size, self._clock.now() + _Settings.owed_s)
 
     def _doubt(self, request: Request, id: int, status: Status, answered_bytes: int) -> Trouble | None:
         if status.id != id:
@@ -337,7 +334,7 @@ class Bus(ABC):
         if len(status.data) != self._asked_size:
             return Trouble.WRONG_LENGTH
         wire_s = (self._question_size + answered_bytes) * self._byte_s
-        if self._clock.now() - self._sent < _SETTINGS.too_early * wire_s:
+        if self._clock.now() - self._sent < _Settings.too_early * wire_s:
             return Trouble.EARLY
         return None
 

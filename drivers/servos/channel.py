@@ -17,7 +17,6 @@ from bodyschema.interfaces.records import JointReading
 from .bus import Answer
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the checks of one servo's readings."""
 
@@ -33,9 +32,6 @@ class _Settings:
     # largest plausible changes, which are slow: 0.1 V, K
     voltage_step: int = 15
     temperature_step: int = 3
-
-
-_SETTINGS = _Settings()
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +82,7 @@ class Channel(ABC):
         self.surprising = True
         self._trend: tuple[float, float, float] | None = None
         self._speed = 0.0
-        self._off_course = max(_SETTINGS.surprise_rad / servo.model.rad_per_tick, _SETTINGS.surprise_ticks)
+        self._off_course = max(_Settings.surprise_rad / servo.model.rad_per_tick, _Settings.surprise_ticks)
         self._supply: tuple[int, int] | None = None
 
     def take(self, answer: Answer) -> Sample | None:
@@ -127,7 +123,7 @@ class Channel(ABC):
             self._speed = speed
         moved = self._step(sample.ticks - before)
         self.surprising = abs(moved - speed * (t - before_t)) > self._off_course
-        self._trend = (t, sample.ticks, moved / max(t - before_t, _SETTINGS.shortest_s))
+        self._trend = (t, sample.ticks, moved / max(t - before_t, _Settings.shortest_s))
 
     def _step(self, ticks: float) -> float:
         turn = self.servo.model.ticks_per_turn
@@ -136,8 +132,8 @@ class Channel(ABC):
     def _is_steady(self, voltage: int, temperature: int) -> bool:
         before = self._supply
         if before is not None and (
-            abs(voltage - before[0]) > _SETTINGS.voltage_step
-            or abs(temperature - before[1]) > _SETTINGS.temperature_step
+            abs(voltage - before[0]) > _Settings.voltage_step
+            or abs(temperature - before[1]) > _Settings.temperature_step
         ):
             return False
         self._supply = (voltage, temperature)
@@ -168,13 +164,13 @@ class Punctuality:
     """Detector of readings that were delayed so much that their time is less certain than usual."""
 
     def __init__(self) -> None:
-        self._unsure: deque[float] = deque(maxlen=_SETTINGS.lately)
+        self._unsure: deque[float] = deque(maxlen=_Settings.lately)
 
     def is_usual(self, unsure: float) -> bool:
         """Return True if a reading's time is about as certain as usual, and include it in the median."""
         self._unsure.append(unsure)
         usual = median(self._unsure)
-        return unsure <= max(usual + _SETTINGS.held_up_s, 2 * usual)
+        return unsure <= max(usual + _Settings.held_up_s, 2 * usual)
 
 
 class Drive(Protocol):

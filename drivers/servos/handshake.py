@@ -137,7 +137,11 @@ def identify(bus: Bus, config: ServoConfig, model: Model, known: Mapping[int, Mo
 
 
 def require_all(findings: Iterable[Finding], ports: str) -> list[IdentifiedServo]:
-    """Return the servos. Raise SourceError with a table of all servos if any is not as configured."""
+    """Return the servos.
+
+    Raises:
+        SourceError: any is not as configured; the message has a table of all servos.
+    """
     findings = list(findings)
     wrong = [finding for finding in findings if finding.servo is None]
     if not wrong:
@@ -154,7 +158,9 @@ def require_all(findings: Iterable[Finding], ports: str) -> list[IdentifiedServo
 def switch_torque_off(bus: Bus, servo: IdentifiedServo) -> IdentifiedServo:
     """Switch its torque off where it is on, and make sure; the servo with what it was like.
 
-    Raise SourceLost if it does not answer. Raise SourceError if the torque stays on.
+    Raises:
+        SourceLost: it does not answer.
+        SourceError: the torque stays on.
     """
     had_torque = torque_is_on(bus, servo)
     if had_torque:
@@ -172,7 +178,11 @@ def switch_torque_off(bus: Bus, servo: IdentifiedServo) -> IdentifiedServo:
 
 
 def torque_is_on(bus: Bus, servo: IdentifiedServo) -> bool:
-    """Return True if the servo's torque is on. Raise SourceLost if it does not answer."""
+    """Return True if the servo's torque is on.
+
+    Raises:
+        SourceLost: it does not answer.
+    """
     data, trouble = read_register(bus, servo.model, servo.id, servo.model.layout["torque"])
     if data is None:
         raise SourceLost(f"joint {servo.joint!r} (ID {servo.id}): {trouble}", retry_s=RETRY_S)

@@ -11,7 +11,7 @@ from bodyschema.drivers.servos.handshake import IdentifiedServo
 from bodyschema.drivers.servos.scan import VOLT_PER_UNIT
 from bodyschema.interfaces.errors import SourceLost
 from bodyschema.interfaces.protocols import Clock
-from bodyschema.interfaces.servos import ServoHealth
+from bodyschema.interfaces.servos import ServoStatus
 
 from .channel import Sample
 from .handshake import Finding
@@ -57,7 +57,7 @@ class Health:
         """Note which servos were found at an opening, and which were not."""
         self.absent = {finding.config.joint: finding.found for finding in findings if finding.servo is None}
 
-    def of(self, servo: IdentifiedServo, sample: Sample | None, lost: str | None) -> ServoHealth:
+    def of(self, servo: IdentifiedServo, sample: Sample | None, lost: str | None) -> ServoStatus:
         """Return the state of a servo; `lost` is the joint that lost its turn count."""
         joint = servo.joint
         voltage, temperature = self.supplies.get(joint, (None, None))
@@ -69,8 +69,18 @@ class Health:
         if servo.bus in self.away:
             troubles = ["its bus is away: look at the adapter's cable"]
         current = None if sample is None else sample.current
-        about = (joint, servo.bus, servo.id, servo.model.name, servo.firmware, servo.homing_offset, servo.drive_mode)
-        return ServoHealth(*about, voltage, temperature, current, tuple(troubles))
+        return ServoStatus(
+            bus=servo.bus,
+            id=servo.id,
+            model=servo.model.name,
+            firmware=servo.firmware,
+            homing_offset=servo.homing_offset,
+            drive_mode=servo.drive_mode,
+            voltage_v=None if voltage is None else round(voltage, 1),
+            temperature_c=temperature,
+            current_a=None if current is None else round(current, 3),
+            troubles=troubles,
+        )
 
     def _reasons(self, bits: int) -> list[str]:
         known = [text for bit, text in self._errors.items() if bits & bit]
@@ -100,7 +110,8 @@ class Inspection:
     def go_on(self) -> None:
         """Inspect the next servo, if it is time.
 
-        Raise SourceLost if its torque is on, and none of our drives switched it on.
+        Raises:
+            SourceLost: its torque is on, and none of our drives switched it on.
         """
         if self._clock.now() < self._next_s:
             return

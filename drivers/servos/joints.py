@@ -6,7 +6,6 @@ import logging
 import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
 from itertools import zip_longest
 from typing import Any, Self
 
@@ -20,7 +19,7 @@ from bodyschema.drivers.turns import SpeedGate
 from bodyschema.interfaces.errors import SourceError, SourceLost
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import JointReading, frozen_array
-from bodyschema.interfaces.servos import BusHealth, ServoHealth
+from bodyschema.interfaces.servos import BusStatus, ServoStatus
 
 from .bus import Bus, Counts, Request
 from .channel import Channel, Punctuality, Sample, middle
@@ -32,7 +31,6 @@ from .vendor import ServoVendor
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the reading of servos."""
 
@@ -43,8 +41,6 @@ class _Settings:
     anchor_polls: int = 50
     slack_ticks: int = 3
 
-
-_SETTINGS = _Settings()
 
 IMPROVE_EVERY_S = 10.0  # a failed attempt costs a reading or two
 GOLDEN = 0.618034  # its multiples, modulo 1, are spread most evenly
@@ -125,19 +121,21 @@ class ServoJoints:
         return (*self._health.complaints, *self._slow, *of_drives)
 
     @property
-    def servo_health(self) -> tuple[ServoHealth, ...]:
-        """State of each servo; empty before the first opening. From any thread."""
+    def servo_health(self) -> Mapping[str, ServoStatus]:
+        """State of each servo, by joint; empty before the first opening. From any thread."""
         samples, lost = self.samples, self._turns.lost
-        return tuple(self._health.of(servo, samples.get(servo.joint), lost) for servo in list(self.servos))
+        return {servo.joint: self._health.of(servo, samples.get(servo.joint), lost) for servo in list(self.servos)}
 
     @property
-    def bus_health(self) -> Mapping[str, BusHealth]:
+    def bus_health(self) -> Mapping[str, BusStatus]:
         """Statistics of each bus since the start, by name. From any thread."""
-        ways = {name: plan.name for name, plan in self._plans.items()}
-        return {
-            name: BusHealth(counts.exchanges, {str(t): n for t, n in list(counts.troubles.items())}, ways.get(name, ""))
-            for name, counts in self._counts.items()
-        }
+        found = dict[str, BusStatus]()
+        for name, counts in self._counts.items():
+            troubles = {str(trouble): count for trouble, count in list(counts.troubles.items())}
+            answered = 1.0 - sum(troubles.values()) / counts.exchanges if counts.exchanges else 0.0
+            way = self._plans[name].name if name in self._plans else ""
+            found[name] = BusStatus(counts.exchanges, round(answered, 5), troubles, way)
+        return found
 
     @property
     def samples(self) -> Mapping[str, Sample | None]:
@@ -189,7 +187,8 @@ class ServoJoints:
     def read(self, timeout_s: float) -> JointReading | None:
         """Return the next reading; see `JointSource.read`.
 
-        Raise SourceLost if a port is gone, or a servo no longer answers, was restarted, or has torque.
+        Raises:
+            SourceLost: a port is gone, or a servo no longer answers, was restarted, or has torque.
         """
         if not self._is_open:
             raise SourceError("the servos are not open; use them in a with statement")
@@ -246,7 +245,7 @@ class ServoJoints:
         self._at = {(servo.bus, servo.id): place for place, servo in enumerate(self.servos)}
         speed = math.radians(self._config.max_speed_deg_s)
         self._gate = SpeedGate(
-            [speed / s.model.rad_per_tick for s in self.servos], [_SETTINGS.slack_ticks] * len(self.servos)
+            [speed / s.model.rad_per_tick for s in self.servos], [_Settings.slack_ticks] * len(self.servos)
         )
         self._punctuality = Punctuality()
         now = self._clock.now()
@@ -258,7 +257,7 @@ class ServoJoints:
     def _anchor(self) -> None:
         """Find the turn of each joint from two consistent readings."""
         believed = 0
-        for _ in range(_SETTINGS.anchor_polls):
+        for _ in range(_Settings.anchor_polls):
             samples = self._ask_all()
             if samples is None:
                 continue
@@ -309,7 +308,7 @@ class ServoJoints:
         if reading is None:
             self.dropped += 1
             self._failures += 1
-            if self._failures >= _SETTINGS.few_polls and self._clock.now() - self._believed_s > LOST_AFTER_S:
+            if self._failures >= _Settings.few_polls and self._clock.now() - self._believed_s > LOST_AFTER_S:
                 raise SourceLost(self._inspection.first_silent() or self._why, retry_s=RETRY_S)
         else:
             self._believed_s, self._failures = self._clock.now(), 0
@@ -349,7 +348,7 @@ class ServoJoints:
             if sample is None:
                 stale = True
                 self._why = f"joint {self.joints[place]!r}: an answer from another time"
-                if channel.doubts >= _SETTINGS.doubts:
+                if channel.doubts >= _Settings.doubts:
                     raise SourceLost(
                         f"joint {channel.servo.joint!r} (ID {channel.servo.id}) was restarted", retry_s=RETRY_S
                     )

@@ -57,7 +57,11 @@ class Packets(Protocol):
         ...
 
     def take(self, received: bytes | bytearray, at: int) -> Status | None:
-        """Return the status packet that begins at `at`; None when it is incomplete. Raise Garbled if there is none."""
+        """Return the status packet that begins at `at`; None when it is incomplete.
+
+        Raises:
+            Garbled: there is none.
+        """
 
 
 HEADER, LARGEST_ID = b"\xff\xff", 0xFD

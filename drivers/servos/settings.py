@@ -40,7 +40,11 @@ class Setting:
     follows: str = ""
 
     def value(self, text: str) -> int:
-        """Parse the user's value. Raise ConfigError if it is no value of this setting, or out of range."""
+        """Parse the user's value.
+
+        Raises:
+            ConfigError: it is no value of this setting, or out of range.
+        """
         if text in self.words:
             return self.words[text]
         try:
@@ -74,7 +78,11 @@ class Setting:
 
 
 def setting_called(name: str, settings: Mapping[str, Setting], model: str) -> Setting:
-    """Return the setting of that name. Raise ConfigError when the model's EEPROM has none that may be written."""
+    """Return the setting of that name.
+
+    Raises:
+        ConfigError: the model's EEPROM has none that may be written.
+    """
     if name not in settings:
         what = f"{model} has no setting {name!r} that may be written"
         raise ConfigError(what, remedy=did_you_mean(name, settings))

@@ -77,7 +77,11 @@ class EepromEditor:
             self._buses.clear()
 
     def bus(self, port: str, baud: int) -> Bus:
-        """Return the bus at `port`, opened at this baud rate. Raise SourceError if it cannot be opened."""
+        """Return the bus at `port`, opened at this baud rate.
+
+        Raises:
+            SourceError: it cannot be opened.
+        """
         if port in self._buses:
             rate, bus = self._buses[port]
             if rate == baud:
@@ -90,7 +94,11 @@ class EepromEditor:
         return self._buses[port][1]
 
     def fitted(self, bus: Bus, config: ServoConfig, model: Model) -> IdentifiedServo:
-        """Return the servo as found on the bus. Raise SourceError if it is another, or does not answer."""
+        """Return the servo as found on the bus.
+
+        Raises:
+            SourceError: it is another, or does not answer.
+        """
         finding = identify(bus, config, model, self.make.models)
         if finding.servo is None:
             raise SourceError(
@@ -118,11 +126,19 @@ class EepromEditor:
         return {model.protocol: model for model in self.make.models.values()}
 
     def value(self, bus: Bus, servo: IdentifiedServo, setting: Setting) -> int:
-        """Return the setting's value in the servo's EEPROM. Raise SourceError if the servo does not answer."""
+        """Return the setting's value in the servo's EEPROM.
+
+        Raises:
+            SourceError: the servo does not answer.
+        """
         return _read(bus, servo, setting.register)
 
     def position(self, bus: Bus, servo: IdentifiedServo) -> int:
-        """Return the servo's position [ticks]. Raise SourceError if it does not answer."""
+        """Return the servo's position [ticks].
+
+        Raises:
+            SourceError: it does not answer.
+        """
         return _read(bus, servo, servo.model.layout["position"])
 
     def homing_offset(self, bus: Bus, servo: IdentifiedServo) -> int:
@@ -133,7 +149,11 @@ class EepromEditor:
         return wanted if turn is None else (wanted + turn // 2) % turn - turn // 2
 
     def torque_off(self, bus: Bus, servos: Iterable[IdentifiedServo]) -> None:
-        """Switch the torque of all servos off, and verify it. Raise SourceError if one stays on."""
+        """Switch the torque of all servos off, and verify it.
+
+        Raises:
+            SourceError: one stays on.
+        """
         for servo in servos:
             switch_torque_off(bus, servo)
 

@@ -9,7 +9,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import BoolArray, FloatArray, frozen, numbers, rows
+from kbmaps.arrays import BoolArray, FloatArray, evenly_spread, frozen, numbers, rows
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.parameters import ChainParameters, ChainTolerances
 from kbmaps.errors import DegenerateDataError, SettingError, ShapeError
@@ -17,7 +17,6 @@ from kbmaps.robust import MEDIAN_NORM, ROUNDING_M, UNCALIBRATED_SIGMAS
 from kbmaps.rotations import cross_matrix, exponentials, nearest_rotation, rotation_vector
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the alignment."""
 
@@ -30,9 +29,6 @@ class _Settings:
     placed: int = 64
     # Singular values below this share of the largest are directions that the data do not determine.
     rank_tolerance: float = 1e-7
-
-
-_SETTINGS = _Settings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +100,7 @@ class _Fit:
         root = np.sqrt(weights)[:, None]
         design = (np.concatenate(columns, axis=2) * root[:, :, None]).reshape(3 * len(turned), -1)
         target = (self.errors() * root).ravel()
-        step = cast(FloatArray, np.linalg.lstsq(design, target, rcond=_SETTINGS.rank_tolerance)[0])
+        step = cast(FloatArray, np.linalg.lstsq(design, target, rcond=_Settings.rank_tolerance)[0])
         if self.fit_pose:
             self.rotation = exponentials(step[:3][None])[0][0] @ self.rotation
             self.translation = self.translation + step[3:6]
@@ -194,7 +190,7 @@ def _start_shift(fit: _Fit, sigma: float, turns: FloatArray | None) -> FloatArra
     Several starting points are tried: pose and marker offset together have local minima, mostly with few joints or
     small ranges.
     """
-    chosen = np.unique(np.linspace(0, len(fit.x) - 1, _SETTINGS.start_pairs).astype(np.intp))
+    chosen = np.unique(np.linspace(0, len(fit.x) - 1, _Settings.start_pairs).astype(np.intp))
     reach = float(np.linalg.norm(fit.x - np.median(fit.x, axis=0), axis=1).mean())
     best, best_spread = np.zeros(3), math.inf
     starts = reach * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
@@ -203,7 +199,7 @@ def _start_shift(fit: _Fit, sigma: float, turns: FloatArray | None) -> FloatArra
     for start in starts:
         trial = _Fit(fit.nominal_rotations[chosen], fit.nominal_positions[chosen], fit.x[chosen], True, True)
         trial.shift = start
-        _fit_robustly(trial, sigma, _SETTINGS.trial_tolerance)
+        _fit_robustly(trial, sigma, _Settings.trial_tolerance)
         spread = trial.spread(0.0)
         # A new start must be clearly better, so that rounding does not choose among equals.
         if spread < 0.9 * best_spread - ROUNDING_M:
@@ -230,12 +226,12 @@ def _shift_by_turns(fit: _Fit, turns: FloatArray) -> FloatArray:
     rotation = nearest_rotation(found * np.sign(np.linalg.det(found)))
     columns = np.concatenate([rotation @ fit.nominal_rotations, np.broadcast_to(np.eye(3), turns.shape)], axis=2)
     target = fit.x - fit.nominal_positions @ rotation.T
-    return cast(FloatArray, np.linalg.lstsq(columns.reshape(-1, 6), target.ravel(), rcond=_SETTINGS.rank_tolerance)[0])[
+    return cast(FloatArray, np.linalg.lstsq(columns.reshape(-1, 6), target.ravel(), rcond=_Settings.rank_tolerance)[0])[
         :3
     ]
 
 
-def _fit_robustly(fit: _Fit, sigma: float, tolerance: float = _SETTINGS.step_tolerance) -> BoolArray:
+def _fit_robustly(fit: _Fit, sigma: float, tolerance: float = _Settings.step_tolerance) -> BoolArray:
     """Fit robustly by graduated non-convexity, then by least squares on the inliers; return the inliers (n,).
 
     Geman-McClure weights whose scale shrinks from the largest residual to that of the bulk (Yang et al. 2020,
@@ -247,7 +243,7 @@ def _fit_robustly(fit: _Fit, sigma: float, tolerance: float = _SETTINGS.step_tol
         fit.place(weights)
     norms = fit.norms()
     scale = float(norms.max())
-    for _ in range(_SETTINGS.rounds):
+    for _ in range(_Settings.rounds):
         goal = 3.0 * fit.spread(sigma)
         scale = max(scale / 1.4, goal)
         weights = (scale**2 / (scale**2 + norms**2)) ** 2 if scale > 0.0 else weights
@@ -256,7 +252,7 @@ def _fit_robustly(fit: _Fit, sigma: float, tolerance: float = _SETTINGS.step_tol
         if scale == goal and step < tolerance:
             break
     inliers = np.ones(len(fit.x), dtype=np.bool_)
-    for _ in range(_SETTINGS.rounds):
+    for _ in range(_Settings.rounds):
         chosen = norms <= max(UNCALIBRATED_SIGMAS * fit.spread(sigma), ROUNDING_M)
         step = fit.improve(chosen.astype(np.float64))
         norms = fit.norms()
@@ -315,7 +311,7 @@ class PlacedStart:
         """
         first = 1 << (len(q).bit_length() - 1)
         if self.needed and first != self._placed_at:
-            chosen = np.linspace(0, first - 1, min(first, _SETTINGS.placed)).round().astype(np.intp)
+            chosen = evenly_spread(first, _Settings.placed)
             self._change, self._placed_at = self._placed(q[chosen], x[chosen]), first
         return self._change
 

@@ -101,7 +101,11 @@ class ChainBelief:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
-        """Return the belief in `data`. Raises ModelFormatError: wrong type of model, or damaged."""
+        """Return the belief in `data`.
+
+        Raises:
+            ModelFormatError: wrong type of model, or damaged.
+        """
         fields, arrays = unpack(data, _KIND)
         with restoring("a belief in a chain"):
             complete(arrays, (*CHAIN, "mean", "root"))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.linalg import solve_triangular  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
 
-from kbmaps.arrays import FloatArray, batches, frozen, rows
+from kbmaps.arrays import FloatArray, batches, evenly_spread, frozen, rows
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.parameters import CHAIN, ChainParameters, chain_arrays, chain_from_arrays
@@ -100,7 +100,11 @@ class OrientedChain:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
-        """Restore the bytes of `to_bytes`. Raises ModelFormatError: wrong type of model, or damaged."""
+        """Restore the bytes of `to_bytes`.
+
+        Raises:
+            ModelFormatError: wrong type of model, or damaged.
+        """
         fields, arrays = unpack(data, _KIND)
         with restoring("an oriented chain"):
             complete(arrays, (*CHAIN, "mean", "turn", "root"))
@@ -208,7 +212,7 @@ class _Fit:
 def _likely_turn(hand: FloatArray, measured: FloatArray) -> FloatArray:
     """Return the rotation, among those of single orientations, with the smallest median distance to the others."""
     turns = hand.swapaxes(1, 2) @ measured
-    tried = turns[np.linspace(0, len(turns) - 1, min(len(turns), _CANDIDATES)).round().astype(np.intp)]
+    tried = turns[evenly_spread(len(turns), _CANDIDATES)]
     # tr(AᵀB) = 1 + 2 cos of the angle between them.
     traces = np.einsum("aij,bij->ab", tried, turns)
     return tried[int(np.median(traces, axis=1).argmax())]

@@ -404,7 +404,11 @@ def describe_tolerances(tolerances: ChainTolerances) -> dict[str, float | None]:
 
 
 def parse_tolerances(value: Any) -> ChainTolerances:
-    """Return the tolerances from `describe_tolerances`. Raises ModelFormatError, SettingError."""
+    """Return the tolerances from `describe_tolerances`.
+
+    Raises:
+        ModelFormatError, SettingError: it does not describe one.
+    """
     names = [field.name for field in fields(ChainTolerances)]
     described = named(value, "the tolerances", names)
     return ChainTolerances(*(or_infinite(described[name], f"the tolerance {name}") for name in names))

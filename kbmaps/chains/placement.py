@@ -14,7 +14,6 @@ from kbmaps.robust import MEDIAN_NORM, ROUNDING_M
 from kbmaps.rotations import cross_matrix, exponentials, rotation_vectors
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the fit of a placement."""
 
@@ -30,9 +29,6 @@ class _Settings:
     settling: int = 4
     # Holds undetermined directions; as a share of the largest diagonal entry.
     ridge: float = 1e-9
-
-
-_SETTINGS = _Settings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,9 +114,9 @@ class _Fitter:
         count = len(self._q)
         every = np.arange(count)
         state = self._start(every, np.zeros((count, 3)) if tools is None else tools)
-        damping, active = np.full(count, _SETTINGS.first_damping), every
-        for k in range(_SETTINGS.steps):
-            reach = max(_SETTINGS.first_reach * 0.5**k, _SETTINGS.least_reach)
+        damping, active = np.full(count, _Settings.first_damping), every
+        for k in range(_Settings.steps):
+            reach = max(_Settings.first_reach * 0.5**k, _Settings.least_reach)
             distances = state.distances[active]
             sigma = np.maximum(np.partition(distances, self._middle)[:, self._middle] / MEDIAN_NORM, ROUNDING_M)
             scale = np.square(reach * sigma)[:, None]
@@ -130,10 +126,10 @@ class _Fitter:
             better = after <= before
             state.put(active[better], tried, better)
             damping[active] = np.where(
-                better, np.maximum(0.1 * damping[active], _SETTINGS.least_damping), 10.0 * damping[active]
+                better, np.maximum(0.1 * damping[active], _Settings.least_damping), 10.0 * damping[active]
             )
-            settled = better & (k >= _SETTINGS.settling) & (before - after < _SETTINGS.small_gain * before)
-            active = active[~(settled | (damping[active] > _SETTINGS.most_damping))]
+            settled = better & (k >= _Settings.settling) & (before - after < _Settings.small_gain * before)
+            active = active[~(settled | (damping[active] > _Settings.most_damping))]
             if not len(active):
                 break
         return Placements(state.rotations, state.shifts, state.zeros, state.tools, state.distances)
@@ -183,7 +179,7 @@ class _Fitter:
         slope[:, 6:] -= self._information[6:] * np.concatenate([state.zeros[rows], state.tools[rows]], axis=1)
         diagonal = np.einsum("sff->sf", gram)
         diagonal += self._information
-        diagonal += damping[:, None] * diagonal + _SETTINGS.ridge * diagonal.max(axis=1, keepdims=True)
+        diagonal += damping[:, None] * diagonal + _Settings.ridge * diagonal.max(axis=1, keepdims=True)
         return cast(FloatArray, np.linalg.solve(gram, slope[..., None])[..., 0])
 
     def _cost(self, state: _State, rows: IntArray | slice, weights: FloatArray) -> FloatArray:

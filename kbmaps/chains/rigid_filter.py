@@ -15,6 +15,7 @@ from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.parameters import WIDE, ChainParameters, ChainTolerances
 from kbmaps.errors import NonFiniteError, SettingError, ShapeError
 from kbmaps.maps.kernels import FilterKernel, filter_kernel
+from kbmaps.robust import OUTLIER_SIGMAS
 from kbmaps.rotations import SMALL_ANGLE
 
 # Scale of the marker's position where its tolerance is 0, so that a tool change can loosen it [m].
@@ -22,8 +23,8 @@ _TOOL_UNIT = 0.1
 _ITERATIONS = 5
 # Relinearise when the curvature of the last step may have moved the marker by this share of the noise.
 _SMALL_BEND = 0.1
-# Squared Mahalanobis distance of an innovation beyond which a pair is down-weighted (chi², 3 degrees: 1 in 10,000).
-_GATE = 21.0
+# Squared Mahalanobis distance of an innovation beyond which a pair is down-weighted.
+_GATE = OUTLIER_SIGMAS * OUTLIER_SIGMAS
 # The noise estimate starts with the weight of this many coordinates, and forgets all but this many of the last ones.
 NOISE_COORDINATES, NOISE_MEMORY = 6.0, 900.0
 LEAST_NOISE_M = 1e-6  # no camera is better, and the formulas need a positive value
@@ -143,7 +144,11 @@ class RigidFilter:
         return {"change": self.change, "covariance": self._covariance, "noise": noise, "origin": origin}
 
     def restore(self, arrays: Mapping[str, FloatArray]) -> None:
-        """Restore the state from `arrays`. Raises KeyError, ShapeError, NonFiniteError, SettingError."""
+        """Restore the state from `arrays`.
+
+        Raises:
+            KeyError, ShapeError, NonFiniteError, SettingError: they are not those of a state.
+        """
         shapes = {name: array.shape for name, array in self.arrays().items()}
         linearised = arrays["origin"].size > 0
         shapes["origin"] = self.change.shape if linearised else (0,)

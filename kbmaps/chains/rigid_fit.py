@@ -15,7 +15,6 @@ from kbmaps.pairs import Pairs
 from kbmaps.robust import MEDIAN_NORM, OUTLIER_SIGMAS, ROUNDING_M
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the robust fit of a chain.
 
@@ -33,9 +32,6 @@ class _Settings:
     most_damping: float = 1e8
     # A step that changes the fit by less than this share of the posterior's standard deviation is the last.
     small_step: float = 1e-4
-
-
-_SETTINGS = _Settings()
 
 
 @dataclass(frozen=True)
@@ -111,7 +107,7 @@ class _Point:
         values, vectors = np.linalg.eigh(spread @ spread.swapaxes(1, 2))
         shares = 1.0 + np.where(inliers, -1.0, 1.0)[:, None] * values
         along = (vectors.swapaxes(1, 2) @ (self.residuals / sigma[:, None])[:, :, None])[:, :, 0]
-        return np.sqrt((np.square(along) / np.maximum(shares, _SETTINGS.least_share)).sum(axis=1))
+        return np.sqrt((np.square(along) / np.maximum(shares, _Settings.least_share)).sum(axis=1))
 
     def cost(self, roots: FloatArray) -> float:
         residuals = np.einsum("ni,ni,n->", self.residuals, self.residuals, roots * roots)
@@ -126,7 +122,7 @@ class _Fitter:
         self.free, self.root = squared(prior.root)
         self.point = self._at(cast(FloatArray, np.linalg.solve(self.root, (start - prior.mean)[self.free])))
         self.least_noise = 1.0 if pairs.known else ROUNDING_M / float(pairs.unit.min())
-        self._damping = _SETTINGS.first_damping
+        self._damping = _Settings.first_damping
         # Residual coordinates that the parameters use up.
         self.used = float(min(len(self.free), 3 * len(pairs)))
 
@@ -147,19 +143,19 @@ class _Fitter:
         before, columns = point.cost(roots), np.einsum("ij,ij->j", design, design)
         squares = np.square(np.linalg.svd(design, compute_uv=False))
         self.used = float((squares / (1.0 + squares)).sum())  # γ of MacKay 1992, "Bayesian interpolation"
-        while self._damping <= _SETTINGS.most_damping:
+        while self._damping <= _Settings.most_damping:
             held = np.sqrt(1.0 + self._damping * columns)
             q, r = np.linalg.qr(np.concatenate([design, np.diag(held)]))
             projected = q.T @ np.concatenate([target, -point.offset / held])
             length = float(np.linalg.norm(projected))
             tried = self._at(point.offset + np.linalg.solve(r, projected))
             if tried.cost(roots) <= before:
-                self.point, self._damping = tried, max(self._damping * 0.1, _SETTINGS.least_damping)
+                self.point, self._damping = tried, max(self._damping * 0.1, _Settings.least_damping)
                 return length
-            if length < _SETTINGS.small_step:
+            if length < _Settings.small_step:
                 return 0.0
-            self._damping = max(self._damping * 10.0, _SETTINGS.first_damping)
-        self._damping = _SETTINGS.first_damping
+            self._damping = max(self._damping * 10.0, _Settings.first_damping)
+        self._damping = _Settings.first_damping
         return 0.0
 
     def _at(self, offset: FloatArray) -> _Point:
@@ -222,12 +218,12 @@ def folded(prior: ChainBelief, pairs: Pairs, change: FloatArray, noise: float) -
 
 def _anneal(fitter: _Fitter) -> None:
     scale = math.inf
-    for _ in range(_SETTINGS.rounds):
+    for _ in range(_Settings.rounds):
         norms = fitter.point.norms
-        goal = _SETTINGS.scales_per_sigma * fitter.typical()
+        goal = _Settings.scales_per_sigma * fitter.typical()
         scale = max(min(scale / 1.4, float(norms.max())), goal)
-        step = fitter.improve((scale**2 / (scale**2 + norms**2)) ** 2, scale / _SETTINGS.scales_per_sigma)
-        if scale == goal and (step < 1.0 or scale <= 2.0 * _SETTINGS.scales_per_sigma * fitter.least_noise):
+        step = fitter.improve((scale**2 / (scale**2 + norms**2)) ** 2, scale / _Settings.scales_per_sigma)
+        if scale == goal and (step < 1.0 or scale <= 2.0 * _Settings.scales_per_sigma * fitter.least_noise):
             return
 
 
@@ -238,7 +234,7 @@ def _polish(fitter: _Fitter, before: NoiseKnowledge) -> RigidFit:
     # Few pairs can be fitted with much noise or with little; a given noise is tried first.
     noise = 1.0 if pairs.known else typical
     freedom = 0.0
-    for _ in range(_SETTINGS.rounds):
+    for _ in range(_Settings.rounds):
         step = fitter.improve(inliers.astype(np.float64), noise)
         freedom = max(3.0 * float(inliers.sum()) - fitter.used, 0.0)
         square = float(np.square(fitter.point.norms[inliers]).sum())
@@ -247,7 +243,7 @@ def _polish(fitter: _Fitter, before: NoiseKnowledge) -> RigidFit:
         chosen = distances <= OUTLIER_SIGMAS
         settled = bool((chosen == inliers).all()) and abs(estimate - noise) <= 1e-3 * noise
         inliers, noise = chosen, estimate
-        if settled and step < _SETTINGS.small_step * math.sqrt(1.0 + freedom):
+        if settled and step < _Settings.small_step * math.sqrt(1.0 + freedom):
             break
     return _summary(fitter, inliers, noise, freedom)
 
@@ -260,7 +256,7 @@ def _found_noise(square: float, freedom: float, before: NoiseKnowledge, fitter: 
 
 def _told_noise(square: float, freedom: float) -> float:
     """Return 1, or more if the residuals exceed chance: then the chain does not fit."""
-    if freedom == 0.0 or chdtrc(freedom, square) >= _SETTINGS.misfit_chance:
+    if freedom == 0.0 or chdtrc(freedom, square) >= _Settings.misfit_chance:
         return 1.0
     return max(math.sqrt(square / freedom), 1.0)
 

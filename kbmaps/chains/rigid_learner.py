@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -31,7 +30,6 @@ from kbmaps.pairs import Pairs, checked_pairs, of_covariances, stored_pairs, wit
 from kbmaps.robust import claimed_sigma, student
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the learner's steps."""
 
@@ -43,9 +41,6 @@ class _Settings:
     followed: int = 100
     # A parameter counts as undetermined if its standard deviation stayed above this share of the prior's.
     hardly_narrower: float = 0.5
-
-
-_SETTINGS = _Settings()
 
 
 def deviations(belief: ChainBelief, pairs: Pairs, sigma: FloatArray) -> FloatArray:
@@ -68,7 +63,7 @@ def deviations(belief: ChainBelief, pairs: Pairs, sigma: FloatArray) -> FloatArr
     opened, closed, follow = _sides(belief, pairs, sigma)
     bend = np.empty((len(belief.mean), opened.shape[1], opened.shape[1]))
     for k, direction in enumerate(opened.T):
-        step = _SETTINGS.longest_step / max(float(np.abs(direction).max()), _SETTINGS.longest_step)
+        step = _Settings.longest_step / max(float(np.abs(direction).max()), _Settings.longest_step)
         _, ahead = belief.parameters.linearised(belief.mean + step * direction, q)
         _, behind = belief.parameters.linearised(belief.mean - step * direction, q)
         second = pairs.whitened((ahead - behind) @ opened) / (2.0 * step * sigma[:, None, None])
@@ -89,8 +84,8 @@ def _sides(belief: ChainBelief, pairs: Pairs, sigma: FloatArray) -> tuple[FloatA
     _, jacobian = belief.parameters.linearised(belief.mean, pairs.q)
     rows = (pairs.whitened(jacobian[:, :, free] @ triangle) / sigma[:, None, None]).reshape(-1, len(free))
     taken, vectors = np.linalg.eigh(rows.T @ rows)
-    opened, closed = vectors[:, taken <= 1.0 - _SETTINGS.open], vectors[:, taken > 1.0 - _SETTINGS.open]
-    follow = (rows @ closed / taken[taken > 1.0 - _SETTINGS.open]).T
+    opened, closed = vectors[:, taken <= 1.0 - _Settings.open], vectors[:, taken > 1.0 - _Settings.open]
+    follow = (rows @ closed / taken[taken > 1.0 - _Settings.open]).T
     return root @ opened, root @ closed, follow
 
 
@@ -198,7 +193,11 @@ class RigidLearner(Model):
 
     @property
     def scatter(self) -> Scatter:
-        """Scatter of the pairs about the chain. Raises DegenerateDataError: no pair has been learnt."""
+        """Scatter of the pairs about the chain.
+
+        Raises:
+            DegenerateDataError: no pair has been learnt.
+        """
         fit = self._fitted()
         if fit is None:
             raise DegenerateDataError("nothing lies around the chain before the first pair was learnt")
@@ -293,7 +292,7 @@ class RigidLearner(Model):
         """Return True for each parameter (size,) that matters and was not determined; noise of a coordinate [m]."""
         before, after = (np.sqrt(np.square(belief.root).sum(axis=1)) for belief in (self._prior, fit.belief))
         lever = np.where(self._parameters.turning, self._parameters.reach, 1.0)
-        return (after > _SETTINGS.hardly_narrower * before) & (before * lever > noise)
+        return (after > _Settings.hardly_narrower * before) & (before * lever > noise)
 
     def to_bytes(self) -> bytes:
         arrays = chain_arrays(self.nominal) | {
@@ -346,7 +345,7 @@ class RigidLearner(Model):
 
     def _deviations(self, fit: RigidFit, pairs: Pairs) -> FloatArray:
         good = np.flatnonzero(fit.inliers)
-        some = good[:: max(len(good) // _SETTINGS.followed, 1)]
+        some = good[:: max(len(good) // _Settings.followed, 1)]
         sigma = fit.noise * pairs.unit[some] * math.sqrt(len(some) / max(len(good), 1))
         return deviations(fit.belief, pairs.chosen(np.isin(np.arange(len(pairs)), some)), sigma)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
@@ -31,7 +30,6 @@ from kbmaps.packed import complete, count, named, pack, restoring, unpack
 from kbmaps.pairs import checked_pairs, stored_pairs, with_units
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the recursive learner.
 
@@ -48,9 +46,6 @@ class _Settings:
     growth: float = 1.5
     # A noise estimated from fewer degrees of freedom is a guess: the next refit comes with the next pair.
     sure_freedom: float = 12.0
-
-
-_SETTINGS = _Settings()
 
 
 class RigidWindow:
@@ -70,8 +65,8 @@ class RigidWindow:
     STORED_BELIEF = ("before_mean", "before_root")
 
     def __init__(self, parameters: ChainParameters, tolerances: ChainTolerances, size: int) -> None:
-        if size < _SETTINGS.least_window:
-            raise SettingError(f"a window must hold at least {_SETTINGS.least_window} pairs, got {size}")
+        if size < _Settings.least_window:
+            raise SettingError(f"a window must hold at least {_Settings.least_window} pairs, got {size}")
         self.size = size
         self.belief = ChainBelief.from_tolerances(parameters, tolerances)
         self.noise = NOTHING_KNOWN
@@ -115,7 +110,7 @@ class RigidWindow:
         """Return the fit to at least one pair; `near` (size,) is the expected change of the chain."""
         q, x, sigma = self._pairs()
         pairs = with_units(q, x, sigma)
-        if self._count > _SETTINGS.fresh:
+        if self._count > _Settings.fresh:
             fit = fit_chain(self.belief, pairs, near, near=True, noise=self.noise)
         else:
             start = self.belief.mean if self._begun else self._place.change(q, x)
@@ -232,7 +227,7 @@ class RecursiveRigidLearner(Model):
         self._tolerances = tolerances
         self._filter = RigidFilter(self._parameters, tolerances, noise)
         self._window = RigidWindow(self._parameters, tolerances, window)
-        self._due = _SETTINGS.first
+        self._due = _Settings.first
         self._pairs = 0
         self._widest: float | None = None
 
@@ -310,7 +305,7 @@ class RecursiveRigidLearner(Model):
         """
         if not (tolerance > 0.0 and math.isfinite(tolerance)):
             raise SettingError(f"tolerance must be finite and greater than 0 m, got {tolerance!r}")
-        if self.kept >= _SETTINGS.first:
+        if self.kept >= _Settings.first:
             self._window.fold(self._set_right(), self.kept)
         belief = ChainBelief.from_covariance(self._parameters, self._filter.change, self._filter.covariance)
         self._go_on_from(belief.with_other_tool(tolerance), fitted=False)
@@ -359,10 +354,10 @@ class RecursiveRigidLearner(Model):
         if self.kept == self._window.size:
             self._window.fold(fit, self.kept // 2)
             self._due = self._window.size
-        elif self._window.finds_noise and fit.freedom + self._window.noise.coordinates < _SETTINGS.sure_freedom:
+        elif self._window.finds_noise and fit.freedom + self._window.noise.coordinates < _Settings.sure_freedom:
             self._due = self.kept + 1
         else:
-            self._due = min(math.ceil(_SETTINGS.growth * self.kept), self._window.size)
+            self._due = min(math.ceil(_Settings.growth * self.kept), self._window.size)
 
     def _set_right(self) -> RigidFit:
         """Set the filter to a fit of the kept pairs, and return the fit."""
@@ -378,4 +373,4 @@ class RecursiveRigidLearner(Model):
         self._filter.go_on_from(belief, fitted=fitted)
         self._window.begin_with(belief)
         self._widest = None
-        self._due = _SETTINGS.first
+        self._due = _Settings.first

@@ -17,7 +17,6 @@ from kbmaps.robust import ROUNDING_M
 from kbmaps.rotations import cross_matrix
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the search for a chain."""
 
@@ -33,9 +32,6 @@ class _Settings:
     stalled_steps: int = 8
     # A start whose residual is below this multiple of the noise has found the chain.
     explained: float = 1.2
-
-
-_SETTINGS = _Settings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,9 +121,9 @@ class Descents:
         pairs = self._x.shape[1]
         reached = self._reach(arms)
         gram, slope = self._normal(arms, reached)
-        damping, squares = np.full(count, _SETTINGS.first_damping), reached.squares.copy()
+        damping, squares = np.full(count, _Settings.first_damping), reached.squares.copy()
         stalled, steps = np.zeros(count, dtype=np.intp), np.zeros(count, dtype=np.intp)
-        active = np.flatnonzero(squares > pairs * _SETTINGS.exact_m**2)
+        active = np.flatnonzero(squares > pairs * _Settings.exact_m**2)
         while len(active):
             change = self._step(gram[active], slope[active], damping[active])
             tried = arms[active].changed(change)
@@ -137,15 +133,15 @@ class Descents:
             if len(taken):
                 arms.axes[taken], arms.points[taken] = tried.axes[better], tried.points[better]
                 last, squares[taken] = squares[taken], reached.squares[better]
-                stalled[taken] = np.where(squares[taken] > (1.0 - _SETTINGS.stalled) * last, stalled[taken] + 1, 0)
-                damping[taken] = np.maximum(0.2 * damping[taken], _SETTINGS.least_damping)
+                stalled[taken] = np.where(squares[taken] > (1.0 - _Settings.stalled) * last, stalled[taken] + 1, 0)
+                damping[taken] = np.maximum(0.2 * damping[taken], _Settings.least_damping)
                 steps[taken] += 1
                 gram[taken], slope[taken] = self._normal(arms[taken], reached[better])
-            damping[failed] = np.maximum(4.0 * damping[failed], _SETTINGS.least_raised_damping)
+            damping[failed] = np.maximum(4.0 * damping[failed], _Settings.least_raised_damping)
             ended = (
-                (stalled >= _SETTINGS.stalled_steps) | (steps >= _SETTINGS.steps) | (damping > _SETTINGS.most_damping)
+                (stalled >= _Settings.stalled_steps) | (steps >= _Settings.steps) | (damping > _Settings.most_damping)
             )
-            ended |= squares <= pairs * _SETTINGS.exact_m**2
+            ended |= squares <= pairs * _Settings.exact_m**2
             if (squares[ended] <= pairs * enough**2).any():
                 break
             active = active[~ended[active]]
@@ -274,7 +270,7 @@ def find_chain(
     size = float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).mean())
     if not size > ROUNDING_M:
         raise DegenerateDataError("all positions lie in one place; record pairs that spread out")
-    enough = max(ROUNDING_M, _SETTINGS.explained * (sigma or 0.0) * math.sqrt(max(3.0 - unknowns / len(angles), 0.0)))
+    enough = max(ROUNDING_M, _Settings.explained * (sigma or 0.0) * math.sqrt(max(3.0 - unknowns / len(angles), 0.0)))
     return _best_of(angles, positions, slides, size, rng, starts, enough)
 
 

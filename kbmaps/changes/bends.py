@@ -15,7 +15,6 @@ from kbmaps.changes.kinds import log_ratios
 from kbmaps.robust import CLIPPED_SIGMAS
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the model of bends."""
 
@@ -40,10 +39,8 @@ class _Settings:
     least: float = 1e-6
 
 
-_SETTINGS = _Settings()
-
 # Log evidence of other pairs about bends of each length, without any such pairs.
-NOTHING_SEEN = (0.0,) * len(_SETTINGS.lengths)
+NOTHING_SEEN = (0.0,) * len(_Settings.lengths)
 # 1-sigma that stands for an absent error.
 _NONE = 1e-3
 
@@ -107,7 +104,7 @@ class Runs:
         on_circles = np.concatenate([np.cos(self.angles), np.sin(self.angles)], axis=1)
         alike, lengths = on_circles @ on_circles.T - self.angles.shape[1], self.lengths
         found = list[tuple[FloatArray, FloatArray]]()
-        for length in _SETTINGS.lengths:
+        for length in _Settings.lengths:
             kernel = np.exp(alike / length**2)
             summed = np.add.reduceat(np.add.reduceat(kernel, self.starts, axis=0), self.starts, axis=1)
             values, axes = np.linalg.eigh(summed / np.sqrt(lengths * lengths[:, None]))
@@ -153,7 +150,7 @@ def log_evidence(runs: Runs) -> list[FloatArray]:
         logs = 1.5 * np.log(weights).sum(axis=1) - 0.5 * runs.within / noises - alone * np.log(noises)
         crossed = sums[:, :known, known:]
         of_length: list[FloatArray] = []
-        for turn in _SETTINGS.turns:
+        for turn in _Settings.turns:
             prior = _prior(runs, k, turn)
             precision = sums[:, :known, :known] + prior[:, None] * np.eye(known)
             left = sums[:, known:, known:] - crossed.transpose(0, 2, 1) @ np.linalg.solve(precision, crossed)
@@ -169,15 +166,15 @@ def probable_bends(runs: Runs, before: Sequence[FloatArray | float]) -> list[Ben
     logs = [now + past + _log_prior(k) for k, (now, past) in enumerate(evidence)]
     total = np.logaddexp.reduce(np.concatenate(logs))
     return [
-        _chosen(runs, k, each - total) for k, each in enumerate(logs) if (each - total > np.log(_SETTINGS.least)).any()
+        _chosen(runs, k, each - total) for k, each in enumerate(logs) if (each - total > np.log(_Settings.least)).any()
     ]
 
 
 def _chosen(runs: Runs, k: int, logs: FloatArray) -> Bends:
     values, axes = runs.axes[k]
-    probable = np.flatnonzero(logs > np.log(_SETTINGS.least))
+    probable = np.flatnonzero(logs > np.log(_Settings.least))
     every = _weights(k, values)[0]
-    weights, priors = every[probable % len(every)], np.concatenate([_prior(runs, k, turn) for turn in _SETTINGS.turns])
+    weights, priors = every[probable % len(every)], np.concatenate([_prior(runs, k, turn) for turn in _Settings.turns])
     turned = np.tensordot(axes.T, runs.rows[..., :-1], axes=1)
     known = np.empty((len(probable), turned.shape[2], turned.shape[0] * 3))
     for h, (prior, weight) in enumerate(zip(priors[probable], weights, strict=True)):
@@ -190,30 +187,30 @@ def _chosen(runs: Runs, k: int, logs: FloatArray) -> Bends:
 def _log_prior(k: int) -> FloatArray:
     """Return the log prior of each hypothesis (h,) of the k-th length, not normalised."""
     sizes, turns = (
-        np.tile(_sizes(k), len(_SETTINGS.turns) * len(_SETTINGS.noises)),
-        np.repeat(_SETTINGS.turns, len(_SETTINGS.noises) * len(_sizes(k))),
+        np.tile(_sizes(k), len(_Settings.turns) * len(_Settings.noises)),
+        np.repeat(_Settings.turns, len(_Settings.noises) * len(_sizes(k))),
     )
     # A bend of size zero has no length: it counts once for each length.
-    shares = np.where(sizes == 0.0, float(len(_SETTINGS.lengths)), 1.0)
-    return np.log(np.where(sizes + turns == 0.0, shares * (len(_SETTINGS.bends) * len(_SETTINGS.turns) - 1.0), shares))
+    shares = np.where(sizes == 0.0, float(len(_Settings.lengths)), 1.0)
+    return np.log(np.where(sizes + turns == 0.0, shares * (len(_Settings.bends) * len(_Settings.turns) - 1.0), shares))
 
 
 def _sizes(k: int) -> FloatArray:
     """Return the sizes of bends of the k-th length."""
-    return np.array(_SETTINGS.bends if k == 0 else _SETTINGS.bends[1:])
+    return np.array(_Settings.bends if k == 0 else _Settings.bends[1:])
 
 
 def _weights(k: int, values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return inverse variances of runs (h, m) for each noise with each size of a bend, and the noises squared (h,)."""
-    noises = np.repeat(np.square(_SETTINGS.noises), len(_sizes(k)))
-    sizes = np.tile(np.square(_sizes(k)), len(_SETTINGS.noises))
+    noises = np.repeat(np.square(_Settings.noises), len(_sizes(k)))
+    sizes = np.tile(np.square(_sizes(k)), len(_Settings.noises))
     return 1.0 / (noises[:, None] * (1.0 + sizes[:, None] * values)), noises
 
 
 def _prior(runs: Runs, k: int, turn: float) -> FloatArray:
     """Return the prior precision (h, p) of the known parameters and joints' own errors, for each noise and bend."""
-    squares = np.tile(np.square(_sizes(k)), len(_SETTINGS.noises)) + turn**2
-    left_open = np.full(len(squares), _SETTINGS.open**2) if runs.fitted else 1.0 + _SETTINGS.taken_along * squares
+    squares = np.tile(np.square(_sizes(k)), len(_Settings.noises)) + turn**2
+    left_open = np.full(len(squares), _Settings.open**2) if runs.fitted else 1.0 + _Settings.taken_along * squares
     known = np.repeat(1.0 / left_open[:, None], runs.known, axis=1)
     own = np.full((len(known), runs.rows.shape[2] - 1 - runs.known), max(turn, _NONE) ** -2.0)
     return np.concatenate([known, own], axis=1)
@@ -226,8 +223,8 @@ def _own_errors(angles: FloatArray, turning: FloatArray) -> FloatArray:
     function I_n.
     """
     columns: list[FloatArray] = []
-    for wave in range(1, _SETTINGS.harmonics + 1):
-        share = 2.0 * float(ive(wave, _SETTINGS.own_length**-2.0))
+    for wave in range(1, _Settings.harmonics + 1):
+        share = 2.0 * float(ive(wave, _Settings.own_length**-2.0))
         for of_angle in (np.cos, np.sin):
             columns.append(np.sqrt(share) * of_angle(wave * angles)[:, None] * turning)
     return np.concatenate(columns, axis=2)

@@ -17,7 +17,6 @@ from kbmaps.changes.white_noise import SharedNoise, inverse_roots
 from kbmaps.robust import CLIPPED_SIGMAS
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the detector of changes."""
 
@@ -37,9 +36,6 @@ class _Settings:
     look_closely: float = 4.0
 
 
-_SETTINGS = _Settings()
-
-
 class Onsets:
     """Sums over all pairs, and their values before each onset that is kept.
 
@@ -51,12 +47,12 @@ class Onsets:
     def __init__(self, known: int, changes: int) -> None:
         self._crossed, self._information = np.zeros((known, changes)), np.zeros((changes, changes))
         self._score = np.zeros(changes)
-        self._crossed_before = np.zeros((_SETTINGS.slots, known, changes))
-        self._information_before = np.zeros((_SETTINGS.slots, changes, changes))
-        self._score_before = np.zeros((_SETTINGS.slots, changes))
-        self._onset = np.zeros(_SETTINGS.slots, dtype=np.intp)
+        self._crossed_before = np.zeros((_Settings.slots, known, changes))
+        self._information_before = np.zeros((_Settings.slots, changes, changes))
+        self._score_before = np.zeros((_Settings.slots, changes))
+        self._onset = np.zeros(_Settings.slots, dtype=np.intp)
         self._slots: list[int] = []
-        self._free = list(range(_SETTINGS.slots))
+        self._free = list(range(_Settings.slots))
         self.pairs = 0
 
     @property
@@ -92,7 +88,7 @@ class Onsets:
         """Drop the newest onset, except the first, whose neighbours are near enough to each other for their age."""
         for k in range(len(self._slots) - 2, 0, -1):
             before, after = self._onset[self._slots[k - 1]], self._onset[self._slots[k + 1]]
-            if after - before <= _SETTINGS.spacing * (self.pairs - after):
+            if after - before <= _Settings.spacing * (self.pairs - after):
                 self._free.append(self._slots.pop(k))
                 return
         if not self._free:
@@ -183,7 +179,7 @@ class ChangeDetector:
         # A root of the covariance: the difference of two covariances would lose all digits after thousands of pairs.
         self._posterior_root, self._mean = np.eye(known), np.zeros(known)
         self._onsets = Onsets(known, len(self._columns))
-        self._differences: deque[float] = deque(maxlen=_SETTINGS.recent)
+        self._differences: deque[float] = deque(maxlen=_Settings.recent)
         self._surprises: deque[FloatArray] = deque(maxlen=MOST_SURPRISES)
         self._rows: deque[tuple[FloatArray, FloatArray, FloatArray, FloatArray]] = deque(maxlen=MOST_PAIRS)
         self._strange, self._looked_at, self._log_odds = False, 0, -math.inf
@@ -193,7 +189,7 @@ class ChangeDetector:
     @staticmethod
     def log_limit(pairs_between_false_alarms: float) -> float:
         """Return the log odds above which there is an alarm."""
-        return math.log(_SETTINGS.overshoot * pairs_between_false_alarms)
+        return math.log(_Settings.overshoot * pairs_between_false_alarms)
 
     @property
     def pairs(self) -> int:
@@ -259,7 +255,7 @@ class ChangeDetector:
             self._differences.append(apart)
         self._surprises.append(off * math.sqrt(self._noise.single) / spread)
         error = expected + off
-        self._strange = float(np.linalg.norm(off)) > _SETTINGS.strange_sigmas * spread
+        self._strange = float(np.linalg.norm(off)) > _Settings.strange_sigmas * spread
         self._onsets.add(known.T @ changed, changed.T @ changed, changed.T @ error)
         step = np.linalg.solve(covariance + self._noise.whole * np.eye(3), seen)
         self._mean = self._mean + self._posterior_root @ (off @ step)
@@ -270,8 +266,8 @@ class ChangeDetector:
     @property
     def due(self) -> bool:
         """True if `suspicion` may have grown enough to be worth evaluating."""
-        late = self.pairs - self._looked_at >= _SETTINGS.look_every
-        return self.pairs > self._looked_at and (late or self._strange or self._log_odds > _SETTINGS.look_closely)
+        late = self.pairs - self._looked_at >= _Settings.look_every
+        return self.pairs > self._looked_at and (late or self._strange or self._log_odds > _Settings.look_closely)
 
     def sums(self) -> tuple[IntArray, FloatArray, FloatArray]:
         """Return the information about all possible changes in the pairs since each onset (m,).
@@ -339,7 +335,7 @@ class ChangeDetector:
 
     def _grown_noise(self) -> SharedNoise:
         """Return the noise, or more where the newest pairs scatter more: that is not a change of the arm."""
-        if len(self._differences) < _SETTINGS.recent:
+        if len(self._differences) < _Settings.recent:
             return self._noise
-        chance = 1.0 + _SETTINGS.clearly * math.sqrt(1.0 / _SETTINGS.recent)
+        chance = 1.0 + _Settings.clearly * math.sqrt(1.0 / _Settings.recent)
         return self._noise.times(max(1.0, float(np.mean(self._differences)) / (self._noise.single * chance)))

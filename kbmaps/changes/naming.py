@@ -8,7 +8,7 @@ from typing import cast
 
 import numpy as np
 
-from kbmaps.arrays import FloatArray
+from kbmaps.arrays import FloatArray, evenly_spread
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.changes.kinds import OTHER, SIZES, ChangeKind
 from kbmaps.robust import OUTLIER_SIGMAS
@@ -58,7 +58,7 @@ def explanations(
         noise_m: 1-sigma of a coordinate [m].
         shared: number of neighbours that carry as much information as one independent pair.
     """
-    chosen = np.linspace(0, len(q) - 1, min(len(q), MOST_PAIRS)).round().astype(np.intp)
+    chosen = evenly_spread(len(q), MOST_PAIRS)
     q, x, counted = q[chosen], x[chosen], 1.0 / shared
     sizes = noise_m * np.array(SIZES)
     fits = [_fit(before, kind, q, x, noise_m, counted, float(sizes[-1])) for kind in kinds]

@@ -154,7 +154,6 @@ def _outer(derivatives: FloatArray) -> FloatArray:
     return columns[..., :, None] * columns[..., None, :]
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the estimate of shared noise."""
 
@@ -174,9 +173,6 @@ class _Settings:
     least: float = 1e-12
     # A fit absorbs at most this share of the error that neighbours share.
     most_taken: float = 0.8
-
-
-_SETTINGS = _Settings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,8 +208,8 @@ class SharedNoise:
         Args:
             share: of the variance, due to the model's error.
         """
-        alike = 1.0 + share * np.arange(_SETTINGS.longest_run if share > 0.0 else 1, dtype=np.float64)
-        return cls(alike, 1.0 + share * (_SETTINGS.usually_shared - 1))
+        alike = 1.0 + share * np.arange(_Settings.longest_run if share > 0.0 else 1, dtype=np.float64)
+        return cls(alike, 1.0 + share * (_Settings.usually_shared - 1))
 
     @classmethod
     def repeated(cls, share: float) -> SharedNoise:
@@ -224,7 +220,7 @@ class SharedNoise:
         Args:
             share: of the variance, due to that rounding.
         """
-        alike = 1.0 + share * np.arange(_SETTINGS.usually_shared, dtype=np.float64)
+        alike = 1.0 + share * np.arange(_Settings.usually_shared, dtype=np.float64)
         return cls(alike, float(alike[-1]))
 
     @classmethod
@@ -241,21 +237,21 @@ class SharedNoise:
             used: number of parameters fitted to the residuals.
         """
         n = len(residuals)
-        square = max(float(np.square(residuals).mean()), _SETTINGS.least) * 3 * n / max(3 * n - used, n)
-        kept = _autocovariances(residuals, _SETTINGS.clearly * square * math.sqrt(2.0 / (3.0 * n)))
+        square = max(float(np.square(residuals).mean()), _Settings.least) * 3 * n / max(3 * n - used, n)
+        kept = _autocovariances(residuals, _Settings.clearly * square * math.sqrt(2.0 / (3.0 * n)))
         lengths = np.arange(1, len(kept) + 2)
         shares = np.maximum(1.0 - np.arange(1, len(kept) + 1) / lengths[:, None], 0.0)
         variances = square + 2.0 * shares @ kept
         together = np.maximum(variances / square, 1.0)
         if len(kept):
             # A shared error has fewer independent parts, of which a fit absorbs more: new pairs show more of it.
-            taken = min(used * float(together[-1]) / (3.0 * n), _SETTINGS.most_taken)
+            taken = min(used * float(together[-1]) / (3.0 * n), _Settings.most_taken)
             alone = max(square - max(float(kept[0]), 0.0), 0.0)
             variances = alone + (variances - alone) / (1.0 - taken)
         variances = np.maximum.accumulate(variances * _raised(3.0 * n / together))
         whole = float(variances[-1])
         if len(kept):
-            longer = np.append(variances, np.full(max(_SETTINGS.longest_run - len(variances), 0), whole))
+            longer = np.append(variances, np.full(max(_Settings.longest_run - len(variances), 0), whole))
             variances = np.maximum(longer, square + max(float(kept[0]), 0.0) * np.arange(len(longer)))
         return cls(variances, whole)
 
@@ -276,7 +272,7 @@ def _autocovariances(residuals: FloatArray, chance: float) -> FloatArray:
     May be empty.
     """
     n = len(residuals)
-    longest = min(int(n * _SETTINGS.longest_lag_share), _SETTINGS.longest_lag) // 2 * 2
+    longest = min(int(n * _Settings.longest_lag_share), _Settings.longest_lag) // 2 * 2
     lags = np.array([float(np.vdot(residuals[k:], residuals[:-k])) / (3 * (n - k)) for k in range(1, longest + 1)])
     pairs = lags.reshape(-1, 2).sum(axis=1)
     if not len(pairs) or pairs[0] <= chance:
@@ -287,5 +283,5 @@ def _autocovariances(residuals: FloatArray, chance: float) -> FloatArray:
 
 def _raised(parts: FloatArray) -> FloatArray:
     """Return the factor that raises variances estimated from this many independent parts."""
-    tail = float(ndtr(-_SETTINGS.tail_sigmas))
-    return np.square(stdtrit(np.maximum(parts, 3.0), 1.0 - tail) / _SETTINGS.tail_sigmas)
+    tail = float(ndtr(-_Settings.tail_sigmas))
+    return np.square(stdtrit(np.maximum(parts, 3.0), 1.0 - tail) / _Settings.tail_sigmas)

@@ -79,7 +79,6 @@ class PoseGoal:
         return bool(distance <= self.tolerance and angle <= self.angle_tolerance)
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the inverse kinematics."""
 
@@ -107,9 +106,6 @@ class _Settings:
     candidates: int = 8
 
 
-_SETTINGS = _Settings()
-
-
 @dataclass(frozen=True, eq=False)
 class JointRange:
     """Joint limits lower ≤ q ≤ upper (d,), and the half range of each joint as its scale."""
@@ -119,7 +115,7 @@ class JointRange:
     scale: FloatArray
 
     def step_bounds(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        longest = _SETTINGS.longest_step * self.scale
+        longest = _Settings.longest_step * self.scale
         return np.maximum(self.lower - q, -longest), np.minimum(self.upper - q, longest)
 
 
@@ -143,7 +139,7 @@ class Descent:
 def descend(goal: Goal, start: FloatArray, joints: JointRange, max_steps: int) -> Descent:
     """Run Levenberg–Marquardt on the error, the damping proportional to the error's square (Sugihara 2011)."""
     q = np.clip(start, joints.lower, joints.upper)
-    error, share = goal.error(q), _SETTINGS.first_share
+    error, share = goal.error(q), _Settings.first_share
     none = np.zeros(len(q))
     for step_number in range(max_steps):
         square = float(error @ error)
@@ -153,19 +149,19 @@ def descend(goal: Goal, start: FloatArray, joints: JointRange, max_steps: int) -
         if _is_stuck(jacobian * joints.scale, error, q, joints):
             return Descent(q, error, step_number + 1, True)
         while True:
-            damping = share * square + _SETTINGS.damping_floor_m2
+            damping = share * square + _Settings.damping_floor_m2
             step = bounded_step(jacobian, error, damping, joints.step_bounds(q), none, joints.scale)
             new_q = np.clip(q + step, joints.lower, joints.upper)
             new_error = goal.error(new_q)
             left = error - jacobian @ step
             expected, gained = square - float(left @ left), square - float(new_error @ new_error)
-            if gained > _SETTINGS.least_gain * expected and gained > 0.0:
+            if gained > _Settings.least_gain * expected and gained > 0.0:
                 break
             share *= 8.0
-            if share > _SETTINGS.most_share:
+            if share > _Settings.most_share:
                 return Descent(q, error, step_number + 1, True)
         if gained > 0.75 * expected:
-            share = max(share / 8.0, _SETTINGS.least_share)
+            share = max(share / 8.0, _Settings.least_share)
         elif gained < 0.25 * expected:
             share *= 2.0
         q, error = new_q, new_error
@@ -177,7 +173,7 @@ def _is_stuck(scaled_jacobian: FloatArray, error: FloatArray, q: FloatArray, joi
     pull = scaled_jacobian.T @ error
     forbidden = ((q <= joints.lower) & (pull < 0.0)) | ((q >= joints.upper) & (pull > 0.0))
     reach = np.linalg.norm(scaled_jacobian, axis=0) * float(np.linalg.norm(error))
-    return bool((forbidden | (np.abs(pull) <= _SETTINGS.stuck_cosine * reach)).all())
+    return bool((forbidden | (np.abs(pull) <= _Settings.stuck_cosine * reach)).all())
 
 
 def settle(goal: Goal, reached: Descent, posture: FloatArray, joints: JointRange, max_steps: int) -> Descent:
@@ -189,22 +185,22 @@ def settle(goal: Goal, reached: Descent, posture: FloatArray, joints: JointRange
     q, steps, portion = reached.q, reached.steps, 1.0
     error = reached.error
     far = _square(q - posture, joints)
-    while steps < max_steps and portion > _SETTINGS.least_portion:
+    while steps < max_steps and portion > _Settings.least_portion:
         jacobian = goal.jacobian(q)
-        damping = 1e-10 * float(np.square(jacobian * joints.scale).sum()) + _SETTINGS.damping_floor_m2
+        damping = 1e-10 * float(np.square(jacobian * joints.scale).sum()) + _Settings.damping_floor_m2
         towards = portion * (posture - q)
         step = bounded_step(jacobian, error, damping, joints.step_bounds(q), towards, joints.scale)
-        tried = descend(goal, q + step, joints, min(_SETTINGS.corrections, max_steps - steps))
+        tried = descend(goal, q + step, joints, min(_Settings.corrections, max_steps - steps))
         steps += tried.steps + 1
         new_far = _square(tried.q - posture, joints)
         if not goal.reached(tried.error) or new_far >= far:
             portion *= 0.5
             continue
-        settled = far - new_far <= _SETTINGS.settled * far
+        settled = far - new_far <= _Settings.settled * far
         q, error, far = tried.q, tried.error, new_far
         if settled:
             return Descent(q, error, steps, True)
-    return Descent(q, error, steps, portion <= _SETTINGS.least_portion)
+    return Descent(q, error, steps, portion <= _Settings.least_portion)
 
 
 def _square(way: FloatArray, joints: JointRange) -> float:
@@ -284,11 +280,11 @@ class InverseKinematics:
         upper: ArrayLike,
         *,
         seed: int = 0,
-        samples: int = _SETTINGS.samples,
+        samples: int = _Settings.samples,
         starts: int | None = None,
-        max_steps: int = _SETTINGS.max_steps,
-        tolerance: float = _SETTINGS.tolerance_m,
-        angle_tolerance: float = _SETTINGS.tolerance_rad,
+        max_steps: int = _Settings.max_steps,
+        tolerance: float = _Settings.tolerance_m,
+        angle_tolerance: float = _Settings.tolerance_rad,
     ) -> None:
         if min(samples, 1 if starts is None else starts, max_steps) < 1 or not min(tolerance, angle_tolerance) > 0.0:
             raise SettingError("samples, starts, max_steps and both tolerances must be greater than 0")
@@ -393,11 +389,11 @@ class InverseKinematics:
     def _most_starts(self, goal: PositionGoal | PoseGoal) -> int:
         if self._starts is not None:
             return self._starts
-        return _SETTINGS.pose_starts if isinstance(goal, PoseGoal) else _SETTINGS.starts
+        return _Settings.pose_starts if isinstance(goal, PoseGoal) else _Settings.starts
 
     def _nearest(self, goal: PositionGoal | PoseGoal) -> IntArray:
         """Return indices of the samples nearest to the goal, the nearest first."""
-        count = min(_SETTINGS.candidates * self._most_starts(goal), len(self._samples))
+        count = min(_Settings.candidates * self._most_starts(goal), len(self._samples))
         # Among some thousand points a search tree would not be faster.
         if isinstance(goal, PoseGoal):
             far = self._pose_features(goal.model) - _pose_features(goal.x, goal.rotation, goal.lever)

@@ -57,7 +57,6 @@ class ProductKernel:
 Precision = float | Literal["evidence"] | None
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the fit of a kernel.
 
@@ -73,9 +72,6 @@ class _Settings:
     refinements: int = 200
     progress: float = 0.95
     block: int = 256
-
-
-_SETTINGS = _Settings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +129,7 @@ class KernelFit:
             # pairs support.
             precision = most_evident(
                 lambda tried: self._log_evidence(tried) - 0.5 * math.log1p(tried / mean),
-                _SETTINGS.search_start * mean,
+                _Settings.search_start * mean,
                 low,
                 high,
             )
@@ -165,8 +161,8 @@ class KernelFit:
         weights, scale = self._seen.weights, self._seen.scale
         size = len(scale)
         gram = np.zeros((size, size), order="F")
-        for start in range(0, size, _SETTINGS.block):
-            end = min(start + _SETTINGS.block, size)
+        for start in range(0, size, _Settings.block):
+            end = min(start + _Settings.block, size)
             block = self._kernel.between(weights[:end], weights[start:end])
             gram[:end, start:end] = block * scale[:end, None] * scale[start:end]
         return gram
@@ -218,15 +214,15 @@ class KernelFit:
         Iterated Tikhonov, as `ExactLearner` without λ.
         """
         errors = self._seen.errors
-        ridge = _SETTINGS.vanishing_ridge * self._gram.trace
+        ridge = _Settings.vanishing_ridge * self._gram.trace
         while not self._gram.factorise(ridge):
             ridge *= 10.0
         self._multipliers = self._gram.solve(errors)
         left = math.inf
-        for _ in range(_SETTINGS.refinements):
+        for _ in range(_Settings.refinements):
             remaining = errors - self._times_gram(self._multipliers)
             size = float(np.linalg.norm(remaining))
-            if not size < _SETTINGS.progress * left:
+            if not size < _Settings.progress * left:
                 break
             left = size
             self._multipliers = self._multipliers + self._gram.solve(remaining)
@@ -238,4 +234,4 @@ class KernelFit:
 
 def _parts(weights: FloatArray) -> list[FloatArray]:
     """Return blocks of rows; one empty block if there are no rows."""
-    return [weights[start : start + _SETTINGS.block] for start in range(0, max(len(weights), 1), _SETTINGS.block)]
+    return [weights[start : start + _Settings.block] for start in range(0, max(len(weights), 1), _Settings.block)]

@@ -46,7 +46,11 @@ class KeptPairs:
         return len(self.q)
 
     def checked(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return checked pairs for `add`. Raises ShapeError, NonFiniteError, SettingError."""
+        """Return checked pairs for `add`.
+
+        Raises:
+            ShapeError, NonFiniteError, SettingError: it is no such array.
+        """
         return checked_pairs(q, x, sigma, self.q.shape[1])
 
     def add(self, q: FloatArray, x: FloatArray, sigma: FloatArray, model: Predictor) -> None:
@@ -234,7 +238,11 @@ class KernelLearner(Model):
 
     @property
     def log_evidence(self) -> float | None:
-        """Log marginal likelihood of the pairs; None for the exact solution. Raises DegenerateDataError."""
+        """Log marginal likelihood of the pairs; None for the exact solution.
+
+        Raises:
+            DegenerateDataError: no pair has been learnt.
+        """
         return self._fitted().log_evidence
 
     def predict(self, q: ArrayLike) -> FloatArray:
@@ -262,12 +270,20 @@ class KernelLearner(Model):
 
     @property
     def prior_precision(self) -> float:
-        """λ of the current fit; 0 for the exact one. Raises DegenerateDataError: no pair has been learnt."""
+        """λ of the current fit; 0 for the exact one.
+
+        Raises:
+            DegenerateDataError: no pair has been learnt.
+        """
         return self._fitted().precision
 
     @property
     def prior_std(self) -> float:
-        """Standard deviation of the control points around the prior [m]. Raises DegenerateDataError."""
+        """Standard deviation of the control points around the prior [m].
+
+        Raises:
+            DegenerateDataError: no pair has been learnt.
+        """
         return math.sqrt(self._fitted().prior_variance)
 
     def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:

@@ -289,7 +289,11 @@ def learning_bases(
 
 
 def check_bases(bases: Sequence[JointBasis], prismatic: Sequence[bool]) -> None:
-    """Check bases for joints of these kinds. Raises BasisError: wrong number of bases, or one of the wrong kind."""
+    """Check bases for joints of these kinds.
+
+    Raises:
+        BasisError: wrong number of bases, or one of the wrong kind.
+    """
     if len(bases) != len(prismatic):
         raise BasisError(f"need {len(prismatic)} bases, one a joint; got {len(bases)}")
     for k, (basis, slides) in enumerate(zip(bases, prismatic, strict=True)):
@@ -314,7 +318,11 @@ def describe_bases(bases: Sequence[JointBasis]) -> list[list[Any]]:
 
 
 def parse_bases(value: Any) -> tuple[JointBasis, ...]:
-    """Return the bases from `describe_bases`. Raises ModelFormatError."""
+    """Return the bases from `describe_bases`.
+
+    Raises:
+        ModelFormatError: it does not describe one.
+    """
     if not isinstance(value, list) or not value:
         raise ModelFormatError("the bases are not a list of at least one")
     return tuple(_parse_basis(entry) for entry in cast(list[Any], value))

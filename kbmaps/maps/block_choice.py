@@ -8,7 +8,6 @@ shares none of its errors with the others.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
@@ -20,7 +19,6 @@ from kbmaps.maps.kbmap import POSITION_OUTPUTS, KBMap
 from kbmaps.maps.stack import BasisStack
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the choice by blocks."""
 
@@ -35,8 +33,6 @@ class _Settings:
     smallest_eigenvalue: float = 1e-15
 
 
-_SETTINGS = _Settings()
-
 FEWEST_BLOCKS = 4
 # Along a guided path, pairs this far apart share little of their errors.
 BLOCK_PAIRS = 30
@@ -49,7 +45,7 @@ def follow_a_path(prior: KBMap, q: ArrayLike) -> bool:
     left, right = BasisStack(prior.bases).halves(rows("q", q, len(prior.bases)))
     square = (left * left).sum(axis=1) * (right * right).sum(axis=1)
     inner = (left[:-1] * left[1:]).sum(axis=1) * (right[:-1] * right[1:]).sum(axis=1)
-    return bool(len(inner)) and bool(np.median(inner / np.sqrt(square[:-1] * square[1:])) > _SETTINGS.path_correlation)
+    return bool(len(inner)) and bool(np.median(inner / np.sqrt(square[:-1] * square[1:])) > _Settings.path_correlation)
 
 
 def blockwise_precision(prior: KBMap, q: ArrayLike, x: ArrayLike) -> float:
@@ -69,12 +65,12 @@ def blockwise_precision(prior: KBMap, q: ArrayLike, x: ArrayLike) -> float:
     angles, positions = rows("q", q, len(prior.bases)), rows("x", x, POSITION_OUTPUTS)
     if len(angles) != len(positions):
         raise ShapeError("x", f"({len(angles)}, 3) to go with q", positions.shape)
-    count = min(len(angles) // BLOCK_PAIRS, _SETTINGS.most_blocks)
+    count = min(len(angles) // BLOCK_PAIRS, _Settings.most_blocks)
     if count < FEWEST_BLOCKS:
         return (
-            _SETTINGS.first_precision * float(np.diag(_kernel(prior, angles)).mean())
+            _Settings.first_precision * float(np.diag(_kernel(prior, angles)).mean())
             if len(angles)
-            else _SETTINGS.first_precision
+            else _Settings.first_precision
         )
     runs = [run[:BLOCK_PAIRS] for run in np.array_split(np.arange(len(angles)), count)]
     chosen = np.concatenate(runs)
@@ -105,7 +101,7 @@ def _left_out_errors(kernel: FloatArray, errors: FloatArray, blocks: int, precis
     components = directions.T @ errors
     means = np.full((len(precisions), blocks), math.inf)
     for row, precision in enumerate(precisions):
-        if variances[0] + precision <= _SETTINGS.smallest_eigenvalue * variances[-1]:
+        if variances[0] + precision <= _Settings.smallest_eigenvalue * variances[-1]:
             continue
         inverses = 1.0 / (variances + precision)
         multipliers = parts @ (inverses[:, None] * components)

@@ -13,7 +13,8 @@ from kbmaps.maps.contraction import contracted
 from kbmaps.maps.factor import RowFactor
 from kbmaps.maps.stack import BasisStack
 
-_MOMENT_BLOCK = 256
+# Number of pairs whose weights are formed at once.
+_BLOCK = 512
 # Products w_a w_b of one joint, each pair once; with these factors their norm is that of the full matrix w wᵀ.
 _FIRST, _SECOND = np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2])
 _FACTORS = np.array([1.0, 1.0, 1.0, *[math.sqrt(2.0)] * 3])
@@ -31,8 +32,8 @@ class Moments:
 
     def add(self, q: FloatArray, weights: FloatArray) -> None:
         """Add pairs at q (n, d) of weights (n,)."""
-        for start in range(0, len(q), _MOMENT_BLOCK):
-            part = slice(start, start + _MOMENT_BLOCK)
+        for start in range(0, len(q), _BLOCK):
+            part = slice(start, start + _BLOCK)
             w = self._stack.joint_weights(q[part])
             products = w[:, :, _FIRST] * w[:, :, _SECOND] * _FACTORS
             features = [products[:, k] @ table for k, table in enumerate(self._polynomials)]
@@ -102,10 +103,6 @@ def _kronecker(factors: Sequence[FloatArray]) -> FloatArray:
     return product
 
 
-_BLOCK = 512
-_FIRST_CAPACITY = 256
-
-
 class Design:
     """Matrix A (n, m) with the rows √weight · w(q)ᵀ, and the targets (n, outputs) likewise scaled.
 
@@ -120,7 +117,7 @@ class Design:
         self.outputs = outputs
         self._moments = Moments(bases, self._stack)
         self._in_moments = self._left_moments = 0
-        self._table = np.empty((_FIRST_CAPACITY, self._stack.joints + outputs + 1))
+        self._table = np.empty((_BLOCK, self._stack.joints + outputs + 1))
         self._pairs = 0
 
     def __len__(self) -> int:

@@ -12,7 +12,6 @@ from kbmaps.arrays import FloatArray
 from kbmaps.robust import VARIANCE_FLOOR
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the search for the most evident variance.
 
@@ -30,9 +29,6 @@ class _Settings:
     step: float = math.log(8.0)
     # A vertex nearer than this share of a step is not tried: evidence is flat there, and a try costs a factorisation.
     near: float = 0.1
-
-
-_SETTINGS = _Settings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,13 +70,13 @@ class LinearEvidence:
         mean = (self.unreached + float(np.square(self.along).sum())) / self.count
         if not len(self.eigenvalues):
             return max(mean, VARIANCE_FLOOR)
-        middle, low, high = max(mean, VARIANCE_FLOOR), _SETTINGS.least_share * mean, _SETTINGS.greatest_share * mean
+        middle, low, high = max(mean, VARIANCE_FLOOR), _Settings.least_share * mean, _Settings.greatest_share * mean
         low, high = max(low, VARIANCE_FLOOR), max(high, VARIANCE_FLOOR)
-        for _ in range(_SETTINGS.rounds):
-            grid = np.geomspace(low, high, _SETTINGS.points)
+        for _ in range(_Settings.rounds):
+            grid = np.geomspace(low, high, _Settings.points)
             best = int(self.at(grid).argmax())
             middle = float(grid[best])
-            low, high = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, _SETTINGS.points - 1)])
+            low, high = float(grid[max(best - 1, 0)]), float(grid[min(best + 1, _Settings.points - 1)])
         return middle
 
 
@@ -105,7 +101,7 @@ def most_evident(log_evidence: Callable[[float], float], start: float, low: floa
 
     middle = min(max(math.log(start), lowest), highest)
     while True:
-        below, above = max(middle - _SETTINGS.step, lowest), min(middle + _SETTINGS.step, highest)
+        below, above = max(middle - _Settings.step, lowest), min(middle + _Settings.step, highest)
         for position in (below, above, middle):
             evidence(position)
         best = max((middle, below, above), key=evidence)
@@ -114,7 +110,7 @@ def most_evident(log_evidence: Callable[[float], float], start: float, low: floa
         middle = best
     if below < middle < above:
         vertex = _vertex((below, middle, above), (evidence(below), evidence(middle), evidence(above)))
-        if abs(vertex - middle) > _SETTINGS.near * _SETTINGS.step:
+        if abs(vertex - middle) > _Settings.near * _Settings.step:
             middle = max((middle, vertex), key=evidence)
     return math.exp(middle)
 

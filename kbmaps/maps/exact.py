@@ -22,7 +22,6 @@ from kbmaps.memory import Memory
 from kbmaps.robust import VARIANCE_FLOOR
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the exact least squares."""
 
@@ -38,9 +37,6 @@ class _Settings:
     first_precision: float = 1e-2
 
 
-_SETTINGS = _Settings()
-
-
 def nearest_solution(design: Design, errors: FloatArray) -> FloatArray:
     """Return the smallest change (m, outputs) of the coefficients that explains errors (n, outputs) best.
 
@@ -48,7 +44,7 @@ def nearest_solution(design: Design, errors: FloatArray) -> FloatArray:
     factorisation (corrected seminormal equations, Björck 1987), at a tenth of its cost.
     """
     gram = ShiftedGram(design.gram())
-    if gram.factorise(0.0) and gram.rcond > _SETTINGS.smallest_gram_rcond:
+    if gram.factorise(0.0) and gram.rcond > _Settings.smallest_gram_rcond:
         change = _refined(design, gram, errors)
         if change is not None:
             return change
@@ -68,10 +64,10 @@ def _refined(design: Design, gram: ShiftedGram, errors: FloatArray) -> FloatArra
     left = float(np.linalg.norm(change))
     if left == 0.0:
         return change
-    for done in range(_SETTINGS.refinements):
+    for done in range(_Settings.refinements):
         correction = step(errors - design.times(change))
         size = float(np.linalg.norm(correction))
-        if not size * _SETTINGS.least_gain < left:
+        if not size * _Settings.least_gain < left:
             return change if done else None
         change, left = change + correction, size
     return change
@@ -82,10 +78,10 @@ def _by_rows(design: Design, errors: FloatArray) -> FloatArray:
     if design.overdetermined:
         factor = design.factor(errors)
         rows, targets = factor.rows, factor.targets
-        change = lapack.triangular_solve(rows, targets, _SETTINGS.smallest_rcond)
+        change = lapack.triangular_solve(rows, targets, _Settings.smallest_rcond)
     else:
         rows, targets = design.rows(), errors
-        change = lapack.smallest_solution(rows, targets, _SETTINGS.smallest_rcond)
+        change = lapack.smallest_solution(rows, targets, _Settings.smallest_rcond)
     return _nearest(rows, targets) if change is None else change
 
 
@@ -96,12 +92,12 @@ def _nearest(rows: FloatArray, errors: FloatArray) -> FloatArray:
     corrects the rounding of the pass before. Directions with σ² far below λ stay at the prior.
     """
     gram = ShiftedGram((rows @ rows.T).T)
-    ridge = _SETTINGS.vanishing_ridge * gram.trace
+    ridge = _Settings.vanishing_ridge * gram.trace
     while not gram.factorise(ridge):
         ridge *= 10.0
     change = rows.T @ gram.solve(errors)
     left = float("inf")
-    for _ in range(_SETTINGS.refinements):
+    for _ in range(_Settings.refinements):
         remaining = errors - rows @ change
         size = float(np.linalg.norm(remaining))
         if not size < 0.5 * left:
@@ -203,7 +199,7 @@ class ExactLearner:
         self._pairs = 0
         # Original weights of the kept pairs; the design holds them after forgetting.
         self._told = np.empty(0)
-        self._last_precision = _SETTINGS.first_precision
+        self._last_precision = _Settings.first_precision
         self.rebase(prior)
 
     @property

@@ -187,7 +187,11 @@ class NLMS:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
-        """Return the learner in `data`. Raises ModelFormatError: wrong type of model, or damaged."""
+        """Return the learner in `data`.
+
+        Raises:
+            ModelFormatError: wrong type of model, or damaged.
+        """
         fields, arrays = unpack(data, _KIND)
         with restoring("an NLMS learner"):
             named(fields, "the fields", ("bases", "mu0", "decay", "floor", "pairs"))

@@ -51,7 +51,11 @@ class Forecast:
     motions: tuple[ExpectedError, ...]
 
     def error_after(self, motion: str, pairs: int) -> float:
-        """Return the expected mean error [m]. Raises SettingError: it is not in the forecast."""
+        """Return the expected mean error [m].
+
+        Raises:
+            SettingError: it is not in the forecast.
+        """
         for expected in self.motions:
             if expected.motion == motion and pairs in self.pairs:
                 return expected.errors[self.pairs.index(pairs)]

@@ -20,7 +20,6 @@ _TRIED = 10.0 ** np.arange(0.0, 7.0, 0.5)
 PRICE = 2.0
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the choice of groups.
 
@@ -36,9 +35,6 @@ class _Settings:
     swap_window: float = 8.0
     rounds: int = 40
     settled: float = 0.02
-
-
-_SETTINGS = _Settings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,14 +217,14 @@ class GroupedModel:
             log_odds.append(posterior.log_evidence - whole.log_evidence + PRICE)
             bases.append((rest, posterior, log_odds[-1]))
         for active, posterior, odds in bases:
-            for name in candidates if odds > -_SETTINGS.swap_window else ():
+            for name in candidates if odds > -_Settings.swap_window else ():
                 gain, variance = (0.0, 0.0) if name in self.variances else self._gain(name, active, posterior)
-                if gain > _SETTINGS.least_gain and odds + gain - PRICE > -_SETTINGS.window:
+                if gain > _Settings.least_gain and odds + gain - PRICE > -_Settings.window:
                     more = {**active, name: variance}
                     models.append((more, self.posterior(active=more)))
                     log_odds.append(odds + gain - PRICE)
         best = max(log_odds)
-        kept = [k for k, odds in enumerate(log_odds) if odds > best - _SETTINGS.window]
+        kept = [k for k, odds in enumerate(log_odds) if odds > best - _Settings.window]
         shares = np.exp(np.array([log_odds[k] for k in kept]) - best)
         return self._mixture([models[k] for k in kept], shares / shares.sum())
 
@@ -246,7 +242,7 @@ class GroupedModel:
         rows = np.concatenate([rows, roots[:, None] * (means - mean)])
         return Average(groups, mean, cast(FloatArray, np.linalg.qr(rows, mode="r")).T)
 
-    def settle(self, rounds: int = _SETTINGS.rounds) -> None:
+    def settle(self, rounds: int = _Settings.rounds) -> None:
         """Set the noise and the groups' variances that make the data most probable, by MacKay's fixed point."""
         for _ in range(rounds):
             posterior = self.posterior()
@@ -262,7 +258,7 @@ class GroupedModel:
                 new = max(float(weights @ weights) / max(posterior.used[name], 1e-9), VARIANCE_FLOOR)
                 change = max(change, 0.5 * abs(math.log(new / old)))
                 self.variances[name] = new
-            if change < _SETTINGS.settled:
+            if change < _Settings.settled:
                 return
 
     def _noise_variance(self, square: float, used: float) -> float:

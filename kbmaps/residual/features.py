@@ -24,7 +24,6 @@ CAMERA_GROUPS = ("affine", "quadratic", "cubic")
 SMOOTH_GROUPS = ("one joint", "two joints", "three joints")
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the residual's features."""
 
@@ -38,9 +37,6 @@ class _Settings:
     path_correlation: float = 0.9
     # A camera may be mounted on a head with up to this many joints; the link behind them then has constant gravity.
     most_neck_joints: int = 3
-
-
-_SETTINGS = _Settings()
 
 
 Weights = Mapping[str, FloatArray]
@@ -94,10 +90,10 @@ class ResidualScaling:
     def of(cls, q: FloatArray, x: FloatArray) -> ResidualScaling:
         """Return the scaling of pairs (n, d) [rad, m] and (n, 3) [m], at least one."""
         low, high = q.min(axis=0), q.max(axis=0)
-        half = np.maximum(0.5 * (high - low), _SETTINGS.least_range)
+        half = np.maximum(0.5 * (high - low), _Settings.least_range)
         centre = x.mean(axis=0)
         spread = math.sqrt(float(np.square(x - centre).mean()))
-        return cls(0.5 * (low + high), half, centre, max(spread, _SETTINGS.least_range))
+        return cls(0.5 * (low + high), half, centre, max(spread, _Settings.least_range))
 
     @classmethod
     def whole_turns(cls, joints: int) -> ResidualScaling:
@@ -124,7 +120,7 @@ class ResidualFeatures:
         low, high = scaling.middle - scaling.half, scaling.middle + scaling.half
         self._stack = BasisStack(learning_bases(low, high, self._prismatic.tolist(), 1.0))
         self._products = {name: _products(self._prismatic, order + 1) for order, name in enumerate(SMOOTH_GROUPS)}
-        still = range(min(_SETTINGS.most_neck_joints, self.joints - 2) + 1)
+        still = range(min(_Settings.most_neck_joints, self.joints - 2) + 1)
         self._still = {f"{COMPLIANCE} behind joint {k}" if k else COMPLIANCE: k for k in still}
         self._loads = {group: self._load_mask(k) for group, k in self._still.items()}
 
@@ -139,7 +135,7 @@ class ResidualFeatures:
     def groups(self) -> tuple[str, ...]:
         """Return the groups available for this arm."""
         names = (*READING_GROUPS, *self._still, *CAMERA_GROUPS, *SMOOTH_GROUPS)
-        return tuple(group for group in names if 0 < self.size(group) <= _SETTINGS.most_features)
+        return tuple(group for group in names if 0 < self.size(group) <= _Settings.most_features)
 
     def approximate(self, groups: Iterable[str]) -> tuple[str, ...]:
         """Return the groups whose law is an engineering approximation instead of geometry."""
@@ -153,7 +149,7 @@ class ResidualFeatures:
         weights = self._stack.joint_weights(q)
         inner, square = np.einsum("nkm,nkm->nk", weights[:-1], weights[1:]), np.square(weights).sum(axis=2)
         shared = (inner / np.sqrt(square[:-1] * square[1:])).prod(axis=1)
-        return bool(len(shared)) and bool(np.median(shared) > _SETTINGS.path_correlation)
+        return bool(len(shared)) and bool(np.median(shared) > _Settings.path_correlation)
 
     def positions(self, chain: RigidChain, weights: Weights, q: FloatArray) -> FloatArray:
         """Return positions (n, 3) [m] at q (n, d)."""
@@ -265,14 +261,14 @@ class ResidualFeatures:
 
     def _places(self, points: FloatArray) -> FloatArray:
         """Return the places of each joint's loads (n, d or 1, loads, 3), from the frames' origins (n, d+1, 3)."""
-        if self.joints <= _SETTINGS.joints_with_own_loads:
+        if self.joints <= _Settings.joints_with_own_loads:
             return points[:, None, 1:]
         beyond = np.cumsum(points[:, :0:-1], axis=1)[:, ::-1] / np.arange(self.joints, 0, -1)[:, None]
         return np.stack([beyond, np.broadcast_to(points[:, -1:], beyond.shape)], axis=2)
 
     def _load_mask(self, still: int) -> BoolArray:
         """Return True where a load (d, 3 loads) acts on a joint: loads beyond it; none before the fixed link."""
-        if self.joints <= _SETTINGS.joints_with_own_loads:
+        if self.joints <= _Settings.joints_with_own_loads:
             acts = np.triu(np.ones((self.joints, self.joints), dtype=np.bool_))
         else:
             acts = np.ones((self.joints, 2), dtype=np.bool_)

@@ -20,7 +20,6 @@ from kbmaps.residual.model import ResidualModel
 from kbmaps.robust import MEDIAN_NORM, OUTLIER_SIGMAS, ROUNDING_M
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the fit of the residual.
 
@@ -47,9 +46,6 @@ class _Settings:
     misfit_sigmas: float = 3.0
 
 
-_SETTINGS = _Settings()
-
-
 def innovations(series: FloatArray, correlation: float) -> FloatArray:
     """Return a series (n, ...) with first-order autoregressive errors, freed of the correlation with the entry before.
 
@@ -72,14 +68,14 @@ def most_probable(evidence: Callable[[float], float], present: float) -> float:
 
     def at(place: int) -> float:
         if place not in found:
-            found[place] = evidence(_SETTINGS.correlations[place])
+            found[place] = evidence(_Settings.correlations[place])
         return found[place]
 
-    place, last = _SETTINGS.correlations.index(present), len(_SETTINGS.correlations) - 1
+    place, last = _Settings.correlations.index(present), len(_Settings.correlations) - 1
     while True:
         best = max((place, min(place + 1, last), max(place - 1, 0)), key=at)
         if best == place:
-            return _SETTINGS.correlations[place] if at(place) > at(0) + PRICE else 0.0
+            return _Settings.correlations[place] if at(place) > at(0) + PRICE else 0.0
         place = best
 
 
@@ -175,7 +171,7 @@ class _Fitter:
     def _considered(self) -> tuple[str, ...]:
         """Return groups with no more features than coordinates; the largest only if the one before is active."""
         coordinates = 3 * int(self.inliers.sum())
-        if self._on_path and coordinates < _SETTINGS.fewest_on_path:
+        if self._on_path and coordinates < _Settings.fewest_on_path:
             return tuple(self.variances)
         largest, before = SMOOTH_GROUPS[2], SMOOTH_GROUPS[1]
 
@@ -202,9 +198,9 @@ class _Fitter:
         self._judge_pairs(residuals)
         rows = np.flatnonzero(self.inliers)
         if self._on_path:
-            parts = min(max(len(rows) // BLOCK_PAIRS, FEWEST_BLOCKS), _SETTINGS.blocks, len(rows))
+            parts = min(max(len(rows) // BLOCK_PAIRS, FEWEST_BLOCKS), _Settings.blocks, len(rows))
         else:
-            parts = max(len(rows) // _SETTINGS.rows_at_once, 1)
+            parts = max(len(rows) // _Settings.rows_at_once, 1)
         runs = np.array_split(rows, parts)
         if self._on_path and ask_correlation:
             self.shared = self._correlation(runs)
@@ -223,7 +219,7 @@ class _Fitter:
             cast(FloatArray, np.linalg.solve(self._root, away)),
             least_noise=self._least_noise,
             noise=self.noise,
-            noise_before=(seen, _SETTINGS.noise_rows if seen > 0.0 else 0.0),
+            noise_before=(seen, _Settings.noise_rows if seen > 0.0 else 0.0),
             blocks=blocks,
         )
 
@@ -239,7 +235,7 @@ class _Fitter:
         def evidence(correlation: float) -> float:
             model = self._grouped([_moments(*part, correlation) for part in rows], groups)
             model.variances = dict(self.variances)
-            model.settle(_SETTINGS.noise_rounds)
+            model.settle(_Settings.noise_rounds)
             return model.posterior().log_evidence - 1.5 * pairs * math.log1p(-(correlation**2))
 
         return most_probable(evidence, self.shared)
@@ -294,10 +290,10 @@ class _Fitter:
 def fit_residual(prior: ResidualModel, pairs: Pairs, change: FloatArray) -> ResidualFit | None:
     """Fit around the most probable rigid chain, at `change`; return None if nothing supports more than that."""
     fitter = _Fitter(prior, pairs, change)
-    for turn in range(_SETTINGS.rounds):
-        length = fitter.step(turn < _SETTINGS.selections)
+    for turn in range(_Settings.rounds):
+        length = fitter.step(turn < _Settings.selections)
         rigid = not fitter.weights and fitter.shared == 0.0
-        if rigid or (turn >= _SETTINGS.selections - 1 and length < _SETTINGS.small_step):
+        if rigid or (turn >= _Settings.selections - 1 and length < _Settings.small_step):
             break
     average = fitter.average()
     if not fitter.weights and fitter.shared == 0.0:
@@ -322,5 +318,5 @@ def _moments(design: FloatArray, target: FloatArray, correlation: float) -> Mome
 
 def _beyond_chance(noise: float, freedom: float) -> float:
     """Return the given noise, 1, unless the residuals are larger than chance explains."""
-    explained = freedom + _SETTINGS.misfit_sigmas * math.sqrt(2.0 * freedom)
+    explained = freedom + _Settings.misfit_sigmas * math.sqrt(2.0 * freedom)
     return 1.0 if noise**2 * freedom <= explained else noise

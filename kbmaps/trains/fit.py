@@ -12,7 +12,6 @@ from kbmaps.trains.core_prior import CORE_NUMBERS, CorePrior
 from kbmaps.trains.train import apply, prefixes, suffixes
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the damping of a step.
 
@@ -25,9 +24,6 @@ class _Settings:
     largest_damping: float = 1e6
     # A step that gains less than this share of the objective ends the search.
     smallest_gain: float = 1e-6
-
-
-_SETTINGS = _Settings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +103,7 @@ def alternate(problem: TensorProblem, z: FloatArray, sweeps: int) -> FloatArray:
             rows *= scale
             miss = problem.x - ahead - (linear @ apply(maps[k], points[k + 1])[:, :, None])[:, :, 0]
             normal = rows.T @ rows
-            normal[np.diag_indices(CORE_NUMBERS)] += 1.0 + _SETTINGS.smallest_damping * normal.trace()
+            normal[np.diag_indices(CORE_NUMBERS)] += 1.0 + _Settings.smallest_damping * normal.trace()
             factor, _ = lapack.cholesky_lower(np.asfortranarray(normal))
             step = lapack.cholesky_solve(factor, rows.T @ (miss.ravel() * scale[:, 0]) - z[part])
             z[part] += step
@@ -126,7 +122,7 @@ class LevenbergMarquardt:
     two cores) need no further treatment: along them, the step follows the prior alone.
     """
 
-    damping: float = _SETTINGS.first_damping
+    damping: float = _Settings.first_damping
     iterations: int = 0
     converged: bool = field(default=False, init=False)
 
@@ -140,19 +136,19 @@ class LevenbergMarquardt:
             residual = (problem.residuals(z) / problem.std[:, None]).ravel()
             normal, dual = _normal_matrix(jacobian)
             before = value
-            while self.damping <= _SETTINGS.largest_damping:
+            while self.damping <= _Settings.largest_damping:
                 step = _damped_step(jacobian, normal, dual, residual, z, self.damping)
                 trial = np.inf if step is None else problem.objective(z + step)
                 if step is not None and trial < value:
                     z, value = z + step, trial
-                    self.damping = max(0.1 * self.damping, _SETTINGS.smallest_damping)
+                    self.damping = max(0.1 * self.damping, _Settings.smallest_damping)
                     break
                 self.damping *= 10.0
             else:
-                self.damping = _SETTINGS.first_damping
+                self.damping = _Settings.first_damping
                 self.converged = True
                 return z, value
-            if before - value <= _SETTINGS.smallest_gain * before:
+            if before - value <= _Settings.smallest_gain * before:
                 self.converged = True
                 return z, value
         return z, value

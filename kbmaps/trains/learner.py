@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any, Self
 
 import numpy as np
@@ -113,7 +113,6 @@ _FIELDS = ("bases", "settings", "pairs", "waiting", "searches", "length")
 _FITTED = ("z", "sure", "used", "information", "absorbed")
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the learner's searches."""
 
@@ -125,9 +124,6 @@ class _Settings:
     # Multiples of the minimum number of pairs for a train: to start a search, and to stop repeating it.
     pairs_to_search: float = 1.5
     searches_until: float = 1.5
-
-
-_SETTINGS = _Settings()
 
 
 class TensorLearner(Model):
@@ -239,7 +235,7 @@ class TensorLearner(Model):
         """
         sizes = [basis.size for basis in self.bases]
         numbers = 12 * sum(sizes[:-1]) + 3 * sizes[-1] - 12 * (self.joints - 1)
-        return math.ceil(_SETTINGS.pairs_to_search * numbers / 3)
+        return math.ceil(_Settings.pairs_to_search * numbers / 3)
 
     @property
     def train(self) -> TensorTrain:
@@ -275,11 +271,15 @@ class TensorLearner(Model):
         if self.settings.window is not None:
             self._keep(self.settings.window)
         # While pairs are few, a quarter more may change much.
-        if self._waiting >= min(self.settings.refit_every, max(1, self.kept // _SETTINGS.share_before_refit)):
+        if self._waiting >= min(self.settings.refit_every, max(1, self.kept // _Settings.share_before_refit)):
             self.refit()
 
     def forget(self, keep: int) -> None:
-        """Drop all but the last `keep` pairs. The train stays until the next fit. Raises SettingError: keep below 0."""
+        """Drop all but the last `keep` pairs. The train stays until the next fit.
+
+        Raises:
+            SettingError: keep below 0.
+        """
         if keep < 0:
             raise SettingError(f"keep must be at least 0, got {keep}")
         self._keep(keep)
@@ -451,14 +451,14 @@ class TensorLearner(Model):
         before, robust = self._fit, self.settings.robust
         if before is None and not self._searches:
             z = np.zeros(CORE_NUMBERS * self.joints)
-            guess = _SETTINGS.first_noise * math.sqrt(
+            guess = _Settings.first_noise * math.sqrt(
                 float(np.square(data.problem(self._prior, 1.0).residuals(z)).mean())
             )
             return refine(data, self._prior, z, max(guess, data.noise_floor), robust=robust)
-        if before is None or (self._searches and self.kept < _SETTINGS.searches_until * self.pairs_needed):
+        if before is None or (self._searches and self.kept < _Settings.searches_until * self.pairs_needed):
             return search(data, self._prior, self.bases, rng, self.settings.starts, robust=robust)
         fit = refine(data, self._prior, before.z, before.noise, robust=robust)
-        lost = fit.noise > _SETTINGS.lost * max(before.noise, data.noise_floor) or fit.noise > PLAUSIBLE * data.size
+        lost = fit.noise > _Settings.lost * max(before.noise, data.noise_floor) or fit.noise > PLAUSIBLE * data.size
         if self._searches and lost:
             again = search(data, self._prior, self.bases, rng, self.settings.starts, robust=robust)
             fit = min(fit, again, key=lambda candidate: candidate.noise)

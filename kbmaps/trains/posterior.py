@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -21,7 +20,6 @@ from kbmaps.trains.train import TensorTrain
 _STDS = np.geomspace(1e-5, 1e-1, 17)
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the posterior of the cores."""
 
@@ -32,9 +30,6 @@ class _Settings:
     batch_rows: int = 512
     # Assumed error of the last frame's axes, as a share of a marker's displacement.
     frame_error: float = 0.05
-
-
-_SETTINGS = _Settings()
 
 
 def misfit_directions(train: TensorTrain, q: FloatArray) -> FloatArray:
@@ -80,16 +75,16 @@ def likely_misfit(
     values, vectors = np.linalg.eigh(directions.T @ directions - absorbed.T @ absorbed)
     # Directions that the cores absorb up to rounding are not determined; without noise, rounding would look
     # significant.
-    values = np.maximum(values, _SETTINGS.rounding * max(float(values.max(initial=0.0)), 1e-300))
+    values = np.maximum(values, _Settings.rounding * max(float(values.max(initial=0.0)), 1e-300))
     matrix = (vectors * values) @ vectors.T
     pull = directions.T @ residuals
     stds = np.zeros(len(sizes))
-    for _ in range(_SETTINGS.sweeps):
+    for _ in range(_Settings.sweeps):
         for group in range(len(sizes)):
             trials = np.tile(stds, (len(_STDS) + 1, 1))
             trials[:, group] = 0.0, *_STDS
             gains = np.array([_gain(matrix, pull, np.repeat(trial, sizes)) for trial in trials])
-            gains[0] += _SETTINGS.telling
+            gains[0] += _Settings.telling
             stds = trials[int(gains.argmax())]
     return stds
 
@@ -210,8 +205,8 @@ class TensorPosterior:
     def variance(self, q: FloatArray) -> FloatArray:
         """Return the variance (n, 3) [m²] of each coordinate at q (n, d)."""
         variance = np.empty((len(q), 3))
-        for start in range(0, len(q), _SETTINGS.batch_rows):
-            part = slice(start, start + _SETTINGS.batch_rows)
+        for start in range(0, len(q), _Settings.batch_rows):
+            part = slice(start, start + _Settings.batch_rows)
             variance[part] = np.square(self.roots(q[part])).sum(axis=2)
         return variance
 
@@ -251,4 +246,4 @@ def _marker_moves(last_core: FloatArray, std: float) -> FloatArray:
         return free
     along = np.zeros((3, 3, 4, 3))
     along[:, :, 3, :] = std * last_core[:, :, :3]
-    return np.column_stack([along.reshape(CORE_NUMBERS, 3), _SETTINGS.frame_error * free])
+    return np.column_stack([along.reshape(CORE_NUMBERS, 3), _Settings.frame_error * free])

@@ -18,7 +18,6 @@ from kbmaps.trains.fit import LevenbergMarquardt, TensorProblem, alternate
 from kbmaps.trains.train import TensorTrain
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the search for cores."""
 
@@ -42,8 +41,6 @@ class _Settings:
     # With fewer degrees of freedom per pair, residuals cannot separate noise from outliers.
     least_freedom: float = 0.2
 
-
-_SETTINGS = _Settings()
 
 # Failed starts leave a tenth or more of the spread, and may agree on it by chance.
 PLAUSIBLE = 0.1
@@ -77,7 +74,7 @@ class Pairs:
     @property
     def noise_floor(self) -> float:
         """Size below which residuals are rounding [m]."""
-        return _SETTINGS.noise_floor * self.size
+        return _Settings.noise_floor * self.size
 
     def chosen(self, mask: BoolArray) -> Pairs:
         return Pairs(self.weights[mask], self.x[mask], self.sigma[mask])
@@ -131,17 +128,17 @@ def search(
     Ends early when one explains the pairs, or two agree.
     """
     some = pairs
-    if len(pairs.x) > _SETTINGS.search_pairs * len(bases):
+    if len(pairs.x) > _Settings.search_pairs * len(bases):
         mask = np.zeros(len(pairs.x), dtype=np.bool_)
-        mask[rng.permutation(len(pairs.x))[: _SETTINGS.search_pairs * len(bases)]] = True
+        mask[rng.permutation(len(pairs.x))[: _Settings.search_pairs * len(bases)]] = True
         some = pairs.chosen(mask)
     best = _from_a_random_chain(some, prior, bases, rng)
     for _ in range(starts - 1):
-        if best.noise < _SETTINGS.explained * pairs.size:
+        if best.noise < _Settings.explained * pairs.size:
             break
         fit = _from_a_random_chain(some, prior, bases, rng)
         plausible = best.noise < PLAUSIBLE * pairs.size
-        agrees = plausible and abs(fit.noise / best.noise - 1.0) < _SETTINGS.same_noise
+        agrees = plausible and abs(fit.noise / best.noise - 1.0) < _Settings.same_noise
         best = min(best, fit, key=lambda candidate: candidate.noise)
         if agrees:
             break
@@ -149,12 +146,12 @@ def search(
 
 
 def _from_a_random_chain(pairs: Pairs, prior: CorePrior, bases: Sequence[JointBasis], rng: np.random.Generator) -> Fit:
-    noise = _SETTINGS.first_noise * pairs.size
+    noise = _Settings.first_noise * pairs.size
     chain = random_chain(bases, pairs.size / math.sqrt(len(bases)), rng)
     # A small given sigma would make the objective of the first steps rugged.
     problem = TensorProblem(pairs.weights, pairs.x, np.full(len(pairs.x), noise), prior)
-    z = alternate(problem, prior.whitened(TensorTrain.from_chain(chain, bases).cores), _SETTINGS.sweeps)
-    z, _ = LevenbergMarquardt().run(problem, z, _SETTINGS.first_steps)
+    z = alternate(problem, prior.whitened(TensorTrain.from_chain(chain, bases).cores), _Settings.sweeps)
+    z, _ = LevenbergMarquardt().run(problem, z, _Settings.first_steps)
     left = math.sqrt(float(np.square(problem.residuals(z)).mean()))
     if left > PLAUSIBLE * pairs.size:
         # Most failed starts show by now; settling them would take longer than the next start.
@@ -210,16 +207,16 @@ def _settle(pairs: Pairs, prior: CorePrior, z: FloatArray, noise: float) -> Fit:
     """
     optimiser = LevenbergMarquardt()
     used = np.ones(len(pairs.x), dtype=np.bool_)
-    for _ in range(_SETTINGS.rounds):
+    for _ in range(_Settings.rounds):
         problem = pairs.problem(prior, noise)
-        z, _ = optimiser.run(problem, z, _SETTINGS.round_steps)
+        z, _ = optimiser.run(problem, z, _Settings.round_steps)
         if not pairs.unknown.any():
             noise = math.sqrt(float(np.square(pairs.sigma).mean()))
             if optimiser.converged:
                 break
             continue
         found = max(_noise(pairs, problem, z), pairs.noise_floor)
-        steady = abs(found / noise - 1.0) < _SETTINGS.same_noise
+        steady = abs(found / noise - 1.0) < _Settings.same_noise
         noise = found
         if (optimiser.converged and steady) or found == pairs.noise_floor:
             break
@@ -241,28 +238,28 @@ def _distances(pairs: Pairs, prior: CorePrior, fit: Fit) -> tuple[FloatArray, bo
     problem = pairs.problem(prior, fit.noise)
     freedom = 1.0 - effective_parameters(problem, fit.z) / (3.0 * len(pairs.x))
     lengths = np.linalg.norm(problem.residuals(fit.z), axis=1) / problem.std
-    unit = float(np.median(lengths)) / (MEDIAN_NORM * math.sqrt(max(freedom, _SETTINGS.least_freedom)))
+    unit = float(np.median(lengths)) / (MEDIAN_NORM * math.sqrt(max(freedom, _Settings.least_freedom)))
     rounding = fit.noise <= 2.0 * pairs.noise_floor
     least = pairs.noise_floor / fit.noise if pairs.unknown.any() else 1.0
-    return lengths / max(unit, least), freedom >= _SETTINGS.least_freedom and not rounding
+    return lengths / max(unit, least), freedom >= _Settings.least_freedom and not rounding
 
 
 def _good(pairs: Pairs, prior: CorePrior, fit: Fit) -> BoolArray:
     """Return True for each pair (n,) whose distance from the fit is within the noise."""
     lengths, telling = _distances(pairs, prior, fit)
-    return lengths <= _SETTINGS.outlier_distance if telling else np.ones(len(lengths), dtype=np.bool_)
+    return lengths <= _Settings.outlier_distance if telling else np.ones(len(lengths), dtype=np.bool_)
 
 
 def _reweighted(pairs: Pairs, prior: CorePrior, fit: Fit) -> Fit:
     """Return an iteratively reweighted fit with Geman and McClure's weights (1 + r²)⁻²."""
     optimiser = LevenbergMarquardt()
     z = fit.z
-    for _ in range(_SETTINGS.rounds):
+    for _ in range(_Settings.rounds):
         lengths, _ = _distances(pairs, prior, replace(fit, z=z))
-        trust = 1.0 / np.square(1.0 + np.square(lengths / _SETTINGS.weight_scale))
+        trust = 1.0 / np.square(1.0 + np.square(lengths / _Settings.weight_scale))
         problem = pairs.problem(prior, fit.noise, trust)
-        z, _ = optimiser.run(problem, z, _SETTINGS.round_steps)
+        z, _ = optimiser.run(problem, z, _Settings.round_steps)
         moved = float(np.abs(_distances(pairs, prior, replace(fit, z=z))[0] - lengths).max())
-        if optimiser.converged and moved < _SETTINGS.same_lengths:
+        if optimiser.converged and moved < _Settings.same_lengths:
             break
     return replace(fit, z=z)

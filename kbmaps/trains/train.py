@@ -225,7 +225,11 @@ class TensorSettings:
 
 
 def parse_settings(value: Any) -> TensorSettings:
-    """Return the settings from `dataclasses.asdict`. Raises ModelFormatError, SettingError."""
+    """Return the settings from `dataclasses.asdict`.
+
+    Raises:
+        ModelFormatError, SettingError: it does not describe one.
+    """
     stored = named(value, "the settings", [field.name for field in fields(TensorSettings)])
     whole = {name: count(stored[name], f"the setting {name}") for name in ("refit_every", "starts", "seed")}
     window = None if stored["window"] is None else count(stored["window"], "the setting window")

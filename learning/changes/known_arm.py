@@ -59,7 +59,6 @@ class KnownArm:
         return KnownArm(self.chain.widened(columns, std), self.tolerances, residual)
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the adaptation to a change."""
 
@@ -74,9 +73,6 @@ class _Settings:
     clipped: float = 5.0
     # Minimum number of pairs before the change that update the previous posterior.
     fewest_before: int = 10
-
-
-_SETTINGS = _Settings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +103,7 @@ class Origin:
         quiet = [k for k in range(min(noticed.earliest, noticed.first)) if noticed.kept[k]]
         q, x = noticed.q[quiet], noticed.x[quiet]
         wide = self._reference.wide
-        if len(quiet) >= _SETTINGS.fewest_before:
+        if len(quiet) >= _Settings.fewest_before:
             wide = fitted_belief(wide, q, self._of_chain(q, x))
         self._before = arm.updated(wide, self._reference.residual)
 
@@ -143,10 +139,10 @@ class Origin:
         Runs of q (n, d) [rad] and x (n, 3) [m], n at least 2, are left out in turn.
         """
         arm, y = self._forgetful(found), self._of_chain(q, x)
-        limit = _SETTINGS.clipped * self._noticed.noise_m
+        limit = _Settings.clipped * self._noticed.noise_m
         old = np.minimum(np.linalg.norm(y - self._reference.belief.predict(q), axis=1), limit)
         new = np.empty(len(q))
-        for left_out in np.array_split(np.arange(len(q)), min(_SETTINGS.folds, len(q))):
+        for left_out in np.array_split(np.arange(len(q)), min(_Settings.folds, len(q))):
             others = np.setdiff1d(np.arange(len(q)), left_out)
             belief = fitted_belief(arm.chain, q[others], y[others])
             new[left_out] = np.minimum(np.linalg.norm(y[left_out] - belief.predict(q[left_out]), axis=1), limit)
@@ -159,7 +155,7 @@ class Origin:
     def _forgetful(self, found: Sequence[Explanation]) -> KnownArm:
         arm = self._before
         kinds = (
-            found[:1] if found[0].probability >= NAMED else [e for e in found if e.probability >= _SETTINGS.improbable]
+            found[:1] if found[0].probability >= NAMED else [e for e in found if e.probability >= _Settings.improbable]
         )
         for each in kinds:
             if each.kind.name == TOOL:
@@ -170,5 +166,5 @@ class Origin:
 
     def _widths(self, kind: ChangeKind, change: FloatArray) -> FloatArray:
         moves = change / kind.units
-        size = _SETTINGS.wider * float(np.sqrt(np.square(moves).mean()))
-        return kind.units * min(max(size, _SETTINGS.least_noises * self._noticed.noise_m), OTHER_TOOL_M)
+        size = _Settings.wider * float(np.sqrt(np.square(moves).mean()))
+        return kind.units * min(max(size, _Settings.least_noises * self._noticed.noise_m), OTHER_TOOL_M)

@@ -18,7 +18,6 @@ from kbmaps.changes.detector import MOST_SURPRISES
 from kbmaps.changes.white_noise import inverse_roots
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the monitor of changes."""
 
@@ -33,8 +32,6 @@ class _Settings:
     # Lower bound of a measurement's noise, whatever it claims [m].
     smallest_m: float = 1e-6
 
-
-_SETTINGS = _Settings()
 
 # If no newer model comes, the older half of this many pairs is dropped.
 MOST_WATCHED = 5000
@@ -93,7 +90,7 @@ class Reference:
         """
         more = np.maximum((white - claimed).diagonal(axis1=1, axis2=2), 0.0)
         missed = np.maximum(self.claim.beyond_chain(q) - more, 0.0)
-        return white + np.eye(3) * np.maximum(missed, _SETTINGS.smallest_m**2)[:, None, :]
+        return white + np.eye(3) * np.maximum(missed, _Settings.smallest_m**2)[:, None, :]
 
     def noise(self, covariances: FloatArray, white: FloatArray) -> SharedNoise:
         """Return the noise of the reference's whitened errors at pairs that it was fitted to.
@@ -226,7 +223,7 @@ class ChangeMonitor:
 
     def offer(self, reference: Reference) -> None:
         """Offer a model of the pairs up to the last `asked`."""
-        if reference.known < _SETTINGS.fewest_known or not self.wants_reference:
+        if reference.known < _Settings.fewest_known or not self.wants_reference:
             return
         self._next, self._next_at = reference, self._asked_at
 
@@ -348,7 +345,7 @@ class ChangeMonitor:
         noise_m = float(np.sqrt(noise.single * _traces(covariances).mean() / 3.0))
         distance_m = float(np.linalg.norm(reference.x, axis=1).mean())
         self._detector = ChangeDetector(reference.belief, noise, noise_m, distance_m)
-        if float(np.square(reference.beyond_chain(q)).mean()) < (_SETTINGS.alone * noise_m) ** 2:
+        if float(np.square(reference.beyond_chain(q)).mean()) < (_Settings.alone * noise_m) ** 2:
             # Terms that another model learnt from these pairs would hide the arm's bends.
             self._detector.recall(q, reference.x - reference.belief.predict(q), covariances)
         self._change, self._look_at = None, 0
@@ -385,4 +382,4 @@ def _traces(covariances: FloatArray) -> FloatArray:
 
 
 def _trial(known: int) -> int:
-    return min(max(known // 2, _SETTINGS.shortest_trial), _SETTINGS.longest_trial)
+    return min(max(known // 2, _Settings.shortest_trial), _Settings.longest_trial)

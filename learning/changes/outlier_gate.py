@@ -22,7 +22,6 @@ CHANGE = 6
 # multiple of the expected ones, and at most this share of those from the prediction.
 FEWEST_FOR_CHANGE = 3
 TOGETHER = 2.0
-LEFT_OVER = 0.2
 
 
 class OutlierGate:
@@ -84,7 +83,7 @@ def sound(distances_m: FloatArray, noise_m: float) -> NDArray[np.bool_]:
 def explained(before_m: FloatArray, after_m: FloatArray, expected_m: float) -> bool:
     """Return True if an explanation reduces a run's distances from `before_m` (n,) [m] to `after_m` (n,) [m]."""
     before, after = (float(np.sqrt(np.square(distances).mean())) for distances in (before_m, after_m))
-    return after <= min(TOGETHER * expected_m, LEFT_OVER * before)
+    return after <= min(TOGETHER * expected_m, before / DOUBT)
 
 
 def limits_m(inside_m: FloatArray, open_m: FloatArray) -> FloatArray:

@@ -20,13 +20,15 @@ from kbmaps import (
     fitted_orientation,
     rotation_matrices,
 )
+from kbmaps.arrays import evenly_spread
 
 # Number of the newest pairs that exact maps are fitted to, which bounds time and memory. Measured where a chain misses
 # 10 mm (docs/results/learning.md).
 WINDOW = 20_000
 # Number of the newest pairs kept as pairs, and of those that a chain is fitted to, evenly spread.
 KEPT, FITTED = 4000, 1000
-# Growth of the number of pairs before the next solution, with a new search for the maps' precision.
+# Growth of the number of pairs before the next solution, with a new search for the maps' precision; the chain with
+# residual waits for it too, since it takes up to a second.
 GROWTH = 1.15
 # Minimum number of orientations for a map: with fewer, the chain suffices.
 FEWEST_FOR_MAP = 30
@@ -83,7 +85,7 @@ class OrientationSolver:
     def solve(self, belief: ChainBelief) -> OrientationSolution:
         """Return the solution around the posterior of the chain; at least one orientation is required."""
         self._solved_at = self._pairs
-        chosen = np.linspace(0, len(self._q) - 1, min(len(self._q), FITTED)).round().astype(np.intp)
+        chosen = evenly_spread(len(self._q), FITTED)
         chain = fitted_orientation(belief, self._q[chosen], self._turns[chosen])
         if not self._with_map or self._pairs < FEWEST_FOR_MAP:
             return OrientationSolution(self._pairs, chain)

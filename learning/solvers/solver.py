@@ -12,7 +12,7 @@ import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.model_bank import EXACT, RESIDUAL, RIGID, LearntModel
-from bodyschema.learning.solvers.orientation import KEPT, WINDOW, OrientationSolution, OrientationSolver
+from bodyschema.learning.solvers.orientation import GROWTH, KEPT, WINDOW, OrientationSolution, OrientationSolver
 from bodyschema.learning.solvers.tolerance_selection import Tolerances, best_tolerances, workmanship
 from kbmaps import (
     ChainBelief,
@@ -29,6 +29,7 @@ from kbmaps import (
     follow_a_path,
     shared_by,
 )
+from kbmaps.arrays import evenly_spread
 
 log = logging.getLogger(__name__)
 
@@ -36,7 +37,6 @@ log = logging.getLogger(__name__)
 LARGEST_NET = 2187
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the solver."""
 
@@ -44,8 +44,6 @@ class _Settings:
     retune: float = 1.25
     # Number of pairs that a chain is fitted to, evenly spread.
     fitted: int = 2000
-    # The chain with residual takes longest, up to a second: it waits for this growth of the number of pairs.
-    residual_growth: float = 1.15
     # With this growth of the number of pairs, this share of them is solved for first, if it is at least this many.
     first_growth: float = 1.5
     first_share: float = 0.75
@@ -56,10 +54,8 @@ class _Settings:
     growth: float = 0.1
 
 
-_SETTINGS = _Settings()
-
 # The information about the chain of pairs older than those kept is folded into its prior, this many at a time.
-FOLDED = 2000
+FOLDED = _Settings.fitted
 
 
 @dataclass(frozen=True)
@@ -188,12 +184,12 @@ class DirectSolver:
     def solutions(self) -> Iterator[Solved]:
         """Yield each model's solution as it is found, the rigid chain first: it is the quickest."""
         task = self._started
-        if self._pairs >= _SETTINGS.first_growth * self._solved_at:
+        if self._pairs >= _Settings.first_growth * self._solved_at:
             yield from self._solved_of_some(task)
         self._solved_at = self._pairs
         wide = fitted_belief(self._before, self._q, self._x)
         made = _ways_made(wide, task)
-        residual_due = self._pairs >= _SETTINGS.residual_growth * self._residual_at
+        residual_due = self._pairs >= GROWTH * self._residual_at
         turns = self._orientations if self._orientations is not None and self._orientations.due else None
         rigid = _solved_chain(task, self._pairs, wide, made)
         yield replace(rigid, last=self._exact is None and not residual_due and turns is None)
@@ -213,8 +209,8 @@ class DirectSolver:
 
     def _solved_of_some(self, task: Task) -> Iterator[Solved]:
         """Yield the chain fitted to the first pairs only, so that the remaining pairs can test it."""
-        some = int(len(self._q) * _SETTINGS.first_share)
-        if some >= _SETTINGS.fewest_first:
+        some = int(len(self._q) * _Settings.first_share)
+        if some >= _Settings.fewest_first:
             wide = fitted_belief(self._before, self._q[:some], self._x[:some])
             pairs = self._pairs - len(self._q) + some
             yield replace(_solved_chain(task, pairs, wide, _ways_made(wide, task)), last=False)
@@ -225,7 +221,7 @@ class DirectSolver:
         The evidence finds the prior's precision if pairs are apart. On a guided path, neighbours share their errors,
         which the evidence would take for shape: there, left-out blocks choose it.
         """
-        retune = self._precision is None or learner.pairs >= _SETTINGS.retune * self._tuned_at
+        retune = self._precision is None or learner.pairs >= _Settings.retune * self._tuned_at
         try:
             solution = learner.solve(self._sought_precision(learner.prior) if retune else self._precision)
         except SettingError:
@@ -284,7 +280,7 @@ def fitted_belief(prior: ChainBelief, q: FloatArray, x: FloatArray) -> ChainBeli
     learner.learn(q, x)
     inliers = learner.inliers
     shared = shared_by(x[inliers] - learner.predict(q[inliers]))
-    if shared < _SETTINGS.shared:
+    if shared < _Settings.shared:
         return learner.belief
     again = RigidLearner(prior.parameters.reference, ChainTolerances(), prior)
     again.learn(q[inliers], x[inliers], learner.scatter.noise * math.sqrt(shared))
@@ -309,7 +305,7 @@ def fitted_residual(prior: ChainBelief | ResidualModel, q: FloatArray, x: FloatA
 
 def _spread(q: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return at most `fitted` of the pairs, evenly spread."""
-    chosen = np.linspace(0, len(q) - 1, min(len(q), _SETTINGS.fitted)).round().astype(np.intp)
+    chosen = evenly_spread(len(q), _Settings.fitted)
     return q[chosen], x[chosen]
 
 
@@ -318,6 +314,10 @@ class SolverClient:
 
     Nothing is sent while the solver works: in a process of its own it does not read meanwhile, and the thread would
     block on the send.
+
+    Attributes:
+        fed: number of pairs of the current task that the solver has.
+        busy: true if it was asked and has not answered.
     """
 
     def __init__(self, solver: Solver, solve_every: int) -> None:
@@ -325,45 +325,35 @@ class SolverClient:
         self.restart()
 
     @property
-    def fed(self) -> int:
-        """Number of pairs of the current task that the solver has."""
-        return self._fed
-
-    @property
-    def busy(self) -> bool:
-        """True if it was asked and has not answered."""
-        return self._busy
-
-    @property
     def due(self) -> bool:
         """True if it is time to ask."""
-        enough = min(self._every, max(_SETTINGS.growth * self._solved_at, 1.0))
-        return self._fed > 0 and (self._soon or self._fed - self._solved_at >= enough)
+        enough = min(self._every, max(_Settings.growth * self._solved_at, 1.0))
+        return self.fed > 0 and (self._soon or self.fed - self._solved_at >= enough)
 
     def works_on(self, task: int) -> bool:
         """Return True if it has pairs of this task, and of no other since."""
-        return self._task == task and self._fed > 0
+        return self._task == task and self.fed > 0
 
     def has_solved(self, task: int, pairs: int) -> bool:
         """Return True if this many pairs of the task were given, asked for and answered."""
-        return self._task == task and not self._busy and self._fed == self._solved_at == pairs
+        return self._task == task and not self.busy and self.fed == self._solved_at == pairs
 
     def restart(self) -> None:
         """Reset after the solver has lost everything."""
         self._task: int | None = None
-        self._fed = self._solved_at = 0
-        self._busy = self._soon = False
+        self.fed = self._solved_at = 0
+        self.busy = self._soon = False
 
     def solve_soon(self) -> None:
         """Request a solution although fewer pairs than usual are new."""
-        self._soon = self._soon or self._fed > self._solved_at or self._task is None
+        self._soon = self._soon or self.fed > self._solved_at or self._task is None
 
     def begin(self, task: Task) -> bool:
         """Start a new task on the solver; return False if it already has this one."""
         if task.number == self._task:
             return False
         self._solver.start(task)
-        self._fed = self._solved_at = 0
+        self.fed = self._solved_at = 0
         self._task = task.number
         return True
 
@@ -377,16 +367,16 @@ class SolverClient:
             turns: their orientations, quaternions (n, 4), NaN where a pair has none; None where no pair has any.
         """
         self._solver.learn(q, x, turns)
-        self._fed = fed
+        self.fed = fed
 
     def ask(self) -> None:
         """Request the solutions of all pairs so far."""
         self._solver.solve()
-        self._busy, self._soon, self._solved_at = True, False, self._fed
+        self.busy, self._soon, self._solved_at = True, False, self.fed
 
     def poll(self) -> Solved | None:
         """Return the next answer if there is one, without waiting."""
         solved = self._solver.poll()
         if solved is not None:
-            self._busy = not solved.last
+            self.busy = not solved.last
         return solved

@@ -369,7 +369,11 @@ class PairStore:
             connection.execute(store_schema.INSERT["devices"], sealed(told))
 
     def go_on_with(self, session: Session) -> None:
-        """Use this session from the next pair on. Raises StoreError: the disk is full or broken."""
+        """Use this session from the next pair on.
+
+        Raises:
+            StoreError: the disk is full or broken.
+        """
         connection = self._require_open()
         self._session = session
         with explained(self.file):

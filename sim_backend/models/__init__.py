@@ -12,7 +12,8 @@ from bodyschema.robot.suggest import did_you_mean
 def model_file(name: str) -> Path:
     """Return the path of robot.toml of the shipped model `name` (`upper_body`).
 
-    Raise ConfigError if there is no such model.
+    Raises:
+        ConfigError: there is no such model.
     """
     folder = Path(str(files(__name__)))
     known = sorted(file.parent.name for file in folder.glob("*/robot.toml"))

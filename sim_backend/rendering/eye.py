@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from colorsys import rgb_to_hsv
-from dataclasses import dataclass
 
 import cv2
 import msgspec
@@ -18,7 +17,6 @@ from bodyschema.sim_backend.randomness import Stream, generator
 from bodyschema.sim_backend.rendering.raster import EmptyWorld, Grid, Raster
 
 
-@dataclass(frozen=True)
 class _Settings:
     """Settings of the rendered images."""
 
@@ -39,9 +37,6 @@ class _Settings:
     most_samples: int = 480
     noise_fields: int = 8
     noise_shift_px: int = 64
-
-
-_SETTINGS = _Settings()
 
 
 def cast_ball(
@@ -76,9 +71,9 @@ def cast_ball(
     facing = np.maximum(normals @ to_light, 0.0)
     mirrored = 2 * facing[:, None] * normals - to_light
     to_eye = -rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    shine = np.maximum(np.einsum("ij,ij->i", mirrored, to_eye), 0.0) ** _SETTINGS.shininess
-    lit = (_SETTINGS.ball_ambient + _SETTINGS.ball_diffuse * facing)[:, None] * bgr
-    return mask, np.minimum(lit + (_SETTINGS.specular * shine)[:, None], 1.0) * 255.0
+    shine = np.maximum(np.einsum("ij,ij->i", mirrored, to_eye), 0.0) ** _Settings.shininess
+    lit = (_Settings.ball_ambient + _Settings.ball_diffuse * facing)[:, None] * bgr
+    return mask, np.minimum(lit + (_Settings.specular * shine)[:, None], 1.0) * 255.0
 
 
 def cluttered_room(
@@ -90,11 +85,11 @@ def cluttered_room(
         ball_hue_deg: hue of the ball [deg].
         gap_deg: smallest difference between the hue of an object and that of the ball [deg].
     """
-    rows = (np.linspace(205, 120, _SETTINGS.height)[:, None, None] * [0.93, 0.97, 1.0]).astype(np.uint8)
-    picture = np.repeat(rows, _SETTINGS.width, axis=1)
+    rows = (np.linspace(205, 120, _Settings.height)[:, None, None] * [0.93, 0.97, 1.0]).astype(np.uint8)
+    picture = np.repeat(rows, _Settings.width, axis=1)
     for _ in range(objects):
         colour = _colour(rng, round(ball_hue_deg / 2), round(gap_deg / 2))
-        x, y = int(rng.integers(_SETTINGS.width)), int(rng.integers(_SETTINGS.height))
+        x, y = int(rng.integers(_Settings.width)), int(rng.integers(_Settings.height))
         w, h = (int(size) for size in rng.integers(15, 160, 2))
         shape = rng.integers(3)
         if shape == 0:
@@ -114,8 +109,8 @@ def background(room: ImageArray, directions: FloatArray, R_world_camera: FloatAr
     """
     x, y, z = np.moveaxis(directions.astype(np.float32) @ R_world_camera.T.astype(np.float32), -1, 0)
     across = np.sqrt(x * x + y * y)
-    columns = (0.5 - cv2.phase(x, y) / (2 * np.pi)) % 1.0 * (_SETTINGS.width - 1)
-    rows = np.arctan2(across, z) / np.pi * (_SETTINGS.height - 1)
+    columns = (0.5 - cv2.phase(x, y) / (2 * np.pi)) % 1.0 * (_Settings.width - 1)
+    rows = np.arctan2(across, z) / np.pi * (_Settings.height - 1)
     seen = cv2.remap(room, columns.astype(np.float32), rows.astype(np.float32), cv2.INTER_LINEAR, None, cv2.BORDER_WRAP)
     return seen.astype(np.uint8, copy=False)
 
@@ -137,7 +132,7 @@ class TagSheets:
         self._tags = tuple(tags)
         self._turns = [rotation_of(np.array(tag.rpy)) for tag in tags]
         # One pixel a square, from the top left; True where it is black.
-        self._black = [patterns.generateImageMarker(tag.id, _SETTINGS.squares, borderBits=1) < 128 for tag in tags]
+        self._black = [patterns.generateImageMarker(tag.id, _Settings.squares, borderBits=1) < 128 for tag in tags]
 
     def cast(
         self, directions: FloatArray, x: FloatArray, R: FloatArray, depth: FloatArray, to_light: FloatArray
@@ -163,9 +158,9 @@ class TagSheets:
             place = (directions[seen] * z[seen][:, None] - centre) @ axes[:, :2]
             on_sheet = np.abs(place).max(axis=1) < tag.half_sheet_m
             seen[seen] = on_sheet
-            lit = _SETTINGS.ambient + _SETTINGS.diffuse * max(float(axes[:, 2] @ to_light), 0.0)
+            lit = _Settings.ambient + _Settings.diffuse * max(float(axes[:, 2] @ to_light), 0.0)
             dark = _is_black(place[on_sheet] / tag.side_m, black)
-            level[seen] = lit * np.where(dark, _SETTINGS.black, _SETTINGS.white)
+            level[seen] = lit * np.where(dark, _Settings.black, _Settings.white)
             nearest[seen] = z[seen]
         mask = np.isfinite(level)
         return mask, np.repeat(255.0 * level[mask][:, None], 3, axis=1)
@@ -173,10 +168,10 @@ class TagSheets:
 
 def _is_black(place: FloatArray, black: np.ndarray) -> np.ndarray:
     """Return a mask (k,) of the points (k, 2) that are black on a tag of side 1, x right and y up from its middle."""
-    column = np.floor((place[:, 0] + 0.5) * _SETTINGS.squares).astype(np.intp)
-    row = np.floor((0.5 - place[:, 1]) * _SETTINGS.squares).astype(np.intp)
-    inside = (column >= 0) & (column < _SETTINGS.squares) & (row >= 0) & (row < _SETTINGS.squares)
-    return inside & black[row.clip(0, _SETTINGS.squares - 1), column.clip(0, _SETTINGS.squares - 1)]
+    column = np.floor((place[:, 0] + 0.5) * _Settings.squares).astype(np.intp)
+    row = np.floor((0.5 - place[:, 1]) * _Settings.squares).astype(np.intp)
+    inside = (column >= 0) & (column < _Settings.squares) & (row >= 0) & (row < _Settings.squares)
+    return inside & black[row.clip(0, _Settings.squares - 1), column.clip(0, _Settings.squares - 1)]
 
 
 TO_LIGHT = np.array([0.35, 0.45, 0.82]) / np.linalg.norm([0.35, 0.45, 0.82])
@@ -254,7 +249,7 @@ class StereoEyes:
         if window is None:
             return
         left, top, width, height = window
-        fine = max(1, min(self._config.supersampling, _SETTINGS.most_samples // max(width, height)))
+        fine = max(1, min(self._config.supersampling, _Settings.most_samples // max(width, height)))
         grid = Grid(left, top, width * fine, height * fine, fine)
         bgr, depth = self._raster.render(T_world_eye, grid)
         patch = image[top : top + height, left : left + width]
@@ -288,7 +283,7 @@ class StereoEyes:
         centre = calibration.project(x_eye)[:2]
         # The outline of a sphere off the axis reaches farther than f·r/z.
         reach = calibration.focal_px * radius / (x_eye[2] - radius)
-        reach = reach * np.linalg.norm(x_eye) / x_eye[2] + _SETTINGS.margin_px
+        reach = reach * np.linalg.norm(x_eye) / x_eye[2] + _Settings.margin_px
         low = np.maximum(np.floor(centre - reach).astype(int), 0)
         high = np.minimum(np.ceil(centre + reach).astype(int) + 1, calibration.image_size_px)
         if (high <= low).any():
@@ -299,7 +294,7 @@ class StereoEyes:
         """Return a stock of noise images; a new one for every frame would cost as much as rendering it."""
         if self._config.noise == 0:
             return np.zeros(0, dtype=np.int16)
-        shape = (_SETTINGS.noise_fields, height + _SETTINGS.noise_shift_px, width + _SETTINGS.noise_shift_px, 3)
+        shape = (_Settings.noise_fields, height + _Settings.noise_shift_px, width + _Settings.noise_shift_px, 3)
         rng = generator(self._seed, Stream.IMAGE_NOISE)
         fields = rng.standard_normal(shape, dtype=np.float32)
         fields *= self._config.noise
@@ -308,8 +303,8 @@ class StereoEyes:
     def _add_noise(self, image: ImageArray, rng: np.random.Generator) -> None:
         if self._config.noise == 0:
             return
-        field = int(rng.integers(_SETTINGS.noise_fields))
-        dy, dx = (int(d) for d in rng.integers(_SETTINGS.noise_shift_px, size=2))
+        field = int(rng.integers(_Settings.noise_fields))
+        dy, dx = (int(d) for d in rng.integers(_Settings.noise_shift_px, size=2))
         height, width = image.shape[:2]
         cv2.add(image, self._noise[field, dy : dy + height, dx : dx + width], dst=image, dtype=cv2.CV_8U)
 

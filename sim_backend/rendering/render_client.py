@@ -91,7 +91,8 @@ class RenderProcess:
     def fetch(self, number: int, timeout_s: float) -> tuple[ImageArray, ...] | None:
         """Frame `number`, the earliest not yet fetched, as images of the caller's own; None after `timeout_s`.
 
-        Raise SourceLost if the renderer's process has died.
+        Raises:
+            SourceLost: the renderer's process has died.
         """
         if not select.select([self._answers], [], [], max(0.0, timeout_s))[0]:
             return None

@@ -70,7 +70,11 @@ _decoder = msgspec.msgpack.Decoder(Message)
 
 
 def send(pipe: Connection, message: Message) -> None:
-    """Write a message. Raise BrokenPipeError if the reader is gone."""
+    """Write a message.
+
+    Raises:
+        BrokenPipeError: the reader is gone.
+    """
     pipe.send_bytes(_encoder.encode(message))
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from bodyschema.interfaces.records import FloatArray, ImageArray
 from bodyschema.sim_backend.bullet import Body
 from bodyschema.sim_backend.geometry import turn_of_z
+from bodyschema.sim_backend.physics_urdf import ROD_RADIUS_M, SHORTEST_ROD_M
 from kbmaps.rotations import quaternions
 
 from .eye import TO_LIGHT, StereoEyes
@@ -24,8 +25,6 @@ from .raster import Raster
 from .render_messages import SLOTS, Frame, Message, Setup, Tool, frame_bytes, receive, slot_images
 
 _PARENT_CHECK_S = 1.0
-_STICK_RADIUS_M = 0.005
-_SHORTEST_STICK_M = 0.01
 
 
 class Stick:
@@ -44,11 +43,11 @@ class Stick:
             self._id = -1
         length = float(np.linalg.norm(tip))
         # What stands in the world, before a camera that the arm carries, is on no stick.
-        if length < _SHORTEST_STICK_M or self._body.stands(self._link):
+        if length < SHORTEST_ROD_M or self._body.stands(self._link):
             return
         shape = bullet.createVisualShape(
             bullet.GEOM_CYLINDER,
-            radius=_STICK_RADIUS_M,
+            radius=ROD_RADIUS_M,
             length=length,
             rgbaColor=[0.16, 0.17, 0.18, 1],
             physicsClientId=client,

@@ -14,9 +14,9 @@ from rich.console import Console
 
 from bodyschema.cli.terminal.status_view import servos_table
 from bodyschema.daemon.sampler.devices import DeviceWatch, differences
-from bodyschema.daemon.transport.status import ServoStatus
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.records import MarkerFix, frozen_array
+from bodyschema.interfaces.servos import ServoStatus
 from bodyschema.recordings.mcap_export import write_mcap
 from bodyschema.recordings.recording import Recording
 from bodyschema.recordings.store.store import PairReader, PairStore, Session

@@ -11,10 +11,9 @@ from guided_arm import JOINTS, NOW_AND_THEN, Scene, built_chain, make_pair, meas
 from bodyschema.interfaces.records import Pair
 from bodyschema.learning.changes.known_arm import KnownArm
 from bodyschema.learning.config import LearnerConfig
-from bodyschema.learning.core import MOST_TOGETHER
 from bodyschema.learning.model_bank import INSTANT
 from bodyschema.learning.nominal import NominalModel
-from bodyschema.learning.online_learner import OnlineLearner
+from bodyschema.learning.online_learner import MOST_TOGETHER, OnlineLearner
 from bodyschema.learning.regime import Regime
 from bodyschema.learning.solvers.solver import DirectSolver
 from bodyschema.learning.uncertainty import ErrorMemory, UncertaintyTracker

@@ -99,7 +99,7 @@ def test_poses_are_written_for_other_programs(tmp_path: Path) -> None:
     assert np.array(poses, dtype=float) == pytest.approx(np.array(found["poses"]))
     with pytest.raises(RecordingError, match="there already"):
         plan.write(tmp_path / "poses.csv", replace=False)
-    with pytest.raises(RecordingError, match=r"end in \.json or \.csv"):
+    with pytest.raises(RecordingError, match=r"end in \.json, \.csv"):
         plan.write(tmp_path / "poses.txt", replace=False)
 
 

@@ -25,6 +25,7 @@ INSTEAD = {
     r"the judge|judged": "the evaluation",
 }
 WORDS = re.compile(rf"\b({'|'.join(INSTEAD)})\b", re.IGNORECASE)
+SENTENCE = re.compile(r"\.\s+Raises? [A-Z]\w+")
 # The views of a diagnosis quote its sentences.
 OF_DIAGNOSIS = re.compile(r"diagnosis_(run|view)\.py$")
 
@@ -61,3 +62,22 @@ def test_an_avoided_word_is_found() -> None:
     assert list(avoided('raise Error(f"{port} is opened anew")', with_docstrings=False)) == ["line 1: anew"]
     assert list(avoided('"""Nobody reads this."""', with_docstrings=False)) == []
     assert list(avoided('def run():\n    """Whoever runs."""', with_docstrings=True)) == ["line 2: Whoever"]
+
+
+def in_sentences(source: str) -> Iterator[str]:
+    """Yield the public docstrings that name an error in a sentence after the first, not under `Raises:`."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.ClassDef | ast.FunctionDef) and re.match("[a-zA-Z]", node.name):
+            yield from (f"line {node.lineno}: {node.name}" for _ in SENTENCE.finditer(ast.get_docstring(node) or ""))
+
+
+@pytest.mark.parametrize("room", [*ROOMS, "diagnosis", "effects", "vision"])
+def test_public_docstrings_name_errors_under_raises(room: str) -> None:
+    files = (ROOT / room).rglob("*.py")
+    found = {str(file.relative_to(ROOT)): names for file in files if (names := list(in_sentences(file.read_text())))}
+    assert found == {}
+
+
+def test_an_error_in_a_sentence_is_found() -> None:
+    assert list(in_sentences('def run():\n    """Run. Raise RunError if it falls."""')) == ["line 1: run"]
+    assert list(in_sentences('def run():\n    """Raise RunError if it falls."""')) == []

@@ -198,7 +198,11 @@ class Images:
     one: bool = False
 
     def files(self) -> list[PairFiles]:
-        """Return the files that belong together. Raise CalibrationError if there are none."""
+        """Return the files that belong together.
+
+        Raises:
+            CalibrationError: there are none.
+        """
         if self.one and (self.right is not None or self.side_by_side):
             raise ConfigError("--one is of one camera alone", remedy="Leave --right and --side-by-side away")
         if (self.left is None) != (self.right is None) and not self.one:

@@ -29,7 +29,11 @@ FindDevice = Callable[[str | None], Any]
 
 
 def sdk() -> Any:
-    """Return the module pyrealsense2. Raise ModuleNotFoundError without the extra `realsense`."""
+    """Return the module pyrealsense2.
+
+    Raises:
+        ModuleNotFoundError: the extra `realsense` is not installed.
+    """
     import pyrealsense2  # pyright: ignore[reportMissingImports]: an extra
 
     return pyrealsense2

@@ -71,7 +71,11 @@ class Page:
 
 
 def sheets(paper: str) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return a paper's (width, height) in landscape and in portrait [mm]. Raise ConfigError for an unknown paper."""
+    """Return a paper's (width, height) in landscape and in portrait [mm].
+
+    Raises:
+        ConfigError: an unknown paper.
+    """
     known = {name.lower(): size for name, size in PAPERS_MM.items()}
     if paper.lower() not in known:
         raise ConfigError(f"there is no paper {paper!r}", remedy=f"Take one of {', '.join(PAPERS_MM)}")

@@ -79,7 +79,11 @@ def learn_train(problem: Problem, earlier: Fitted | None) -> Fitted:
 
 
 def drawing_of(problem: Problem) -> tuple[RigidChain, ChainTolerances]:
-    """Return the nominal model and its tolerances. Raise ValueError if the problem has none."""
+    """Return the nominal model and its tolerances.
+
+    Raises:
+        ValueError: the problem has none.
+    """
     if problem.drawing is None or problem.tolerances is None:
         raise ValueError("this learner starts from a drawing")
     return problem.drawing, problem.tolerances

@@ -162,7 +162,11 @@ def _of_lerobot(
 
 
 def write_new(file: Path, text: str) -> None:
-    """Write a new file. Raise ConfigError if it exists."""
+    """Write a new file.
+
+    Raises:
+        ConfigError: it exists.
+    """
     from bodyschema.interfaces.whole_files import write_whole
 
     if os.path.lexists(file):

@@ -43,7 +43,9 @@ class NatnetReceiver:
     def open(self) -> None:
         """Request the server's version and join its stream.
 
-        Raise SourceLost if it does not answer. Raise SourceError if it speaks another version of NatNet.
+        Raises:
+            SourceLost: it does not answer.
+            SourceError: it speaks another version of NatNet.
         """
         self.server, self.names, self._frames = None, {}, 0
         try:
@@ -88,7 +90,11 @@ class NatnetReceiver:
         return "Motive answers, but sends no frames: start its live mode, and check Rigid Bodies in Data Streaming"
 
     def decode(self, payload: bytes, _: bytes = b"") -> Iterator[Report]:
-        """Yield the rigid bodies of a frame. Raise Unusable if it is damaged."""
+        """Yield the rigid bodies of a frame.
+
+        Raises:
+            Unusable: it is damaged.
+        """
         if self.server is None:
             return
         found = packets.frame(payload, self.server.version)

@@ -108,7 +108,11 @@ def connect() -> bytes:
 
 
 def opened(data: bytes) -> tuple[int, bytes]:
-    """Return the message and the contents of a packet. Raise Unusable if its size is not the one announced."""
+    """Return the message and the contents of a packet.
+
+    Raises:
+        Unusable: its size is not the one announced.
+    """
     if len(data) < HEADER.size:
         raise Unusable(Fault.MALFORMED, f"{len(data)} bytes are no NatNet packet")
     message, size = HEADER.unpack_from(data)
@@ -118,7 +122,11 @@ def opened(data: bytes) -> tuple[int, bytes]:
 
 
 def server_info(contents: bytes) -> ServerInfo:
-    """Read the answer to CONNECT. Raise Unusable if it is too short."""
+    """Read the answer to CONNECT.
+
+    Raises:
+        Unusable: it is too short.
+    """
     if len(contents) < SERVER.size + SERVER_CLOCK.size:
         raise Unusable(Fault.MALFORMED, f"{len(contents)} bytes are no answer of a NatNet 3 or 4 server")
     name, major, minor, _, _, net_major, net_minor, _, _ = SERVER.unpack_from(contents)
@@ -129,7 +137,11 @@ def server_info(contents: bytes) -> ServerInfo:
 
 
 def frame(contents: bytes, version: Version) -> Frame:
-    """Read a frame. Raise Unusable if its sections do not fit into its bytes."""
+    """Read a frame.
+
+    Raises:
+        Unusable: its sections do not fit into its bytes.
+    """
     reader = _Reader(contents)
     is_sized = version >= SIZED_SINCE
     number = reader.int32()
