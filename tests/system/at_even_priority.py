@@ -1,4 +1,4 @@
-"""Run `bodyschema` with all its work at the same priority: on a full machine, what is put last gets nothing for minutes."""
+"""Run `bodyschema` with all work at one priority: on a full machine, what is put last gets nothing for minutes."""
 
 from __future__ import annotations
 
