@@ -119,7 +119,9 @@ def pytest_collection(session: pytest.Session) -> None:
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Leave what was collected out of every later search for garbage."""
+    """Leave what was collected out of every later search for garbage; fork what would import it again."""
+    if warm.SHARED in os.environ:
+        warm.fork_solvers_and_renderers()
     gc.collect()
     gc.freeze()
     gc.enable()
