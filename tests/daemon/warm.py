@@ -178,9 +178,10 @@ def start() -> socket.socket:
         others.bind("")  # to a name that is not in use
         others.listen()
         files = [its.fileno(), others.fileno()]
-        subprocess.Popen(
+        server = subprocess.Popen(
             [sys.executable, __file__, *map(str, files)], stdin=subprocess.DEVNULL, env=environment, pass_fds=files
-        ).returncode = 0  # never waited for
+        )
+        atexit.register(server.wait)  # its time of the processor counts
         os.environ[SHARED] = others.getsockname().hex()
     atexit.register(ours.close)
     return ours
