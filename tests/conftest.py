@@ -76,7 +76,7 @@ def pytest_xdist_setupnodes() -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Return one worker for each processor, hyperthreads too: one more costs 15 s of CPU for what it collects."""
+    """Return one worker for each processor, hyperthreads too: one more costs 10 s of CPU for what it collects."""
     return len(os.sched_getaffinity(0))
 
 
