@@ -42,6 +42,7 @@ def has_room() -> bool:
     return disk.f_bavail * disk.f_frsize > ROOM_BYTES and not disk.f_flag & os.ST_NOEXEC
 
 
+ALL_SOAK = "\npytestmark = pytest.mark.soak"
 QUICK = ("kbmaps/", "tests/interfaces/", "tests/kbmaps/")
 
 
@@ -75,8 +76,8 @@ def pytest_xdist_setupnodes() -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int:
-    """Return three workers for two processors: half of the tests wait for processes, clocks or disks."""
-    return (3 * len(os.sched_getaffinity(0)) + 1) // 2
+    """Return one worker for each processor, hyperthreads too: one more costs 10 s of CPU for what it collects."""
+    return len(os.sched_getaffinity(0))
 
 
 def leaves_soak_out(config: pytest.Config) -> bool:
@@ -85,6 +86,13 @@ def leaves_soak_out(config: pytest.Config) -> bool:
 
 def is_soak(marks: Iterable[pytest.Mark]) -> bool:
     return any(mark.name == "soak" for mark in marks)
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Import no file of soak tests alone where they are left out: what they need takes a second in each worker."""
+    if collection_path.name.startswith("test_") and collection_path.suffix == ".py" and leaves_soak_out(config):
+        return True if ALL_SOAK in collection_path.read_text(encoding="utf-8") else None
+    return None
 
 
 def pytest_pycollect_makeitem(collector: pytest.Collector, obj: object) -> list[pytest.Item] | None:
@@ -111,7 +119,9 @@ def pytest_collection(session: pytest.Session) -> None:
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Leave what was collected out of every later search for garbage."""
+    """Leave what was collected out of every later search for garbage; fork what would import it again."""
+    if warm.SHARED in os.environ:
+        warm.fork_solvers_and_renderers()
     gc.collect()
     gc.freeze()
     gc.enable()

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from bodyschema.interfaces.errors import RecordingError
 from bodyschema.interfaces.records import FloatArray
@@ -22,6 +21,7 @@ from bodyschema.recordings.recording import Recording
 from bodyschema.robot.description import RobotDescription
 from kbmaps import ChainParameters, DegenerateDataError, RigidChain, align
 from kbmaps.chains.placement import place
+from kbmaps.rotations import rotation_vector, rotation_vectors
 
 from .limits import A_RADIAN_M, KNOWN_TOOL_M, MEASURED, SLIDES_M, TOOL_M, ZEROS_RAD, reach_m, spread_m
 from .reading import AS_IT_IS, QUARTER, REMEDIES, Reading, errors_rad
@@ -358,7 +358,7 @@ def _moved(shift: int) -> tuple[str, str]:
 
 def _turned(chain: RigidChain, q: FloatArray, x: FloatArray, fit: _Fit) -> Plausibility | None:
     """Return a refusal if the measurement frame is turned against a pose that robot.toml declares known; else None."""
-    angle = float(Rotation.from_matrix(fit.rotation).magnitude())
+    angle = float(np.linalg.norm(rotation_vector(fit.rotation)))
     if angle < _SETTINGS.turned_rad:
         return None
     told, free = (align(chain, q, x, pose_known=known, marker_known=False).rms for known in (True, False))
@@ -616,7 +616,7 @@ class _Search:
         moved = np.linalg.norm(placed.tools, axis=1)
         cost = 0.5 * np.square(zeros / std).sum(axis=1) + 0.5 * np.square(moved / tool_m)
         if self._pose_known:
-            turns = Rotation.from_matrix(placed.rotations).magnitude()
+            turns = np.linalg.norm(rotation_vectors(placed.rotations), axis=1)
             cost += [
                 0.0 if r.mirrored else 0.5 * (turn / _SETTINGS.turned_rad) ** 2
                 for r, turn in zip(new, turns, strict=True)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -25,20 +26,22 @@ from kbmaps import ChainBelief, KBMapsError
 
 log = logging.getLogger(__name__)
 
-# Findings take at most 1/SHARE of the background thread's time, which the robots share, and recur no more often.
+# Findings take at most 1/SHARE of a processor, which the robots share, and recur no more often.
 SHARE = 10.0
 EVERY_S = 1.0
 
 
 class FindingTurns:
-    """Limits all users of the background thread together to `SHARE` of its time. For that thread alone.
+    """Limits all users of the background thread together to `SHARE` of a processor. For that thread alone.
 
     Attributes:
         due_at: time of the next permitted finding.
+        spent: returns the thread's processor time [s]. On a busy machine most of the wall time is waiting, and a rest
+            of ten times as long would leave findings out for a quarter of an hour.
     """
 
-    def __init__(self) -> None:
-        self.due_at = -math.inf
+    def __init__(self, spent: Callable[[], float] = time.thread_time) -> None:
+        self.due_at, self.spent = -math.inf, spent
 
     def took(self, begin: float, seconds: float) -> None:
         """Note that one finding took `seconds` from `begin` on."""
@@ -105,7 +108,7 @@ class Findings:
             return
         if present == self._found_of or begin < max(self._due_at, self._turns.due_at):
             return
-        self._found_of, known = present, self._learning.known()
+        self._found_of, known, spent = present, self._learning.known(), self._turns.spent()
         if known is None:
             self._found = None, None
             return
@@ -114,7 +117,7 @@ class Findings:
         except (KBMapsError, np.linalg.LinAlgError) as error:
             log.warning("status has no calibration for now: %s", error)
             self._found = None, None
-        seconds = self._clock.now() - begin
+        seconds = self._turns.spent() - spent
         self._turns.took(begin, seconds)
         self._due_at = begin + max(self._parts * seconds, EVERY_S)
 
@@ -125,10 +128,11 @@ class Findings:
             self._checked, self.doubts = 0, ()
         if count < max(FEWEST_ROWS, 2 * self._checked) or begin < self._turns.due_at:
             return
+        spent = self._turns.spent()
         q, x = self._learning.kept(ROWS)
         self._checked = count
         self.doubts = plausibility(self._robot, q, x, chain=self._learning.nominal.chain).sentences
-        self._turns.took(begin, self._clock.now() - begin)
+        self._turns.took(begin, self._turns.spent() - spent)
 
 
 def _found(robot: RobotDescription, known: LearnerEvidence) -> tuple[ChainCalibration, Outlook | None]:

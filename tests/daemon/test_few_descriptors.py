@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import resource
-import subprocess
 import sys
 
 import pytest
@@ -63,6 +62,6 @@ def test_a_solver_that_cannot_start_is_tried_again(monkeypatch: pytest.MonkeyPat
     def no_more(*_: object, **__: object) -> None:
         raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
 
-    monkeypatch.setattr(subprocess, "Popen", no_more)
+    monkeypatch.setattr("bodyschema.daemon.learner.solver_process.subprocess.Popen", no_more)
     with SolverProcess() as solver, pytest.raises(SolverLostError, match="cannot be started: Too many open files"):
         solver.start(Task(1, NOMINAL.prior(), NOMINAL.belief(NOMINAL.chain, ChainTolerances())))

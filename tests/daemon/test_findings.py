@@ -112,7 +112,8 @@ def shared(seed: int, pairs: int) -> Planted:
 
 
 def findings_of(arm: Planted, clock: Ticking | None = None) -> Findings:
-    return Findings(arm.learning, arm.robot, clock or Ticking())
+    clock = clock or Ticking()
+    return Findings(arm.learning, arm.robot, clock, turns=FindingTurns(clock.now))
 
 
 # --- calibration
@@ -297,8 +298,20 @@ def test_they_are_found_again_when_a_new_chain_was_found_and_not_too_soon() -> N
     assert findings.calibration.pairs > first.pairs
 
 
+def test_waiting_for_a_processor_is_no_reason_to_rest() -> None:
+    arm, clock = Planted.of(1, 40), Slow()
+    clock.TICK_S = 60.0  # a minute passes on a busy machine, and the finding takes no time of the processor
+    findings = Findings(arm.learning, arm.robot, clock, turns=FindingTurns(lambda: 0.0))
+    findings.renew()
+    first = findings.calibration
+    arm.teach(np.random.default_rng(8), 30)
+    findings.renew()
+    assert findings.calibration.pairs > first.pairs
+
+
 def test_of_several_robots_one_finds_at_a_time() -> None:
-    clock, turns = Slow(), FindingTurns()
+    clock = Slow()
+    turns = FindingTurns(clock.now)
     # From FEWEST_ROWS pairs on, they are checked in a turn of their own.
     arms = [Planted.of(seed, FEWEST_ROWS - 2) for seed in (1, 2)]
     found = [Findings(arm.learning, arm.robot, clock, 2, turns) for arm in arms]

@@ -174,7 +174,7 @@ def test_many_threads_read_while_pairs_come(file, store) -> None:
         reads = [pool.submit(reader.read) for _ in range(40)]
         fill(store, 100)
         for read in reads:
-            pairs = read.result(30)
+            pairs = read.result()
             assert [pair.seq for pair in pairs] == list(range(1, len(pairs) + 1))
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import atexit
 import ctypes
+import fcntl
 import functools
 import gc
 import importlib
@@ -27,7 +28,8 @@ import traceback
 from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import IO
+from types import MappingProxyType, ModuleType
+from typing import IO, Any
 
 RARELY_NEEDED = (
     "bodyschema.dashboard",
@@ -38,6 +40,7 @@ RARELY_NEEDED = (
 )
 PR_SET_PDEATHSIG = 1
 LONGEST_REQUEST = 1 << 17
+MOST_FILES = 16
 SHARED = "BODYSCHEMA_FORKING"  # where the forking process listens
 _ASKING = threading.Lock()
 
@@ -48,7 +51,11 @@ class Child:
     Args:
         arguments: as for the interpreter: `-m MODULE ...`, or a script and its arguments.
         stdout, stderr: open files; without them, the output is dropped.
+        pass_fds: files that stay open in it, by their numbers there.
     """
+
+    stdin: IO[bytes] | None = None
+    stdout: IO[bytes] | None = None
 
     def __init__(
         self,
@@ -57,13 +64,15 @@ class Child:
         env: Mapping[str, str] | None = None,
         stdout: IO | None = None,
         stderr: IO | None = None,
+        pass_fds: Mapping[int, int] = MappingProxyType({}),
     ) -> None:
         self.args, self.returncode, self._lock = [str(word) for word in arguments], None, threading.Lock()
         self._heard = b""
-        request = json.dumps([self.args, str(cwd or Path.cwd()), dict(os.environ if env is None else env)])
+        environment = dict(os.environ if env is None else env)
+        request = json.dumps([self.args, str(cwd or Path.cwd()), environment, [1, 2, *pass_fds]])
         self._fate, fate = os.pipe()
         with open(os.devnull, "wb") as nowhere:
-            files = [fate, (stdout or nowhere).fileno(), (stderr or nowhere).fileno()]
+            files = [fate, (stdout or nowhere).fileno(), (stderr or nowhere).fileno(), *pass_fds.values()]
             with _ASKING:  # two threads must not start two servers
                 socket.send_fds(_server(), [request.encode()], files)
         os.close(fate)
@@ -121,6 +130,35 @@ def run(
         return subprocess.CompletedProcess(child.args, code, out.read(), err.read())
 
 
+class _AsForks(ModuleType):
+    """`subprocess` to modules of ours whose child processes may be forks, too."""
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(subprocess, name)
+
+    @staticmethod
+    def Popen(command: list[str], *, pass_fds: tuple[int, ...] = (), **told: Any) -> Child | subprocess.Popen[bytes]:
+        if command[1:3] != ["-P", "-m"]:  # a program that a test put in its place
+            return subprocess.Popen(command, pass_fds=pass_fds, **told)
+        passed = {file: file for file in pass_fds}
+        if told["stdin"] != subprocess.PIPE:
+            return Child(*command[2:], env=told["env"], stderr=sys.__stderr__, pass_fds=passed)
+        (its_in, ours_out), (ours_in, its_out) = os.pipe(), os.pipe()
+        with os.fdopen(its_out, "wb") as out, os.fdopen(its_in, "rb"):
+            child = Child(
+                *command[2:], env=told["env"], stdout=out, stderr=sys.__stderr__, pass_fds=passed | {0: its_in}
+            )
+        child.stdin, child.stdout = os.fdopen(ours_out, "wb"), os.fdopen(ours_in, "rb")
+        return child
+
+
+def fork_solvers_and_renderers() -> None:
+    """Let solvers and renderers of this process be forks."""
+    for module in ("bodyschema.daemon.learner.solver_process", "bodyschema.sim_backend.rendering.render_client"):
+        with suppress(ImportError):  # of an extra that is not installed
+            vars(importlib.import_module(module))["subprocess"] = _AsForks("subprocess")
+
+
 @functools.cache
 def _server() -> socket.socket:
     """Return the socket to the forking process: the one that started pytest's workers, or one of this process's own."""
@@ -140,9 +178,10 @@ def start() -> socket.socket:
         others.bind("")  # to a name that is not in use
         others.listen()
         files = [its.fileno(), others.fileno()]
-        subprocess.Popen(
+        server = subprocess.Popen(
             [sys.executable, __file__, *map(str, files)], stdin=subprocess.DEVNULL, env=environment, pass_fds=files
-        ).returncode = 0  # never waited for
+        )
+        atexit.register(server.wait)  # its time of the processor counts
         os.environ[SHARED] = others.getsockname().hex()
     atexit.register(ours.close)
     return ours
@@ -176,13 +215,15 @@ def _serve(wire: socket.socket, others: socket.socket) -> list[str]:
                 os.close(fate)
                 os.close(ready)
                 continue
-            message, files, *_ = socket.recv_fds(asking[ready], LONGEST_REQUEST, 3)
+            message, files, *_ = socket.recv_fds(asking[ready], LONGEST_REQUEST, MOST_FILES)
             if not message:
                 if ready == wire.fileno():
                     os._exit(0)
                 asking.pop(ready).close()
                 continue
             if (pid := os.fork()) == 0:
+                for one in (others, *asking.values()):  # else they close, when they are collected, what is there then
+                    one.detach()
                 return _settle(json.loads(message), files)
             os.write(files[0], b"%d\n" % pid)
             alive[os.pidfd_open(pid)] = pid, files[0]
@@ -190,13 +231,16 @@ def _serve(wire: socket.socket, others: socket.socket) -> list[str]:
                 os.close(file)
 
 
-def _settle(request: tuple[list[str], str, dict[str, str]], files: list[int]) -> list[str]:
+def _settle(request: tuple[list[str], str, dict[str, str], list[int]], files: list[int]) -> list[str]:
     """Reset the process to the state of a new one; return its arguments."""
-    arguments, folder, environment = request
+    arguments, folder, environment, places = request
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    os.dup2(files[1], 1)
-    os.dup2(files[2], 2)
-    os.closerange(3, max(map(int, os.listdir("/proc/self/fd"))) + 1)
+    above = max(map(int, os.listdir("/proc/self/fd"))) + max(places) + 1  # of all that is open or is going to be
+    copies = [fcntl.fcntl(file, fcntl.F_DUPFD, above) for file in files[1:]]
+    os.closerange(3, above)
+    for copy, place in zip(copies, places, strict=True):
+        os.dup2(copy, place)
+        os.close(copy)
     # Those of the server know whether its own files can seek, not whether these can.
     sys.stdout = sys.__stdout__ = os.fdopen(1, "w", closefd=False)
     sys.stderr = sys.__stderr__ = os.fdopen(2, "w", 1, errors="backslashreplace", closefd=False)
@@ -212,6 +256,7 @@ def _run(arguments: list[str]) -> int:
     try:
         if arguments[0] == "-m":
             sys.path.insert(0, os.getcwd())
+            sys.modules.pop(arguments[1], None)
             runpy.run_module(arguments[1], run_name="__main__", alter_sys=True)
         else:
             sys.path.insert(0, os.path.dirname(arguments[0]))
@@ -229,6 +274,7 @@ def _run(arguments: list[str]) -> int:
 if __name__ == "__main__":
     sys.path.pop(0)
     _import_all()
+    fork_solvers_and_renderers()
     gc.freeze()  # a collection would copy every page
     code = _run(_serve(*(socket.socket(fileno=int(file)) for file in sys.argv[1:])))
     threading._shutdown()

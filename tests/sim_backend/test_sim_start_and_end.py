@@ -17,6 +17,7 @@ from bodyschema.robot.toml_file import read_toml
 from bodyschema.sim_backend import SimConfig, SimWorld, model_file
 
 ROOT = Path(__file__).resolve().parents[2]
+LIMIT_S = 500.0  # only ends a test that would never end
 HOLD_OPEN = """
 import select, signal, sys
 from bodyschema.robot.description import RobotDescription
@@ -45,7 +46,7 @@ def test_a_killed_parent_leaves_no_renderer_behind():
     with run_python(HOLD_OPEN, stdin=subprocess.PIPE) as parent:
         renderer = os.pidfd_open(int(parent.stdout.readline()))
         parent.kill()
-    ended, _, _ = select.select([renderer], [], [], 20.0)
+    ended, _, _ = select.select([renderer], [], [], LIMIT_S)
     os.close(renderer)
     assert ended
 
@@ -55,7 +56,7 @@ def test_an_interrupted_world_closes_its_renderer_and_says_nothing():
         renderer = os.pidfd_open(int(parent.stdout.readline()))
         parent.send_signal(signal.SIGINT)
         complaints = parent.stderr.read()
-    ended, _, _ = select.select([renderer], [], [], 20.0)
+    ended, _, _ = select.select([renderer], [], [], LIMIT_S)
     os.close(renderer)
     assert ended
     assert (parent.returncode, complaints) == (0, "")
@@ -63,7 +64,7 @@ def test_an_interrupted_world_closes_its_renderer_and_says_nothing():
 
 def test_importing_the_package_does_not_load_pybullet():
     with run_python("import sys, sim_backend; sys.exit('pybullet' in sys.modules)") as python:
-        assert python.wait(300) == 0
+        assert python.wait(LIMIT_S) == 0
 
 
 def test_without_pybullet_the_remedy_is_named(monkeypatch):

@@ -22,7 +22,7 @@ pytest.importorskip("pybullet")
 
 # The limit only ends a demo that would never end; on a busy machine it takes longer, and passes.
 LIMIT_S = 400
-FIRST, SECOND = 12, 6
+FIRST, SECOND = 8, 4
 
 
 @dataclass(frozen=True)
