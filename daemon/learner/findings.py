@@ -128,6 +128,8 @@ class Findings:
         if count < max(FEWEST_ROWS, 2 * self._checked) or begin < self._turns.due_at:
             return
         q, x = self._learning.kept(ROWS)
+        if len(q) < FEWEST_ROWS:  # the others are doubted
+            return
         self._checked = count
         self._doubts = plausibility(self._robot, q, x, chain=self._learning.nominal.chain).sentences
         self._turns.took(begin, self._clock.now() - begin)

@@ -470,3 +470,20 @@ def test_the_live_learner_names_a_wrong_reading(case) -> None:
         findings.renew()
     assert (case or "") in "".join(findings.doubts)
     assert bool(findings.doubts) == (case is not None)
+
+
+def test_the_live_learner_waits_for_as_many_pairs_as_decide() -> None:
+    """Doubted pairs do not count."""
+    wrong, rows = pairs().read(MISREAD["q3 counts the other way"]), [35, 40]
+    learning = SimpleNamespace(
+        counters=SimpleNamespace(since_change=40),
+        kept=lambda _: (lambda count: (wrong.q[:count], wrong.x[:count]))(rows.pop(0)),
+        nominal=SimpleNamespace(chain=arm()),
+        belief=None,
+        snapshot=SimpleNamespace(answering="prior"),
+    )
+    findings = Findings(learning, robot(), SystemClock())
+    findings.renew()
+    assert findings.doubts == ()
+    findings.renew()
+    assert "q3 counts the other way" in findings.doubts[0]
