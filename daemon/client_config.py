@@ -81,26 +81,24 @@ class ClientConfig:
         """Return the endpoint and identity with which a client connects to `sampler` or `learner`."""
         return self.zenoh.route(process, self.file.parent)
 
-    def check(self) -> None:
-        """Check all of robot.toml.
-
-        Raises:
-            ConfigError: as `Config.load`.
-        """
+    def fault(self) -> str:
+        """Check all of robot.toml. Return why no process starts with it on this machine, or ""."""
         from bodyschema.daemon.config import Config
 
-        Config.load(self.file)
+        try:
+            Config.load(self.file)
+        except ConfigError as error:
+            return f"With this robot.toml it cannot start on this machine: {error}"
+        return ""
 
     @contextmanager
     def checked_on_error(self) -> Iterator[None]:
-        """Raise the ConfigError of a wrong robot.toml in the place of an error that it may have caused.
-
-        A process with a wrong robot.toml does not start, and then nothing answers.
-        """
+        """Add the fault of a wrong robot.toml to an error that it may have caused: nothing answers."""
         try:
             yield
-        except (BusError, RequestError):
-            self.check()
+        except (BusError, RequestError) as error:
+            if fault := self.fault():
+                raise type(error)(f"{error}. {fault}") from error
             raise
 
     @cached_property

@@ -25,7 +25,7 @@ from kbmaps.rotations import rotation_vector, rotation_vectors
 
 from .limits import A_RADIAN_M, KNOWN_TOOL_M, MEASURED, SLIDES_M, TOOL_M, ZEROS_RAD, reach_m, spread_m
 from .reading import AS_IT_IS, QUARTER, REMEDIES, Reading, errors_rad
-from .size import size_of
+from .size import evidences, size_of
 
 # Number of rows to be read in other ways, evenly spread. Twice as many cost twice the time and change no verdict of the
 # tests.
@@ -80,9 +80,9 @@ class _Settings:
     other_size: float = 0.04
     # Orientations of a tag on a nominal arm are no better than this.
     oriented_rad: float = math.radians(1.0)
-    # Rows are shifted if this share of them fits so many times better with the angles of the row as far away. None do
-    # so in right recordings; 0.09 and more where half of the rows are shifted.
-    shifted: float = 0.08
+    # Rows are shifted if this share of them fits so many times better with angles or positions of the row as far away.
+    # Up to 0.09 do so in right recordings, 0.16 and more where a fifth of the rows of a real recording is shifted.
+    shifted: float = 0.12
     shifted_better: float = 5.0
     # Share of its tolerance that is left to a joint offset that is held.
     held: float = 1e-3
@@ -196,11 +196,17 @@ def plausibility(
     before, after = search.fits[as_it_is].error, fit.error / chosen.scale
     unnamed = not (_nameable(as_it_is, search.fits[as_it_is], spread) or _nameable(chosen, fit, spread))
     if unnamed and len(q) >= FEWEST_ROWS:
-        shifted = _shifted(search, q, x, before)
-        if shifted is not None:
-            return shifted
+        all_shifted = _shifted(search, q, x, before)
+        if all_shifted is not None:
+            return all_shifted
     noise = 0.0 if sigma_m is None else _SETTINGS.noises * sigma_m
-    sized = _partly_shifted(search, q, x) or search.sized(before, fit.error) or Plausibility()
+    misread = chosen != as_it_is and before > _SETTINGS.much_better * fit.error and _nameable(chosen, fit, spread)
+    fits = before < _SETTINGS.named * spread
+    sized = (
+        (None if misread else _partly_shifted(search, q, x, fits=fits))
+        or search.sized(before, fit.error)
+        or Plausibility()
+    )
     if sized.refusal is not None:
         return _decided(sized, len(q))
     if before <= _SETTINGS.much_better * fit.error and not _nameable(chosen, fit, spread):
@@ -319,21 +325,36 @@ def _shifted(search: _Search, q: FloatArray, x: FloatArray, before: float) -> Pl
     )
 
 
-def _partly_shifted(search: _Search, q: FloatArray, x: FloatArray) -> Plausibility | None:
-    """Return a refusal if the positions of many rows, and not of most, belong to the angles of a row nearby."""
+def _partly_shifted(search: _Search, q: FloatArray, x: FloatArray, *, fits: bool) -> Plausibility | None:
+    """Return a refusal if in many rows, and not in most, angles or positions belong to a row nearby; else None.
+
+    Args:
+        search: the search over other readings.
+        q, x: all pairs (n, d) [rad, m] and (n, 3) [m].
+        fits: the pairs place the arm. Else every row may be wrong, and the arm is also placed by shifted rows.
+    """
     if len(q) < FEWEST_ROWS:
         return None
     shifts, rows = _rows_nearby(len(q))
-    own, *others = search.distances(np.stack([q[rows + shift] for shift in (0, *shifts)]), x[rows])
-    shares = [float((_SETTINGS.shifted_better * other < own).mean()) for other in others]
-    share, shift = max(zip(shares, shifts, strict=True))
-    if share < _SETTINGS.shifted:
+    own_q, own_x = q[rows], x[rows]
+    of_angles = [(q[rows + shift], own_x) for shift in shifts]
+    pairs = [(own_q, own_x), *of_angles, *((own_q, x[rows + shift]) for shift in shifts)]
+    placed_by = [(own_q, own_x), *([] if fits else of_angles)]
+    found = np.stack([search.distances(*placed, pairs) for placed in placed_by])
+    nearer = _SETTINGS.shifted_better * found.min(axis=0)[1:] < found[0, 0]
+    shares = nearer.mean(axis=1).reshape(2, -1)
+    angles, positions = shares.max(axis=1)
+    if max(angles, positions) < _SETTINGS.shifted:
         return None
-    row, remedy = _moved(shift)
+    row, remedy = _moved(shifts[int(shares[0].argmax())])
+    fit, remedy = f"these fit the angles of {row}", f"In these rows: {remedy[0].lower()}{remedy[1:]}"
+    if positions > _SETTINGS.much_better * angles:
+        fit = f"their angles fit the positions of {_moved(shifts[int(shares[1].argmax())])[0]}"
+        remedy = "Join the two logs by time, not by row: rows hold the angles of others"
     return Plausibility(
-        f"it seems that angles and positions are shifted against each other in {100.0 * share:.0f} % of the rows: "
-        f"these fit the angles of {row}",
-        f"In these rows: {remedy[0].lower()}{remedy[1:]}",
+        "it seems that angles and positions are shifted against each other in "
+        f"{100.0 * max(angles, positions):.0f} % of the rows: {fit}",
+        remedy,
         misread=True,
     )
 
@@ -442,9 +463,13 @@ class _Search:
             self._try(other for reading in self._distinct(expanded) for other in reading.neighbours(slides))
         if as_it_is not in self.fits:
             self._fit([as_it_is], held=True)
-        best = self.fits[self._best()[0]]
+        best, refuted = self._most_probable(as_it_is)
         good = sorted(
-            (reading for reading in self.fits if self._as_good(self.fits[reading], best)),
+            (
+                reading
+                for reading, fit in self.fits.items()
+                if self._as_good(fit, self.fits[best]) and not self._alike(fit.error, refuted)
+            ),
             key=lambda reading: (reading.changes, reading.quarters != as_it_is.quarters, self.fits[reading].nats),
         )
         others = [reading for reading in good[1:] if reading.changes <= good[0].changes + 1]
@@ -502,13 +527,13 @@ class _Search:
         placed = place(self._chain, q, x, zeros_std=self._std, tool_std=TOOL_M)
         return np.maximum(placed.errors(MEASURED), self._exact_m)
 
-    def distances(self, q: FloatArray, x: FloatArray) -> FloatArray:
-        """Return the distances (s, n) [m] of positions x (n, 3) from the arm at q (s, n, d), placed by the first."""
-        placed, p = place(self._chain, q[:1], x[None], zeros_std=self._std, tool_std=TOOL_M), self._parameters
+    def distances(self, q: FloatArray, x: FloatArray, pairs: list[tuple[FloatArray, FloatArray]]) -> FloatArray:
+        """Return the distances (s, n) [m] of sets of pairs from the arm as pairs q (n, d) and x (n, 3) place it."""
+        placed, p = place(self._chain, q[None], x[None], zeros_std=self._std, tool_std=TOOL_M), self._parameters
         change = np.zeros(p.size)
         change[p.zeros], change[p.tool] = placed.zeros[0], placed.tools[0]
-        drawn = np.stack([p.positions(change, each) for each in q])
-        return np.linalg.norm(drawn @ placed.rotations[0].T + placed.shifts[0] - x, axis=2)
+        drawn = (p.positions(change, each) @ placed.rotations[0].T + placed.shifts[0] for each, _ in pairs)
+        return np.stack([np.linalg.norm(at - seen, axis=1) for at, (_, seen) in zip(drawn, pairs, strict=True)])
 
     def with_marker_known(self, reading: Reading) -> tuple[Reading, _Fit] | None:
         """Return the reading with a zero near the hand off by quarter turns, and its fit, if the known marker shows it.
@@ -560,12 +585,33 @@ class _Search:
         """Return all readings, the best first."""
         return sorted(self.fits, key=lambda reading: self.fits[reading].nats + _SETTINGS.a_change * reading.changes)
 
+    def _most_probable(self, as_it_is: Reading) -> tuple[Reading, list[float]]:
+        """Return the most probable reading with links of some tolerance, and the errors of better fits that it refutes.
+
+        With nominal links a wrong reading may fit better: its marker and joint offsets make up for errors of the links.
+        """
+        rivals = self._distinct([])
+        if rivals[0] == as_it_is or as_it_is not in self.fits:
+            return rivals[0], []
+        rivals += [as_it_is] if as_it_is not in rivals else []
+        slides = self._chain.prismatic
+        read = [(each.angles(self._q, slides), each.positions(self._x), each.scale) for each in rivals]
+        changes = np.array([reading.changes for reading in rivals])
+        best = rivals[int((evidences(self._chain, read, self._apart) - _SETTINGS.a_change * changes).argmax())]
+        nats, error = self.fits[best].nats, self.fits[best].error
+        fits = [self.fits[reading] for reading in rivals]
+        return best, [fit.error for fit in fits if fit.nats < nats and not self._alike(error, [fit.error])]
+
+    @staticmethod
+    def _alike(error: float, others: list[float]) -> bool:
+        return any(abs(error - other) <= _SETTINGS.same * other for other in others)
+
     def _distinct(self, expanded: list[Reading]) -> list[Reading]:
         """Return the best readings whose fits differ from those already expanded, and from each other."""
         seen, new = [self.fits[reading].error for reading in expanded if reading in self.fits], list[Reading]()
         for reading in self._best():
             error = self.fits[reading].error
-            if all(abs(error - other) > _SETTINGS.same * other for other in seen):
+            if not self._alike(error, seen):
                 new.append(reading)
                 seen.append(error)
             if len(new) == _SETTINGS.width:

@@ -15,7 +15,7 @@ from kbmaps.chains.parameters import WIDE
 from kbmaps.chains.placement import Placements, place
 from kbmaps.rotations import rotation_vectors
 
-from .limits import MEASURED, SLIDES_M, TOOL_M, ZEROS_RAD
+from .limits import MEASURED, SLIDES_M, TOOL_M, ZEROS_RAD, BoolArray
 
 # The links are linearised about a fit with nominal links: two steps reach 0.1 % from a size that is 20 % off.
 _STEPS = 3
@@ -63,6 +63,22 @@ def size_of(chain: RigidChain, q: FloatArray, x: FloatArray, apart: list[int]) -
     return Size(math.exp(log), sigma, math.exp(log) * error)
 
 
+def evidences(chain: RigidChain, readings: list[tuple[FloatArray, FloatArray, float]], apart: list[int]) -> FloatArray:
+    """Return the log evidence (m,) of readings of the same pairs; links and size may be off by tolerances.
+
+    Args:
+        readings: joints q (n, d) [rad, m], positions x (n, 3) [m], and how many of the recording's units are 1 m.
+        apart: as in `size_of`.
+    """
+    placed = [_placed(chain, q[apart], x[apart]) for q, x, _ in readings]
+    good = np.all([_is_near(each.distances[0]) for each in placed], axis=0)
+    found: list[float] = []
+    for at, (q, x, scale) in zip(placed, readings, strict=True):
+        logs = _evidences(chain, q[apart], at, x[apart], good)[0]
+        found.append(logs.max() + np.log(np.exp(logs - logs.max()).mean()) - 3.0 * good.sum() * math.log(scale))
+    return np.array(found)
+
+
 def _placed(chain: RigidChain, q: FloatArray, x: FloatArray) -> Placements:
     std = np.where(chain.prismatic, SLIDES_M, ZEROS_RAD)
     return place(chain, q[None], x[None], zeros_std=std, tool_std=TOOL_M)
@@ -70,8 +86,20 @@ def _placed(chain: RigidChain, q: FloatArray, x: FloatArray) -> Placements:
 
 def _log_size(chain: RigidChain, q: FloatArray, placed: Placements, x: FloatArray) -> tuple[float, float]:
     """Return mean and 1-sigma of the logarithm of the positions' size, over all workmanships and noise levels."""
+    evidence, means, variances = _evidences(chain, q, placed, x, _is_near(placed.distances[0]))
+    shares = np.exp(evidence - evidence.max())
+    shares /= shares.sum()
+    mean = float(shares @ means)
+    return mean, math.sqrt(float(shares @ (variances + np.square(means - mean))))
+
+
+def _is_near(distances: FloatArray) -> BoolArray:
+    return distances <= _FAR * np.median(distances)
+
+
+def _evidences(chain: RigidChain, q: FloatArray, placed: Placements, x: FloatArray, good: BoolArray) -> FloatArray:
+    """Return log evidence, mean and variance (3, k) of the size from `good` rows, by workmanship and noise level."""
     distances, parameters = placed.distances[0], ChainParameters(chain)
-    good = distances <= _FAR * np.median(distances)
     change = np.zeros(parameters.size)
     change[parameters.zeros], change[parameters.tool] = placed.zeros[0], placed.tools[0]
     tolerated = change.copy()
@@ -89,11 +117,7 @@ def _log_size(chain: RigidChain, q: FloatArray, placed: Placements, x: FloatArra
     within = both @ basis
     beyond = (both - within @ basis.T) @ (both - within @ basis.T).T
     found = [_posteriors(effects @ made, within, beyond, noises, len(residuals)) for made in _made(parameters)]
-    evidence, means, variances = np.concatenate(found, axis=1)
-    shares = np.exp(evidence - evidence.max())
-    shares /= shares.sum()
-    mean = float(shares @ means)
-    return mean, math.sqrt(float(shares @ (variances + np.square(means - mean))))
+    return np.concatenate(found, axis=1)
 
 
 def _made(parameters: ChainParameters) -> Iterator[FloatArray]:

@@ -128,9 +128,11 @@ def _state_dir(backup: Backup, tables: Mapping[str, Any], robot_file: Path) -> P
         return state_home() / backup.manifest.robot
     home = robot_file.parent.resolve()
     folder = (home / given).resolve()
-    if not (folder.is_relative_to(home) or backup.has(ROBOT_TOML, robot_file)):
+    seen = folder.is_relative_to(home) and not any(part.startswith(".") for part in folder.relative_to(home).parts)
+    if not (seen or backup.has(ROBOT_TOML, robot_file)):
+        where = "in a hidden folder" if folder.is_relative_to(home) else "outside of its folder"
         raise BackupError(
-            f"the robot.toml in {backup.file} keeps pairs and checkpoint outside of its folder. {NOTHING_CHANGED}. "
+            f"the robot.toml in {backup.file} keeps pairs and checkpoint {where}. {NOTHING_CHANGED}. "
             f"Give --state-dir {str(folder)!r} to put them there, or another folder"
         )
     return folder

@@ -95,7 +95,8 @@ def screen(seen: Seen, config: ClientConfig) -> RenderableType:
     parts: list[RenderableType] = []
     parts += _absent("sampler", config.route("sampler")) if seen.sampler is None else _sampler(seen.sampler)
     parts.append(Text())
-    slides = {name for name, slides in zip(config.joints, config.slides, strict=True) if slides}
+    names = () if seen.nobody else zip(config.joints, config.slides, strict=True)
+    slides = {name for name, slides in names if slides}
     parts += _absent("learner", config.route("learner")) if seen.learner is None else _learner(seen.learner)
     if seen.learner is not None and seen.learner.calibration is not None:
         parts += [Text(), calibration_table(seen.learner.calibration, slides)]

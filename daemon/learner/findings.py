@@ -130,6 +130,8 @@ class Findings:
             return
         spent = self._turns.spent()
         q, x = self._learning.kept(ROWS)
+        if len(q) < FEWEST_ROWS:  # the others are doubted
+            return
         self._checked = count
         self.doubts = plausibility(self._robot, q, x, chain=self._learning.nominal.chain).sentences
         self._turns.took(begin, self._turns.spent() - spent)

@@ -8,7 +8,6 @@ Both directions carry frames: four bytes of length, then a MessagePack message.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import select
 import signal
@@ -35,6 +34,7 @@ NICENESS = 5
 LONGEST_REST_S = 5.0
 # A child that owes an answer and uses no processor for this long is stopped or locked up: the learner's `WatchdogSec`.
 HUNG_AFTER_S = 60.0
+READS_WITHIN_S = 0.1  # a child that waits for orders takes some of them within this time
 _LENGTH = struct.Struct("<I")
 
 
@@ -99,7 +99,7 @@ class SolverProcess:
 
     def __init__(self) -> None:
         self._child: subprocess.Popen[bytes] | None = None
-        self._received = bytearray()
+        self._received, self._unsent = bytearray(), bytearray()
         self._owes = False
         self._moved_s, self._looked_at = 0.0, 0.0  # the child's processor time at the last look, and when that was
 
@@ -122,10 +122,12 @@ class SolverProcess:
             # A process group of its own: Ctrl-C in a terminal is handled by the parent.
             try:
                 self._child = subprocess.Popen(
-                    command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, process_group=0
+                    command, bufsize=0, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, process_group=0
                 )
             except OSError as error:  # out of memory, or too many open files
                 raise SolverLostError(f"the solver cannot be started: {error.strerror}; it is tried again") from error
+            if self._child.stdin is not None:
+                os.set_blocking(self._child.stdin.fileno(), False)
         self._send(Start(_fields(task), robot))
 
     def learn(self, q: FloatArray, x: FloatArray, turns: FloatArray | None = None, robot: int = 0) -> None:
@@ -143,6 +145,7 @@ class SolverProcess:
         child = self._child
         if child is None or child.stdout is None:
             return None
+        self._hand_over()
         while select.select([child.stdout], [], [], 0)[0]:
             part = os.read(child.stdout.fileno(), 1 << 20)
             if not part:
@@ -180,10 +183,19 @@ class SolverProcess:
         return Solved(**solved, orientation=None if turned is None else OrientationSolution(**turned))
 
     def _send(self, order: Start | Learn | Solve) -> None:
-        if self._child is None or self._child.stdin is None:
+        if self._child is None:
             raise SolverLostError("the solver has not been started")
+        self._unsent += _framed(order)
+        self._hand_over()
+
+    def _hand_over(self) -> None:
+        """Write what the child reads now; `poll` writes the rest, so that a stopped child blocks nothing."""
+        child = self._child
+        if child is None or child.stdin is None:
+            return
         try:
-            _write(self._child.stdin, order)
+            while self._unsent and select.select([], [child.stdin], [], READS_WITHIN_S)[1]:
+                del self._unsent[: os.write(child.stdin.fileno(), self._unsent)]
         except OSError as error:
             raise self._lost() from error
 
@@ -194,10 +206,10 @@ class SolverProcess:
     def _end(self) -> int | None:
         child, self._child, self._owes = self._child, None, False
         self._received.clear()
+        self._unsent.clear()
         if child is None or child.stdin is None or child.stdout is None:
             return None
-        with contextlib.suppress(OSError):  # buffered data has no reader any more
-            child.stdin.close()
+        child.stdin.close()
         child.terminate()
         try:
             return child.wait(END_LIMIT_S)
@@ -237,10 +249,14 @@ def _solve(solver: DirectSolver, solutions: IO[bytes]) -> float:
     return time.process_time() - begin
 
 
-def _write(stream: IO[bytes], message: Start | Learn | Solve | dict[str, Any]) -> None:
-    payload = msgspec.msgpack.encode(message)
-    stream.write(_LENGTH.pack(len(payload)) + payload)
+def _write(stream: IO[bytes], solved: dict[str, Any]) -> None:
+    stream.write(_framed(solved))
     stream.flush()
+
+
+def _framed(message: Start | Learn | Solve | dict[str, Any]) -> bytes:
+    payload = msgspec.msgpack.encode(message)
+    return _LENGTH.pack(len(payload)) + payload
 
 
 def _read(stream: IO[bytes]) -> Start | Learn | Solve | None:

@@ -156,7 +156,11 @@ class PingScanner:
         servo, bus = FoundServo(name, port.baud, self.protocol, id), kind.bus(name, port, clock, latency_s)
         head = _asked(bus, kind, id, self._head)
         if head.trouble is Trouble.TIMEOUT:
-            return replace(servo, troubles=tuple(dict.fromkeys(kind.packets.pinged_only for kind in self._kinds)))
+            said = {kind.packets.pinged_only: kind.name for kind in self._kinds}
+            alone = len(said) == 1
+            return replace(
+                servo, troubles=tuple(text if alone else f"if {name}: {text}" for text, name in said.items())
+            )
         if head.trouble is not None:
             return replace(servo, is_double=True, troubles=(DOUBLE,))
         told = [found for kind in self._kinds if (found := kind.told(head.answers[0].status.data, id)) is not None]

@@ -331,12 +331,11 @@ def test_an_encrypted_archive_is_refused(backed_up, elsewhere) -> None:
     assert "is no backup, or is damaged" in refused(backed_up, elsewhere)
 
 
-@pytest.mark.parametrize("folder", ["/srv/state", "../state", "a/../../state"])
+@pytest.mark.parametrize("folder", ["/srv/state", "../state", "a/../../state", ".git/hooks"])
 def test_a_state_dir_elsewhere_is_asked_for(backed_up, elsewhere, folder, tmp_path) -> None:
     archive = altered(backed_up, described(lambda text: text.replace('"state"', json.dumps(folder))))
-    assert "keeps pairs and checkpoint outside of its folder. Nothing was changed. Give --state-dir" in refused(
-        archive, elsewhere
-    )
+    where = "in a hidden folder" if folder.startswith(".git") else "outside of its folder"
+    assert f"keeps pairs and checkpoint {where}. Nothing was changed. Give --state-dir" in refused(archive, elsewhere)
     with Backup(archive) as backup:
         restore(backup, elsewhere, tmp_path / "given")
     assert len(stored(tmp_path / "given" / "pairs.sqlite")) == PAIRS

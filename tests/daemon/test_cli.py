@@ -41,7 +41,7 @@ def robot(tmp_path: Path, free_endpoint) -> Path:
 
 
 # All of robot.toml is checked only where nothing answers.
-AS_IF_ANSWERED = "from bodyschema.daemon.client_config import ClientConfig; ClientConfig.check = lambda _: None"
+AS_IF_ANSWERED = "from bodyschema.daemon.client_config import ClientConfig; ClientConfig.fault = lambda _: ''"
 
 
 def loaded_by(*lines: list[str], cwd: Path, first: str = "") -> set[str]:
@@ -88,15 +88,23 @@ def test_status_and_predict_load_no_numpy(robot) -> None:
 
 def test_a_wrong_request_is_told_what_is_wrong_in_robot_toml(robot) -> None:
     robot.write_text(robot.read_text() + "[daemon.more]\n")
-    with pytest.raises(ConfigError, match="more"):
+    with pytest.raises(RequestError, match=r"has 1 numbers.* unknown key 'more'"):
         app(["predict", "0", "--robot", str(robot)], exit_on_error=False, result_action="return_value")
 
 
-@pytest.mark.parametrize("words", ["status", "status --json", "predict 0 0", "ik 0.1 0.2 0.3"])
-def test_silence_is_explained_by_a_wrong_table(robot, words) -> None:
-    robot.write_text(robot.read_text() + "[vision]\nradius = 1\n")
-    with pytest.raises(ConfigError, match="unknown key 'radius'"):
+@pytest.mark.parametrize("words", ["status", "predict 0 0", "ik 0.1 0.2 0.3", "command pause"])
+@pytest.mark.parametrize(("missing", "fault"), [(True, "cannot read the URDF"), (False, "unknown key 'radius'")])
+def test_silence_is_told_before_a_fault_of_robot_toml(robot, capsys, words, missing, fault) -> None:
+    """A client's machine need not have every file that robot.toml names."""
+    if missing:
+        robot.with_name("arm.urdf").unlink()
+    else:
+        robot.write_text(robot.read_text() + "[vision]\nradius = 1\n")
+    with pytest.raises(BusError) as raised:
         called(*words.split(), "--robot", robot)
+    silence, cause = f"{capsys.readouterr().out}{raised.value}".split("cannot start on this machine: ")
+    assert "nothing listens on" in silence or "learner does not answer" in silence
+    assert fault in cause
 
 
 def test_a_message_does_not_quote_a_file_without_end(robot) -> None:

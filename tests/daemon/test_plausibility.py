@@ -241,7 +241,8 @@ def test_a_right_recording_is_not_doubted(seed) -> None:
     assert pairs(seed, noise=noise, zeros_deg=zeros, tool=tool, count=40 + 100 * seed).seen().sentences == ()
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 12))])
+# With nominal links the pairs of seed 24 fit better with the zero of q5 90° off.
+@pytest.mark.parametrize("seed", [0, 24, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 12))])
 def test_a_right_recording_of_a_short_path_is_not_doubted(seed) -> None:
     """Along a path the errors of neighbouring pairs are alike, and a wrong reading may fit them by chance."""
     assert guided(seed, steps=120).seen().sentences == ()
@@ -299,6 +300,14 @@ def test_positions_of_another_row_in_half_of_the_rows_are_named(rows, said) -> N
     q[rows] = np.roll(q[rows], 1, axis=0)
     found = replace(right, q=q).seen()
     assert f"% of the rows: these fit the angles of {said}" in (found.refusal or "")
+
+
+@pytest.mark.parametrize("step", [2, pytest.param(5, marks=pytest.mark.soak)])
+def test_rows_that_hold_their_neighbours_angles_are_named(step) -> None:
+    right = pairs()
+    q = right.q.copy()
+    q[step - 1 :: step] = q[step - 2 :: step]
+    assert "their angles fit the positions of 1 row earlier" in (replace(right, q=q).seen().refusal or "")
 
 
 def test_the_direction_of_a_joint_through_the_marker_is_not_shown() -> None:
@@ -461,3 +470,20 @@ def test_the_live_learner_names_a_wrong_reading(case) -> None:
         findings.renew()
     assert (case or "") in "".join(findings.doubts)
     assert bool(findings.doubts) == (case is not None)
+
+
+def test_the_live_learner_waits_for_as_many_pairs_as_decide() -> None:
+    """Doubted pairs do not count."""
+    wrong, rows = pairs().read(MISREAD["q3 counts the other way"]), [35, 40]
+    learning = SimpleNamespace(
+        counters=SimpleNamespace(since_change=40),
+        kept=lambda _: (lambda count: (wrong.q[:count], wrong.x[:count]))(rows.pop(0)),
+        nominal=SimpleNamespace(chain=arm()),
+        belief=None,
+        snapshot=SimpleNamespace(answering="prior"),
+    )
+    findings = Findings(learning, robot(), SystemClock())
+    findings.renew()
+    assert findings.doubts == ()
+    findings.renew()
+    assert "q3 counts the other way" in findings.doubts[0]

@@ -119,6 +119,18 @@ def test_a_solver_that_hangs_is_replaced(monkeypatch) -> None:
         assert process.pid is None
 
 
+def test_a_solver_that_reads_nothing_blocks_nobody(monkeypatch) -> None:
+    monkeypatch.setattr(solver_process, "module_command", lambda _: ("sleep", "60"))
+    monkeypatch.setattr(solver_process, "READS_WITHIN_S", 0.0)
+    monkeypatch.setattr(solver_process, "HUNG_AFTER_S", 0.0)
+    with solver_process.SolverProcess() as process:
+        process.start(TASK)
+        process.learn(np.zeros((10_000, 3)), np.zeros((10_000, 3)))
+        process.solve()
+        with pytest.raises(SolverLostError, match="started again"):
+            list(iter(process.poll, ()))
+
+
 def test_a_solver_is_kept_where_its_clock_is_unknown(monkeypatch) -> None:
     def unknown(clock: int) -> float:
         raise OSError(22, "Invalid argument")

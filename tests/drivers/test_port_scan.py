@@ -191,6 +191,14 @@ def test_a_servo_that_answers_no_read_is_told_with_its_register() -> None:
     assert "Status Return Level (68" in found(silent)[0].troubles[0]
 
 
+def test_a_servo_of_either_make_that_answers_no_read_is_told_of_both() -> None:
+    silent = servo("MX-28", 3)
+    silent["status_return"] = 0
+    dynamixel_1, of_feetech = found(silent)[0].troubles
+    assert dynamixel_1.startswith("if Dynamixel 1.0: answers PING but no READ: its Status Return Level (16")
+    assert of_feetech == f"if Feetech: {FeetechPackets.pinged_only}"
+
+
 def test_a_feetech_servo_without_read_is_not_told_of_its_level() -> None:
     assert "Status Return" not in FeetechPackets.pinged_only
     level_0 = feetech("STS3215", 3)

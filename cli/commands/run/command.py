@@ -37,7 +37,7 @@ def command(
 
     Next: `bodyschema status`.
     """
-    from bodyschema.daemon.config import Config
+    from bodyschema.daemon.client_config import ClientConfig
     from bodyschema.daemon.transport.bus import client
     from bodyschema.daemon.transport.keys import Keys
     from bodyschema.daemon.transport.wire import CommandReply, CommandRequest, decode, encode
@@ -47,9 +47,9 @@ def command(
         raise RequestError(f"{name} is a command of the learner: drop --to")
     if process == "learner" and name in SAMPLERS and name not in BOTHS:
         raise RequestError(f"{name} is a command of the sampler: drop --to")
-    config = Config.load(robot)
-    with client(config.route(process)) as bus:
-        reply = bus.ask_one(Keys(config.robot.name).command(process), encode(CommandRequest(name)))
+    config = ClientConfig.load(robot)
+    with config.checked_on_error(), client(config.route(process)) as bus:
+        reply = bus.ask_one(Keys(config.name).command(process), encode(CommandRequest(name)))
     done = decode(reply, CommandReply)
     if as_json:
         print_json(done)

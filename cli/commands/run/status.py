@@ -26,6 +26,7 @@ def status(
     """
     from bodyschema.cli.terminal.status_view import Watcher, as_json, screen
     from bodyschema.daemon.client_config import ClientConfig
+    from bodyschema.interfaces.errors import BusError
 
     config = ClientConfig.load(robot)
     console = Console(highlight=False)
@@ -40,9 +41,9 @@ def status(
             if json:
                 console.file.write(as_json(seen) + "\n")
                 console.file.flush()
-            if seen.nobody and not watch:
-                config.check()  # `Start it` would be no remedy
             if not json:
                 console.print(screen(seen, config))
             if seen.nobody and not watch:
+                if fault := config.fault():  # `Start it` would be no remedy
+                    raise BusError(fault)
                 sys.exit(1)
