@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import threading
+from collections.abc import Callable
 
 import numpy as np
 
@@ -38,7 +39,13 @@ class OnlineLearner:
     """
 
     def __init__(
-        self, nominal: NominalModel, settings: LearnerConfig, solver: Solver, *, together_s: float = 0.0
+        self,
+        nominal: NominalModel,
+        settings: LearnerConfig,
+        solver: Solver,
+        *,
+        together_s: float = 0.0,
+        common: Callable[[FloatArray], FloatArray] | None = None,
     ) -> None:
         """Initialise before any pair.
 
@@ -48,8 +55,9 @@ class OnlineLearner:
             solver: of the models that need all pairs.
             together_s: maximum wait of pairs to be judged together [s], which costs a fraction of judging each. The
                 instant learner does not wait.
+            common: as `Snapshot` has it.
         """
-        self._nominal, self._settings = nominal, settings
+        self._nominal, self._settings, self._common = nominal, settings, common
         self._solving = SolverClient(solver, settings.solve_every)
         self._lock = threading.Lock()
         self._core = LearnerCore(nominal, settings, together_s)
@@ -362,6 +370,7 @@ class OnlineLearner:
             newest_utc=self._core.newest_utc,
             waiting_for=self._waiting_for() if regime is None else "",
             orientation=None if regime is None else regime.orientation,
+            common=self._common,
         )
 
     def _waiting_for(self) -> str:
