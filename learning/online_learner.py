@@ -125,9 +125,9 @@ class OnlineLearner:
             return Recent(0, {}) if regime is None else regime.recent
 
     def claimed_error_m(self) -> float | None:
-        """Return the expected mean distance to the truth [m] in the data's region; None while there are too few pairs.
+        """Return the expected mean distance [m] in the data's region to what the cameras see without noise.
 
-        The region: within a few degrees (`REGION_RAD` per joint) of the kept pairs.
+        None while there are too few pairs. The region: within a few degrees (`REGION_RAD` per joint) of the kept pairs.
         """
         with self._lock:
             regime, snapshot = self._core.regimes.present, self._snapshot
@@ -138,6 +138,15 @@ class OnlineLearner:
                 return None
             region = self._region(regime)
         return snapshot.expected_error_m(region)
+
+    def common_error_m(self) -> float | None:
+        """Return the expected mean error [m] in the data's region that all pairs share; None if it is not known."""
+        with self._lock:
+            regime, snapshot = self._core.regimes.present, self._snapshot
+            if regime is None or len(regime.memory) == 0:
+                return None
+            region = self._region(regime)
+        return snapshot.common_error_m(region)
 
     def _region(self, regime: Regime) -> FloatArray:
         """Return poses (n, d) [rad, m] that represent the data's region; the same for the same pairs."""

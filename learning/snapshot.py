@@ -109,6 +109,11 @@ class Snapshot:
         return Prediction(x, sigma, in_support, quaternions(rotations), np.sqrt(variance))
 
     def expected_error_m(self, q: FloatArray) -> float:
-        """Return the expected mean distance to the truth [m], from the sigmas of predictions at q (n, d) [rad]."""
-        variance = np.square(self.predict(q).sigma).sum(axis=1)
-        return MEAN_OVER_RMS * float(np.sqrt(variance).mean())
+        """Return the expected mean distance [m] to what the cameras see without noise, at q (n, d) [rad]."""
+        return MEAN_OVER_RMS * float(np.sqrt(self.claim.variance(q).sum(axis=1)).mean())
+
+    def common_error_m(self, q: FloatArray) -> float | None:
+        """Return the expected mean error [m] that all pairs share, at q (n, d) [rad]; None if not known."""
+        if self.common is None:
+            return None
+        return MEAN_OVER_RMS * float(np.sqrt(self.common(self.require_model().predict(q)).sum(axis=1)).mean())

@@ -165,6 +165,7 @@ class Learner:
             prequential_m=dict(recent.means),
             prequential_pairs=recent.pairs,
             claimed_error_m=self._learning.claimed_error_m(),
+            common_error_m=self._learning.common_error_m(),
             curve=self._learning.curve,
             model=snapshot.digest,
             calibration=self._findings.calibration,
