@@ -16,6 +16,8 @@ from .stereo_rig import Rig, StereoRig
 
 # Distance of the positions that decide which turn of the frame is no error, and that are taken for typical [m].
 AHEAD_M = 0.6
+# Nearer, the two eyes of a pair share no view.
+_NEAREST_M = 0.1 * AHEAD_M
 _GRID = 9  # points across the image, and down
 _STEP = 1e-3  # of a direction, for the growth of a small marker
 
@@ -56,6 +58,10 @@ class CommonError:
         return AHEAD_M * np.column_stack([across.ravel(), down.ravel(), np.ones(across.size)])
 
     @cached_property
+    def _rectification(self) -> Rectification:
+        return Rectification(self.rig)
+
+    @cached_property
     def _root(self) -> FloatArray:
         """Root (p, k) of the calibration's covariance, without what rounding leaves."""
         sigma = self.rig.sigma
@@ -73,17 +79,17 @@ class CommonError:
     @cached_property
     def _view(self) -> FloatArray:
         """Lowest and highest x/z and y/z (2, 2) in the rectified images."""
-        pinhole = Rectification(self.rig).calibration
+        pinhole = self._rectification.calibration
         corners = np.array([[0.0, 0.0], np.array(pinhole.image_size_px) - 1.0])
         return np.asarray((corners - pinhole.principal_point_px) / pinhole.focal_px, np.float64)
 
     def _within_view(self, x: FloatArray) -> FloatArray:
         """Return the positions x (n, 3), each moved to where the cameras could see it: models may predict others."""
-        ahead = np.maximum(x[:, 2:], 1e-6)
+        ahead = np.maximum(x[:, 2:], _NEAREST_M)
         return np.concatenate([ahead * np.clip(x[:, :2] / ahead, *self._view), ahead], axis=1)
 
     def _raw(self, x: FloatArray) -> FloatArray:
-        R = Rectification(self.rig).R_rectified_left
+        R = self._rectification.R_rectified_left
         own = _by_two_eyes(self.rig, x @ R) if isinstance(self.rig, StereoRig) else _by_one_eye(self.rig.left, x)
         errors = R @ own @ self._root
         return np.concatenate([errors, self.size_sigma * x[:, :, None]], axis=2) if self.size_sigma else errors
@@ -100,7 +106,7 @@ def _by_two_eyes(rig: StereoRig, x: FloatArray) -> FloatArray:
     by_rig = np.zeros((n, 4, 2 * p + 6))
     by_rig[:, :2, :p] = by_left_lens.reshape(n, 2, p)
     by_rig[:, 2:, p:] = np.concatenate([by_right_lens, by_pose], axis=1).reshape(n, 2, p + 6)
-    return np.asarray(-np.linalg.pinv(by_x) @ by_rig, np.float64)
+    return np.asarray(-np.linalg.solve(by_x.mT @ by_x, by_x.mT @ by_rig), np.float64)
 
 
 def _by_one_eye(lens: Lens, x: FloatArray) -> FloatArray:
