@@ -82,7 +82,7 @@ def online(
     nominal = NominalModel(arm.nominal, arm.lower, arm.upper, pose_known=False, marker_known=False)
     learner = OnlineLearner(nominal, LearnerConfig(), DirectSolver(), common=common)
     for k in range(len(q)):
-        pair = Pair("one", k + 1, 1, k / 30.0, "", *(frozen_array(each[k]) for each in (q, x, cov)))
+        pair = Pair("one", k + 1, 1, k / 30.0, "", frozen_array(q[k]), frozen_array(x[k]), frozen_array(cov[k]))
         learner.learn(pair, pair.t)
         while k % 30 == 29 and learner.work():
             pass
@@ -95,7 +95,7 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=60)
     parser.add_argument("--online", type=int, default=0, help="arms that the online learner learns too")
     given = parser.parse_args()
-    rows: dict[str, list[tuple[float, float, float, float]]] = {}
+    rows: dict[str, list[tuple[float, ...]]] = {}
     for seed in range(given.arms):
         rng = np.random.default_rng([20261126, seed])
         arm = Arm(rng)
