@@ -109,10 +109,10 @@ def test_claimed_intervals_cover_as_they_say():
 
 def test_intervals_cover_errors_that_all_pairs_share():
     inside = {True: [], False: []}
-    for seed in range(40):
+    for seed in range(25):
         rng = np.random.default_rng(seed)
-        arm = rough_arm(rng)
-        (q, x), asked = arm.pairs(rng, 60, 0.001), random_q(rng, arm.kinds, 100, 80)
+        arm = rough_arm(rng, "RRRR")
+        (q, x), asked = arm.pairs(rng, 40, 0.001), random_q(rng, arm.kinds, 100, 80)
         common = 0.02 * arm.real.positions(q)[:, :, None] * np.eye(3)  # each axis's scale is off by 2 %
         seen = x + common @ rng.standard_normal(3)
         for told, covered in inside.items():
@@ -120,7 +120,7 @@ def test_intervals_cover_errors_that_all_pairs_share():
             learner.learn(q, seen, 0.001, common=common if told else None)
             estimate = learner.estimate(asked)
             covered.append((np.abs(estimate.x - arm.real.positions(asked)) < estimate.sigma).mean())
-    assert 0.60 < np.mean(inside[True]) < 0.76
+    assert 0.58 < np.mean(inside[True]) < 0.80
     assert np.mean(inside[False]) < 0.58
 
 
