@@ -250,7 +250,7 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
             told_noise_mm=1e3 * report.noise if calibration.noise_told else None,
             misfit=report.misfit,
             drawn_error_mm=1e3 * _mean_error(calibration.placed.chain.positions(recording.q), recording),
-            learnt_error_mm=1e3 * _mean_error(learner.predict(recording.q), recording),
+            learnt_error_mm=1e3 * float(np.linalg.norm(calibration.residuals, axis=1).mean()),
             axes_deg=None if made is None else _DEG * made.axes,
             points_mm=None if made is None else 1e3 * made.points,
             shown=calibration.shown,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -79,6 +80,7 @@ class Calibration:
         shares: how probable each is (m,); they add up to 1.
         noise_told: whether the noise was told, not estimated.
         trusted: what was held as the URDF has it.
+        common: errors (n, 3, k) [m] that all rows share, at 1 sigma of each of k unknowns; None: none are known.
     """
 
     robot: RobotDescription
@@ -88,6 +90,7 @@ class Calibration:
     shares: FloatArray
     noise_told: bool
     trusted: Trusted = "nothing"
+    common: FloatArray | None = None
 
     @classmethod
     def of(
@@ -98,6 +101,7 @@ class Calibration:
         sigma_m: float | None,
         zeros_rad: float,
         trusted: Trusted = "nothing",
+        common: Callable[[FloatArray], FloatArray] | None = None,
     ) -> Calibration:
         """Learn `recording`, around the nominal model.
 
@@ -105,6 +109,8 @@ class Calibration:
             sigma_m: 1-sigma of the positions [m] where the recording has none; None: estimated.
             zeros_rad: how far joint zeros may be off (1-sigma) [rad].
             trusted: what is held as the URDF has it: its links, or its joint zeros too.
+            common: returns the errors (n, 3, k) [m] that all rows share at positions (n, 3) [m], at 1 sigma of each of
+                k unknowns; None: none are known.
 
         Raises:
             CalibrationError: there are too few pairs, or they do not fit the robot at all.
@@ -119,12 +125,15 @@ class Calibration:
             turned = recording.orientation
             turns = None if turned is None else rotation_matrices("orientation", turned)
             placed = align(robot.chain, recording.q, recording.x, turns=turns, **known)
-            learners, shares = _learners(placed.chain, _tolerances(robot, zeros_rad, trusted), recording, sigma_m)
+            choices = _tolerances(robot, zeros_rad, trusted)
+            # Measured positions would share their noise with the rows.
+            shared = None if common is None else common(placed.chain.positions(recording.q))
+            learners, shares = _learners(placed.chain, choices, recording, sigma_m, shared)
             learners[0].report()  # fits it, so that what cannot be fitted shows here
         except KBMapsError as error:
             raise CalibrationError(f"no chain can be fitted to the recording: {error}") from error
         told = sigma_m is not None or recording.cov is not None
-        return cls(robot, recording, placed, learners, shares, told, trusted)
+        return cls(robot, recording, placed, learners, shares, told, trusted, shared)
 
     @property
     def learner(self) -> RigidLearner:
@@ -143,8 +152,13 @@ class Calibration:
         report = self.learner.report()
         if not self.noise_told:
             return report.noise
-        squares = np.sort(np.square(self.learner.predict(self.recording.q) - self.recording.x).sum(axis=1))
+        squares = np.sort(np.square(self.residuals).sum(axis=1))
         return float(np.sqrt(squares[: len(squares) - report.outliers].sum() / max(report.freedom, 1.0)))
+
+    @property
+    def residuals(self) -> FloatArray:
+        """Measured minus predicted positions (n, 3) [m], without the estimated errors that all rows share."""
+        return _residuals(self.learner, self.recording, np.arange(len(self.recording)), self.common)
 
     @cached_property
     def expected(self) -> Expected | None:
@@ -154,19 +168,19 @@ class Calibration:
         if rows < _Settings.folds * 2 * len(self.robot.joints):
             return None
         sigma_m = self.learner.report().noise if self.noise_told else None
-        told = _told(self.recording, self.learner, np.arange(rows))
-        predicted = np.empty_like(self.recording.x)
+        told = _told(self.recording, self.learner, np.arange(rows), self.common)
+        distances = np.empty(rows)
         for held_out in range(_Settings.folds):
             kept = np.flatnonzero(fold != held_out)
             kept = kept[np.unique(np.linspace(0, len(kept) - 1, _Settings.fold_rows).astype(np.intp))]
             fresh = RigidLearner(self.placed.chain, self.learner.tolerances)
-            q, x = self.recording.q[kept], self.recording.x[kept]
-            fresh.learn(q, x, sigma_m) if told is None else fresh.learn(q, x, cov=told[kept])
+            _learn(fresh, self.recording, kept, sigma_m, told, self.common)
             try:
-                predicted[fold == held_out] = fresh.predict(self.recording.q[fold == held_out])
+                apart = _residuals(fresh, self.recording, np.flatnonzero(fold == held_out), self.common)
             except KBMapsError:
                 return None
-        distances = np.linalg.norm(predicted - self.recording.x, axis=1)[self.learner.inliers]
+            distances[fold == held_out] = np.linalg.norm(apart, axis=1)
+        distances = distances[self.learner.inliers]
         return Expected(float(distances.mean()), float(np.quantile(distances, 0.95)))
 
     @cached_property
@@ -191,7 +205,11 @@ class Calibration:
 
 
 def _learners(
-    nominal: RigidChain, choices: list[ChainTolerances], recording: Recording, sigma_m: float | None
+    nominal: RigidChain,
+    choices: list[ChainTolerances],
+    recording: Recording,
+    sigma_m: float | None,
+    common: FloatArray | None,
 ) -> tuple[tuple[RigidLearner, ...], FloatArray]:
     """Return learners of all pairs with the tolerances that a sample of the pairs makes probable, and their shares."""
     told = None if recording.cov is None else recording.cov + ROUNDING_M**2 * np.eye(3)
@@ -199,31 +217,46 @@ def _learners(
 
     def learner(tolerances: ChainTolerances, rows: IntArray) -> RigidLearner:
         fresh = RigidLearner(nominal, tolerances)
-        if told is None:
-            fresh.learn(recording.q[rows], recording.x[rows], sigma_m)
-        else:
-            fresh.learn(recording.q[rows], recording.x[rows], cov=told[rows])
+        _learn(fresh, recording, rows, sigma_m, told, common)
         return fresh
 
-    told = _told(recording, learner(choices[-1], some), some)
+    told = _told(recording, learner(choices[-1], some), some, common)
     evidence = np.array([learner(tolerances, some).log_evidence for tolerances in choices])
     kept, shares = probable(evidence)
     everything = np.arange(len(recording))
     return tuple(learner(choices[k], everything) for k in kept), shares
 
 
-def _told(recording: Recording, learner: RigidLearner, rows: IntArray) -> FloatArray | None:
+def _residuals(learner: RigidLearner, recording: Recording, rows: IntArray, common: FloatArray | None) -> FloatArray:
+    apart = recording.x[rows] - learner.predict(recording.q[rows])
+    return apart if common is None else apart - common[rows] @ learner.unknowns
+
+
+def _learn(
+    learner: RigidLearner,
+    recording: Recording,
+    rows: IntArray,
+    sigma_m: float | None,
+    told: FloatArray | None,
+    common: FloatArray | None,
+) -> None:
+    noise = {"sigma": sigma_m} if told is None else {"cov": told[rows]}
+    shared = None if common is None else common[rows]
+    learner.learn(recording.q[rows], recording.x[rows], **noise, common=shared)
+
+
+def _told(recording: Recording, learner: RigidLearner, rows: IntArray, common: FloatArray | None) -> FloatArray | None:
     """Return the stated covariances (n, 3, 3) [m²], the arm's share added in some rows; None if none are stated."""
     if recording.cov is None:
         return None
-    return recording.cov + (ROUNDING_M**2 + _of_the_arm(learner, recording, rows)) * np.eye(3)
+    return recording.cov + (ROUNDING_M**2 + _of_the_arm(learner, recording, rows, common)) * np.eye(3)
 
 
-def _of_the_arm(learner: RigidLearner, recording: Recording, rows: IntArray) -> float:
+def _of_the_arm(learner: RigidLearner, recording: Recording, rows: IntArray, common: FloatArray | None) -> float:
     """Return the variance [m²] per coordinate that these rows have beyond the instrument's: encoders, backlash."""
     assert recording.cov is not None
     good = rows[learner.inliers]
-    residuals = recording.x[good] - learner.predict(recording.q[good])
+    residuals = _residuals(learner, recording, rows, common)[learner.inliers]
     freedom = max(learner.scatter.freedom, 1.0)
     return unexplained_variance(residuals, recording.cov[good] + ROUNDING_M**2 * np.eye(3), freedom)
 

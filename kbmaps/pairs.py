@@ -23,6 +23,7 @@ class Pairs:
         unit: 1-sigma (n,) of each coordinate [m] up to a common factor; the geometric mean of all directions.
         known: whether that factor is 1; otherwise it has to be estimated.
         shape: (n, 3, 3) of determinant 1: what makes an error as large in all directions; None where it is.
+        common: (n, 3, k) [m], the errors that k unknowns shared by all pairs bring at 1 sigma of each; None: none.
     """
 
     q: FloatArray
@@ -30,14 +31,15 @@ class Pairs:
     unit: FloatArray
     known: bool
     shape: FloatArray | None = None
+    common: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.q)
 
     def chosen(self, mask: BoolArray) -> Pairs:
         """Return the pairs selected by the mask (n,), in the same units."""
-        shape = None if self.shape is None else self.shape[mask]
-        return Pairs(self.q[mask], self.x[mask], self.unit[mask], self.known, shape)
+        shape, common = (None if each is None else each[mask] for each in (self.shape, self.common))
+        return Pairs(self.q[mask], self.x[mask], self.unit[mask], self.known, shape, common)
 
     def whitened(self, errors: FloatArray) -> FloatArray:
         """Return errors (n, 3) or (n, 3, k) [m], scaled to be isotropic."""
@@ -46,17 +48,23 @@ class Pairs:
         return (self.shape @ errors[..., None])[..., 0] if errors.ndim == 2 else self.shape @ errors
 
 
-def with_units(q: FloatArray, x: FloatArray, sigma: FloatArray, shape: FloatArray | None = None) -> Pairs:
-    """Return pairs from their sigma (n,) [m], NaN where unknown, and the shape of their errors as in `Pairs`.
+def with_units(
+    q: FloatArray,
+    x: FloatArray,
+    sigma: FloatArray,
+    shape: FloatArray | None = None,
+    common: FloatArray | None = None,
+) -> Pairs:
+    """Return pairs from their sigma (n,) [m], NaN where unknown, and the rest as in `Pairs`.
 
     As soon as one is unknown, the others count relative to their median, which also replaces the missing ones.
     """
     told = ~np.isnan(sigma)
     if told.all():
-        return Pairs(q, x, sigma, len(q) > 0, shape)
+        return Pairs(q, x, sigma, len(q) > 0, shape, common)
     if not told.any():
-        return Pairs(q, x, np.ones(len(q)), False, shape)
-    return Pairs(q, x, np.where(told, sigma / np.median(sigma[told]), 1.0), False, shape)
+        return Pairs(q, x, np.ones(len(q)), False, shape, common)
+    return Pairs(q, x, np.where(told, sigma / np.median(sigma[told]), 1.0), False, shape, common)
 
 
 def stored_pairs(arrays: Mapping[str, FloatArray], joints: int) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import itertools
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -48,7 +48,13 @@ class OnlineLearner:
     """
 
     def __init__(
-        self, nominal: NominalModel, settings: LearnerConfig, solver: Solver, *, together_s: float = 0.0
+        self,
+        nominal: NominalModel,
+        settings: LearnerConfig,
+        solver: Solver,
+        *,
+        together_s: float = 0.0,
+        common: Callable[[FloatArray], FloatArray] | None = None,
     ) -> None:
         """Initialise before any pair.
 
@@ -58,8 +64,9 @@ class OnlineLearner:
             solver: of the models that need all pairs.
             together_s: maximum wait of pairs to be judged together [s], which costs a fraction of judging each. The
                 instant learner does not wait.
+            common: as `Snapshot` has it.
         """
-        self.nominal, self._settings = nominal, settings
+        self.nominal, self._settings, self._common = nominal, settings, common
         self._solving = SolverClient(solver, settings.solve_every)
         self._lock = threading.Lock()
         self._together_s = together_s
@@ -128,9 +135,9 @@ class OnlineLearner:
             return Recent(0, {}) if regime is None else regime.recent
 
     def claimed_error_m(self) -> float | None:
-        """Return the expected mean distance to the truth [m] in the data's region; None while there are too few pairs.
+        """Return the expected mean distance [m] in the data's region to what the cameras see without noise.
 
-        The region: within a few degrees (`REGION_RAD` per joint) of the kept pairs.
+        None while there are too few pairs. The region: within a few degrees (`REGION_RAD` per joint) of the kept pairs.
         """
         with self._lock:
             regime, snapshot = self._regimes.present, self._snapshot
@@ -141,6 +148,15 @@ class OnlineLearner:
                 return None
             region = self._region(regime)
         return snapshot.expected_error_m(region)
+
+    def common_error_m(self) -> float | None:
+        """Return the expected mean error [m] in the data's region that all pairs share; None if it is not known."""
+        with self._lock:
+            regime, snapshot = self._core.regimes.present, self._snapshot
+            if regime is None or len(regime.memory) == 0:
+                return None
+            region = self._region(regime)
+        return snapshot.common_error_m(region)
 
     def _region(self, regime: Regime) -> FloatArray:
         """Return poses (n, d) [rad, m] that represent the data's region; the same for the same pairs."""
@@ -456,6 +472,7 @@ class OnlineLearner:
             newest_utc=self._newest_utc,
             waiting_for=self._waiting_for() if regime is None else "",
             orientation=None if regime is None else regime.orientation,
+            common=self._common,
         )
 
     def _waiting_for(self) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -58,6 +59,7 @@ class Snapshot:
         newest_utc: storage time of the last of them, ISO 8601; None before any since the learner started.
         waiting_for: what is missing while there is no model.
         orientation: the model of the marker's orientation; None if none was learnt.
+        common: variance (n, 3) [m²] at positions (n, 3) [m] of errors that all pairs share, so that no pair shows them.
     """
 
     answering: str
@@ -69,6 +71,7 @@ class Snapshot:
     newest_utc: str | None
     waiting_for: str
     orientation: OrientationModel | None = None
+    common: Callable[[FloatArray], FloatArray] | None = None
 
     @cached_property
     def digest(self) -> str:
@@ -104,7 +107,8 @@ class Snapshot:
             RequestError: an answer would not be a number.
         """
         x = self.require_model().predict(q)
-        sigma, in_support = np.sqrt(self.claim.variance(q)), unexplained(self.support, q) < IN_SUPPORT
+        shared = 0.0 if self.common is None else self.common(x)
+        sigma, in_support = np.sqrt(self.claim.variance(q) + shared), unexplained(self.support, q) < IN_SUPPORT
         if not (np.isfinite(x).all() and np.isfinite(sigma).all()):
             raise RequestError("the model has no finite answer at these joint angles; angles are in radians")
         if self.orientation is None:
@@ -113,6 +117,11 @@ class Snapshot:
         return Prediction(x, sigma, in_support, quaternions(rotations), np.sqrt(variance))
 
     def expected_error_m(self, q: FloatArray) -> float:
-        """Return the expected mean distance to the truth [m], from the sigmas of predictions at q (n, d) [rad]."""
-        variance = np.square(self.predict(q).sigma).sum(axis=1)
-        return MEAN_OVER_RMS * float(np.sqrt(variance).mean())
+        """Return the expected mean distance [m] to what the cameras see without noise, at q (n, d) [rad]."""
+        return MEAN_OVER_RMS * float(np.sqrt(self.claim.variance(q).sum(axis=1)).mean())
+
+    def common_error_m(self, q: FloatArray) -> float | None:
+        """Return the expected mean error [m] that all pairs share, at q (n, d) [rad]; None if not known."""
+        if self.common is None:
+            return None
+        return MEAN_OVER_RMS * float(np.sqrt(self.common(self.require_model().predict(q)).sum(axis=1)).mean())

@@ -36,19 +36,16 @@ from bodyschema.vision.calibration.report import page as report_page
 from bodyschema.vision.calibration.report.page import to_its_interval
 from bodyschema.vision.calibration.view import EYES, ONE_EYE
 from bodyschema.vision.printing.sheet import rulers_mm
+from bodyschema.vision.rig.common_error import AHEAD_M, CommonError
 from bodyschema.vision.rig.rectified import Rectification
 from bodyschema.vision.rig.rig_file import read_rig, write_rig
-from bodyschema.vision.rig.spread import covariance_of
 from bodyschema.vision.rig.stereo_rig import CalibrationError, OneEyeRig, StereoRig
-from bodyschema.vision.rig.triangulated import triangulated
 
 if TYPE_CHECKING:
     from bodyschema.cli.commands.calibrate.calibrate_cameras import KnownCameras
 
 REPORT = "report.html"
 NORMAL_95 = 1.96
-# Position uncertainty is reported for a point straight ahead at this distance [m].
-AHEAD_M = 0.6
 _SQUARES = re.compile(r"(\d{1,9})\s*[xX×]\s*(\d{1,9})")
 
 Tell = Callable[[str], None]
@@ -90,7 +87,8 @@ class UnusableImage(msgspec.Struct):
 class CamerasFile(msgspec.Struct):
     """Output of `bodyschema calibrate cameras --json`. Half widths are those of 95 % intervals.
 
-    One camera alone has no baseline. `right_camera` is the pose of the right optical frame in the left one. `refocused`
+    One camera alone has no baseline. Positions are those of a marker of known size all over the view, 0.6 m ahead.
+    `right_camera` is the pose of the right optical frame in the left one. `refocused`
     has a sentence for each sign that a lens refocused between the views, or was free to.
     """
 
@@ -100,7 +98,7 @@ class CamerasFile(msgspec.Struct):
     board: str
     baseline_mm: float | None
     baseline_half_width_mm: float | None
-    position_half_widths_mm: tuple[float, float, float] | None
+    position_half_widths_mm: tuple[float, float, float]
     reprojection_px: float
     held_out_px: float
     held_out_by_model_px: dict[str, float]
@@ -249,6 +247,7 @@ def figures(
     pair = rig if isinstance(rig, StereoRig) else None
     errors = zip(fitted.views, fitted.bundle.view_rms_px().tolist(), fitted.held_out.view_rms_px.tolist(), strict=True)
     widths = NORMAL_95 * rig.sigma
+    across, down, ahead = (1e3 * NORMAL_95 * CommonError(rig).typical).tolist()
     return CamerasFile(
         model=rig.model,
         image_size_px=rig.image_size_px,
@@ -256,7 +255,7 @@ def figures(
         board=rig.made.board,
         baseline_mm=None if pair is None else 1e3 * pair.baseline_m,
         baseline_half_width_mm=None if pair is None else 1e3 * NORMAL_95 * pair.baseline_sigma_m,
-        position_half_widths_mm=None if pair is None else _position_half_widths_mm(pair),
+        position_half_widths_mm=(across, down, ahead),
         reprojection_px=rig.made.reprojection_px,
         held_out_px=rig.made.held_out_px,
         held_out_by_model_px={str(model): px for model, px in result.rivals_px.items()},
@@ -334,16 +333,6 @@ def _right_camera(rig: StereoRig) -> HandEye:
     return HandEye.of("left_camera_optical_frame", "right_camera_optical_frame", pose(values), covariance)
 
 
-def _position_half_widths_mm(rig: StereoRig) -> tuple[float, float, float]:
-    """Return 95 % half widths of a position straight ahead in the left camera's frame, due to the calibration alone."""
-    eye = -rig.R_right_left.T @ rig.translation_m
-    x = np.array([[0.5 * eye[0], 0.5 * eye[1], AHEAD_M]])
-    left, right = rig.left.project(x), rig.right.project(x @ rig.R_right_left.T + rig.translation_m)
-    covariance = covariance_of(rig, lambda other: triangulated(other, left, right)[0])
-    across, down, ahead = (1e3 * NORMAL_95 * np.sqrt(np.diag(covariance))).tolist()
-    return across, down, ahead
-
-
 def _metres(mm: float | None) -> float | None:
     return None if mm is None else 1e-3 * mm
 
@@ -388,13 +377,14 @@ def check_view(found: CheckFile, name: str) -> Group:
 
 def _sentences(found: CamerasFile) -> list[str]:
     said: list[str] = []
-    if found.position_half_widths_mm is not None:
-        across, down, ahead = found.position_half_widths_mm
-        said.append(
-            f"Baseline {found.baseline_mm:.2f} ± {found.baseline_half_width_mm:.2f} mm (95 %). A position "
-            f"{AHEAD_M:g} m ahead is known to ± {across:.2f} mm across, {down:.2f} down, {ahead:.2f} in depth, as far "
-            "as the calibration goes."
-        )
+    if found.baseline_mm is not None:
+        said.append(f"Baseline {found.baseline_mm:.2f} ± {found.baseline_half_width_mm:.2f} mm (95 %).")
+    across, down, ahead = found.position_half_widths_mm
+    marker = "Positions" if found.baseline_mm is not None else "Tags of exactly known size"
+    said.append(
+        f"{marker} {AHEAD_M:g} m ahead are known to ± {across:.2f} mm across, {down:.2f} down, {ahead:.2f} in depth "
+        "(95 %), as far as the calibration goes."
+    )
     said.append(
         f"Views that were not fitted are foretold to {found.held_out_px:.3f} px (RMS per coordinate; fitted "
         f"{found.reprojection_px:.3f}); {len(found.views)} views of {found.board}. {_rivals(found)}"

@@ -161,7 +161,9 @@ def _expected(status: LearnerStatus) -> str:
     if (here_m := status.expected_error_m(status.claimed_error_m)) is None:
         return "not known yet"
     anywhere_m = None if status.outlook is None else status.expected_error_m(status.outlook.anywhere_m)
-    return f"{mm(here_m)} where data is" + ("" if anywhere_m is None else f", {mm(anywhere_m)} over all joints' ranges")
+    said = f"{mm(here_m)} where data is" + ("" if anywhere_m is None else f", {mm(anywhere_m)} over all joints' ranges")
+    shared = "" if status.common_error_m is None else f"; {mm(status.common_error_m)} in all: camera calibration"
+    return said + shared
 
 
 def _change(status: LearnerStatus) -> Iterator[str]:

@@ -29,6 +29,7 @@ from bodyschema.daemon.transport.wire import OCTETS, CommandReply, CommandReques
 from bodyschema.daemon.wiring.wiring import open_marker_topic
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.protocols import Clock
+from bodyschema.interfaces.records import FloatArray
 from bodyschema.interfaces.waits import READ_S
 from bodyschema.learning.nominal import NominalModel
 from bodyschema.learning.online_learner import OnlineLearner
@@ -79,7 +80,9 @@ class Learner:
         self._version = version("bodyschema")  # reads a file: once, while descriptors are available
         self._nominal = NominalModel.extended_by(config.simulation)
         self._learning, self._set_aside = go_on(
-            lambda: OnlineLearner(self._nominal, self._settings, solver, together_s=together_s(robots)),
+            lambda: OnlineLearner(
+                self._nominal, self._settings, solver, together_s=together_s(robots), common=_common_variance(config)
+            ),
             config.checkpoint_file,
             config.robot.name,
         )
@@ -162,6 +165,7 @@ class Learner:
             prequential_m=dict(recent.means),
             prequential_pairs=recent.pairs,
             claimed_error_m=self._learning.claimed_error_m(),
+            common_error_m=self._learning.common_error_m(),
             curve=self._learning.curve,
             model=snapshot.digest,
             calibration=self._findings.calibration,
@@ -349,6 +353,16 @@ def show_name() -> None:
 def more_rarely(robots: int) -> float:
     """Return the factor by which states and checkpoints are rarer when `robots` robots share a process."""
     return max(1.0, robots / AS_OFTEN_AS_ONE)
+
+
+def _common_variance(config: Config) -> Callable[[FloatArray], FloatArray] | None:
+    """Return the variance that the cameras' calibration leaves in all positions; None if that is not known."""
+    if config.tables.vision.cameras is None:
+        return None
+    from bodyschema.daemon.wiring.cameras import common_error
+
+    error = common_error(config)
+    return None if error is None else error.variance
 
 
 def together_s(robots: int) -> float:

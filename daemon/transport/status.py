@@ -122,8 +122,8 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
         answering: answering model: `prior`, `nlms`, `rigid`, `residual` or `exact`.
         prequential_m: error on new pairs, by model: mean distance between the measurement, its noise included, and the
             prediction made before the pair was learnt, over the last `prequential_pairs`, the same for all models [m].
-        claimed_error_m: predicted mean distance to the truth, without measurement noise, where data is [m]; null
-            until a few pairs have been predicted.
+        claimed_error_m: predicted mean distance to the truth as the cameras see it, without measurement noise, where
+            data is [m]; null until a few pairs have been predicted.
         curve: error on new pairs of the answering model.
         model: its hash; empty before the first.
         calibration: camera, tool and joint offsets; null before the first solution with the present tool.
@@ -143,6 +143,8 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
         missed: pairs no longer available from the sampler.
         behind: pairs stored but not yet learnt; a `health` problem from 100 on.
         age_s: as in PredictReply.
+        common_error_m: predicted mean error there that all pairs share, so that no pair shows it: of the cameras'
+            calibration and of a tag's size [m]; in the sigma of predictions; null where cameras.toml does not tell.
     """
 
     robot: str
@@ -175,6 +177,7 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
     missed: int = 0
     behind: int = 0
     age_s: float | None = None
+    common_error_m: float | None = None
     schema: int = SCHEMA
 
     def expected_error_m(self, claimed_m: float | None) -> float | None:

@@ -27,6 +27,7 @@ from bodyschema.vision.cameras.realsense import RealsenseCamera
 from bodyschema.vision.cameras.v4l2.controls import left_to_the_camera
 from bodyschema.vision.cameras.v4l2.serials import connected
 from bodyschema.vision.cameras.watched import PlainEyes, WatchedCamera
+from bodyschema.vision.rig.common_error import CommonError
 from bodyschema.vision.rig.rectified import RectifiedCamera
 from bodyschema.vision.rig.rig_file import read_rig
 from bodyschema.vision.rig.stereo_rig import OneEyeRig, Rig
@@ -82,6 +83,19 @@ def calibration_file(config: Config) -> Path:
 def names_calibration(config: Config) -> bool:
     """Return True if robot.toml names a calibration."""
     return require_cameras(config).calibration is not None
+
+
+def common_error(config: Config) -> CommonError | None:
+    """Return what all positions of the only cameras share of their calibration's error; None if that is not known."""
+    vision = config.tables.vision
+    if vision.cameras is None or vision.cameras.calibration is None or vision.further_cameras:
+        return None
+    file = calibration_file(config)
+    if not file.exists():  # a learner may run on another machine
+        return None
+    rig = read_rig(file)
+    sized = isinstance(rig, OneEyeRig) and vision.marker in ("tag", "cluster")  # a fix of a ball has its radius's error
+    return CommonError(rig, vision.tag.side_sigma_m / vision.tag.side_m if sized else 0.0)
 
 
 def camera_of(config: Config, eyes: Eyes) -> StereoCamera:

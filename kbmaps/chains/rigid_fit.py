@@ -65,6 +65,7 @@ class RigidFit:
         inliers: True for each pair (n,) that is not an outlier.
         rank: number of independent directions of the parameters that the data determine.
         log_evidence: log marginal likelihood of the inliers (Laplace's approximation).
+        common: most probable values (k,) of the unknowns shared by all pairs, in their sigmas.
     """
 
     belief: ChainBelief
@@ -73,14 +74,15 @@ class RigidFit:
     inliers: BoolArray
     rank: int
     log_evidence: float
+    common: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
 class _Point:
     """Residuals (n, 3) and Jacobian (n, 3, f), as sure in all directions, and norms in units (n,) at a change (size,).
 
-    The f free parameters are counted from the prior's mean in columns of its root; `offset` (f,) is their current
-    value.
+    The f unknowns are the free parameters, counted from the prior's mean in columns of its root, then the errors common
+    to all pairs in their sigmas; `offset` (f,) is their current value.
     """
 
     change: FloatArray
@@ -120,11 +122,14 @@ class _Fitter:
     def __init__(self, prior: ChainBelief, pairs: Pairs, start: FloatArray) -> None:
         self.prior, self.pairs = prior, pairs
         self.free, self.root = squared(prior.root)
-        self.point = self._at(cast(FloatArray, np.linalg.solve(self.root, (start - prior.mean)[self.free])))
+        common = np.zeros((len(pairs), 3, 0)) if pairs.common is None else pairs.common
+        self._common = pairs.whitened(common)
+        first = cast(FloatArray, np.linalg.solve(self.root, (start - prior.mean)[self.free]))
+        self.point = self._at(np.concatenate([first, np.zeros(common.shape[2])]))
         self.least_noise = 1.0 if pairs.known else ROUNDING_M / float(pairs.unit.min())
         self._damping = _Settings.first_damping
         # Residual coordinates that the parameters use up.
-        self.used = float(min(len(self.free), 3 * len(pairs)))
+        self.used = float(min(len(self.point.offset), 3 * len(pairs)))
 
     def typical(self) -> float:
         """Return noise over unit from the middle residual (Rousseeuw and Leroy 1987, least median of squares).
@@ -159,13 +164,13 @@ class _Fitter:
         return 0.0
 
     def _at(self, offset: FloatArray) -> _Point:
-        change = self.prior.mean.copy()
-        change[self.free] += self.root @ offset
+        change, own = self.prior.mean.copy(), len(self.free)
+        change[self.free] += self.root @ offset[:own]
         x, jacobian = self.prior.parameters.linearised(change, self.pairs.q)
-        residuals = self.pairs.whitened(self.pairs.x - x)
+        residuals = self.pairs.whitened(self.pairs.x - x) - self._common @ offset[own:]
         norms = np.linalg.norm(residuals, axis=1) / self.pairs.unit
         by_free = self.pairs.whitened(jacobian[:, :, self.free] @ self.root)
-        return _Point(change, residuals, norms, by_free, offset)
+        return _Point(change, residuals, norms, np.concatenate([by_free, self._common], axis=2), offset)
 
 
 def fit_chain(
@@ -267,16 +272,16 @@ def _summary(fitter: _Fitter, inliers: BoolArray, noise: float, freedom: float) 
     factor = point.reduced(inliers / (fitter.pairs.unit * noise))
     _, singular, vt = np.linalg.svd(factor[:, :-1])
     singular = np.concatenate([singular, np.zeros(len(vt) - len(singular))])
-    rank = _rank(cast(FloatArray, np.linalg.solve(root.T, factor[:, :-1].T)).T)
-    spread = np.zeros((size, size))
-    spread[np.ix_(free, free)] = root @ (vt.T / np.sqrt(1.0 + np.square(singular)))
+    rank = _rank(cast(FloatArray, np.linalg.solve(root.T, factor[:, : len(free)].T)).T)
+    spread = np.zeros((size, len(vt)))
+    spread[free] = root @ (vt.T / np.sqrt(1.0 + np.square(singular)))[: len(free)]
     square = float(np.square(point.norms[inliers]).sum()) / noise**2 + float(point.offset @ point.offset)
     spans = 6.0 * float(np.log(noise * fitter.pairs.unit[inliers]).sum())
     evidence = -0.5 * (square + spans + 3.0 * float(inliers.sum()) * math.log(2.0 * math.pi))
     evidence -= 0.5 * float(np.log1p(np.square(singular)).sum())
     seen = noise * math.sqrt(float(np.square(fitter.pairs.unit).mean())) if freedom > 0.0 else 0.0
     belief = ChainBelief(parameters, point.change, spread, seen)
-    return RigidFit(belief, noise, freedom, inliers, rank, evidence)
+    return RigidFit(belief, noise, freedom, inliers, rank, evidence, point.offset[len(free) :])
 
 
 def _rank(design: FloatArray) -> int:

@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import BoolArray, FloatArray, frozen, rows_or_vector
+from kbmaps.arrays import BoolArray, FloatArray, frozen, numbers, rows_or_vector
 from kbmaps.chains.align import PlacedStart
 from kbmaps.chains.belief import ChainBelief, squared
 from kbmaps.chains.chain import RigidChain
@@ -23,7 +23,7 @@ from kbmaps.chains.parameters import (
 )
 from kbmaps.chains.report import ChainReport, Scatter, chain_report
 from kbmaps.chains.rigid_fit import RigidFit, fit_chain
-from kbmaps.errors import DegenerateDataError, ModelFormatError, SettingError
+from kbmaps.errors import DegenerateDataError, ModelFormatError, NonFiniteError, SettingError, ShapeError
 from kbmaps.model import Estimate, Model, near_data, widest
 from kbmaps.packed import complete, named, pack, restoring, unpack
 from kbmaps.pairs import Pairs, checked_pairs, of_covariances, stored_pairs, with_units
@@ -130,7 +130,7 @@ class RigidLearner(Model):
             self._prior = ChainBelief(self._parameters, prior.mean, prior.root)
         self._place = PlacedStart(self._parameters, tolerances)
         self._q, self._x = np.empty((0, nominal.joints)), np.empty((0, 3))
-        self._sigma, self._shape = np.empty(0), np.empty((0, 3, 3))
+        self._sigma, self._shape, self._common = np.empty(0), np.empty((0, 3, 3)), np.empty((0, 3, 0))
         self._fit: RigidFit | None = None
         self._widest = 0.0
         self._twin: RigidLearner | None = None
@@ -192,6 +192,12 @@ class RigidLearner(Model):
         return np.zeros(0, dtype=np.bool_) if fit is None else fit.inliers.copy()
 
     @property
+    def unknowns(self) -> FloatArray:
+        """Most probable values (k,) of the unknowns that all pairs share, in their sigmas."""
+        fit = self._fitted()
+        return np.zeros(self._common.shape[2]) if fit is None else fit.common
+
+    @property
     def scatter(self) -> Scatter:
         """Scatter of the pairs about the chain.
 
@@ -218,7 +224,13 @@ class RigidLearner(Model):
         return 0.0 if fit is None else fit.log_evidence
 
     def learn(
-        self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None, *, cov: ArrayLike | None = None
+        self,
+        q: ArrayLike,
+        x: ArrayLike,
+        sigma: ArrayLike | None = None,
+        *,
+        cov: ArrayLike | None = None,
+        common: ArrayLike | None = None,
     ) -> None:
         """Learn pairs, as every `Model` does.
 
@@ -227,6 +239,9 @@ class RigidLearner(Model):
                 relative to their median.
             cov: in the place of sigma: covariances [m²], (3, 3) or (n, 3, 3), where some directions are surer:
                 one camera tells depth far worse than what is across.
+            common: (n, 3, k) [m], the errors that k unknowns shared by all pairs bring at 1 sigma of each, such as
+                those of a camera's calibration. They are estimated with the chain and are not part of sigma or cov.
+                Compute them at predicted positions: measured ones would share their noise with the pairs.
 
         Raises:
             ShapeError, NonFiniteError, SettingError (a sigma that is not positive, a covariance that is not positive
@@ -238,9 +253,18 @@ class RigidLearner(Model):
         shape = np.broadcast_to(np.eye(3), (len(angles), 3, 3))
         if cov is not None:
             sigmas, shape = of_covariances(cov, len(angles))
+        shared = np.zeros((len(angles), 3, 0)) if common is None else numbers("common", common)
+        if shared.ndim != 3 or shared.shape[:2] != positions.shape:
+            raise ShapeError("common", f"({len(angles)}, 3, k)", shared.shape)
+        if not np.isfinite(shared).all():
+            raise NonFiniteError("common")
         self._q = np.concatenate([self._q, angles])
         self._x = np.concatenate([self._x, positions])
         self._sigma, self._shape = np.concatenate([self._sigma, sigmas]), np.concatenate([self._shape, shape])
+        columns = max(self._common.shape[2], shared.shape[2])
+        self._common = np.concatenate(
+            [np.pad(each, ((0, 0), (0, 0), (0, columns - each.shape[2]))) for each in (self._common, shared)]
+        )
         self._fit = None
 
     def predict(self, q: ArrayLike) -> FloatArray:
@@ -302,6 +326,8 @@ class RigidLearner(Model):
         }
         if self._shaped:
             arrays["shape"] = self._shape
+        if self._common.any():
+            arrays["common"] = self._common
         if self._told_prior:
             arrays |= {"prior_mean": self._prior.mean, "prior_root": self._prior.root}
         return pack(_KIND, {"tolerances": describe_tolerances(self._tolerances)}, arrays)
@@ -311,7 +337,7 @@ class RigidLearner(Model):
         fields, arrays = unpack(data, _KIND)
         with restoring("a rigid learner"):
             tolerances = parse_tolerances(named(fields, "the fields", ("tolerances",))["tolerances"])
-            complete(arrays, (*CHAIN, "q", "x", "sigma"), ("prior_mean", "prior_root"), ("shape",))
+            complete(arrays, (*CHAIN, "q", "x", "sigma"), ("prior_mean", "prior_root"), ("shape",), ("common",))
             chain = chain_from_arrays(arrays)
             prior = None
             if "prior_mean" in arrays:
@@ -321,11 +347,14 @@ class RigidLearner(Model):
             shape = arrays.get("shape", np.broadcast_to(np.eye(3), (learner.pairs, 3, 3)))
             if shape.shape != (learner.pairs, 3, 3) or not np.isfinite(shape).all():
                 raise ModelFormatError(f"no shapes of {learner.pairs} pairs' errors: {shape.shape}")
-            learner._shape = shape
+            common = arrays.get("common", np.empty((learner.pairs, 3, 0)))
+            if common.ndim != 3 or common.shape[:2] != learner._x.shape or not np.isfinite(common).all():
+                raise ModelFormatError(f"no common errors of {learner.pairs} pairs: {common.shape}")
+            learner._shape, learner._common = shape, common
         return learner
 
     def _units(self) -> Pairs:
-        return with_units(self._q, self._x, self._sigma, self._shape if self._shaped else None)
+        return with_units(self._q, self._x, self._sigma, self._shape if self._shaped else None, self._common)
 
     @property
     def _shaped(self) -> bool:
@@ -350,7 +379,7 @@ class RigidLearner(Model):
         return deviations(fit.belief, pairs.chosen(np.isin(np.arange(len(pairs)), some)), sigma)
 
     def _same_pairs(self, other: RigidLearner) -> bool:
-        own, others = ((each._q, each._x, each._sigma, each._shape) for each in (self, other))
+        own, others = ((each._q, each._x, each._sigma, each._shape, each._common) for each in (self, other))
         return all(np.array_equal(mine, theirs, equal_nan=True) for mine, theirs in zip(own, others, strict=True))
 
     def _start(self) -> FloatArray:

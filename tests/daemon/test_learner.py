@@ -29,6 +29,9 @@ from bodyschema.daemon.transport.wire import (
 from bodyschema.interfaces.errors import BusError
 from bodyschema.interfaces.records import Pair
 from bodyschema.learning.solvers.solver import DirectSolver
+from bodyschema.vision.rig.lens import Lens
+from bodyschema.vision.rig.rig_file import write_rig
+from bodyschema.vision.rig.stereo_rig import Made, OneEyeRig
 
 KEYS = Keys("arm")
 
@@ -119,3 +122,39 @@ def test_new_pairs_tell_on_how_many_their_error_rests(learner: tuple[Learner, Wi
     status = learner[1].status()
     assert status.prequential_pairs == 5
     assert set(status.prequential_m) == {"prior", "nlms"}
+
+
+TAG_CAMERA = """eyes = 1
+[daemon]
+state_dir = "state"
+[vision]
+marker = "tag"
+[vision.tag]
+side_m = 0.05
+side_sigma_m = 0.0005
+[vision.cameras]
+calibration = "cameras.toml"
+[vision.cameras.one]
+device = "/dev/v4l/by-id/usb-A-video-index0"
+image_size_px = [640, 480]
+"""
+
+
+def test_predictions_contain_what_calibration_and_tag_leave(tmp_path: Path) -> None:
+    made = Made("", "", 20, 0, 0.0, 0.0, 0.0)
+    lens = Lens("pinhole", (600.0, 600.0), (319.5, 239.5), (0.0,) * 5)
+    write_rig(OneEyeRig(lens, (640, 480), ("",), 1e-12 * np.eye(9), made), tmp_path / "cameras.toml")
+    answers = []
+    for text in (TAG_CAMERA, TAG_CAMERA.replace("0.0005", "0.0")):
+        config = Config.load(write_small_arm(tmp_path, text), {})
+        wire = Wire([pair(seq) for seq in range(1, 6)])
+        learner = Learner(config, DirectSolver(), cast(ZenohSession, wire), Still())
+        learner._declare()
+        learner._feed.step(0.0)
+        answers.append((wire.status(), decode(wire.ask(KEYS.predict, {"q": [0.1, 0.2]}), PredictReply)))
+    (status, reply), (_, sure) = answers
+    x = np.array(reply.x)
+    # A size that is 1 % off is 1 % of all distances, within the view.
+    assert np.hypot(sure.sigma[0][2], 0.01 * x[0, 2]) == pytest.approx(reply.sigma[0][2], rel=1e-3)
+    assert status.common_error_m is not None
+    assert 0.5 < status.common_error_m / (0.01 * float(np.linalg.norm(x))) < 1.2

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -57,3 +59,18 @@ def test_its_intervals_hold_it(found) -> None:
     figures = calibration.figures
     truth = np.concatenate([T[:3, 3], Rotation.from_matrix(T[:3, :3]).as_euler("xyz")])
     assert (np.abs(figures.values[:6] - truth) < 1.5 * figures.half_widths[:6]).all()
+
+
+def test_a_wrong_tag_size_stays_within_the_intervals() -> None:
+    T = np.eye(4)
+    T[:3, 3] = 0.03, -0.04, 0.06
+    robot = wrist_camera()
+    recording = recorded(robot, T, np.array([0.5, 0.2, 0.1]))
+    grown = replace(recording, x=1.01 * recording.x)
+
+    def worst(common: Callable[[FloatArray], FloatArray] | None) -> float:
+        found = Calibration.of(robot, grown, sigma_m=None, zeros_rad=1e-6, trusted="urdf", common=common).figures
+        return float((np.abs(found.values[:3] - T[:3, 3]) / found.half_widths[:3]).max())
+
+    assert worst(None) > 1.5
+    assert worst(lambda x: 0.01 * x[:, :, None]) < 1.0

@@ -107,6 +107,23 @@ def test_claimed_intervals_cover_as_they_say():
     assert 0.92 < np.mean(inside_twice) < 0.98
 
 
+def test_intervals_cover_errors_that_all_pairs_share():
+    inside = {True: [], False: []}
+    for seed in range(25):
+        rng = np.random.default_rng(seed)
+        arm = rough_arm(rng, "RRRR")
+        (q, x), asked = arm.pairs(rng, 40, 0.001), random_q(rng, arm.kinds, 100, 80)
+        common = 0.02 * arm.real.positions(q)[:, :, None] * np.eye(3)  # each axis's scale is off by 2 %
+        seen = x + common @ rng.standard_normal(3)
+        for told, covered in inside.items():
+            learner = RigidLearner(arm.nominal, ROUGH)
+            learner.learn(q, seen, 0.001, common=common if told else None)
+            estimate = learner.estimate(asked)
+            covered.append((np.abs(estimate.x - arm.real.positions(asked)) < estimate.sigma).mean())
+    assert 0.58 < np.mean(inside[True]) < 0.80
+    assert np.mean(inside[False]) < 0.58
+
+
 @pytest.mark.soak
 @pytest.mark.parametrize("learner", [RigidLearner, RecursiveRigidLearner])
 @pytest.mark.parametrize("told", [True, False])
@@ -344,11 +361,12 @@ def test_before_any_pair_the_drawing_and_its_tolerances_speak():
 
 
 @pytest.mark.parametrize("sigma", [0.002, None])
-def test_bytes_give_the_same_learner_back(sigma):
+@pytest.mark.parametrize("common", [None, np.full((30, 3, 1), 0.01)])
+def test_bytes_give_the_same_learner_back(sigma, common):
     rng = np.random.default_rng(13)
     arm = rough_arm(rng, "RPRR")
     learner = RigidLearner(arm.nominal, ROUGH)
-    learner.learn(*arm.pairs(rng, 30, 0.002), sigma)
+    learner.learn(*arm.pairs(rng, 30, 0.002), sigma, common=common)
     twin = RigidLearner.from_bytes(learner.to_bytes())
     more = arm.pairs(rng, 5, 0.002)
     learner.learn(*more, 0.002)
@@ -388,6 +406,17 @@ def test_bad_input_changes_nothing(q, x, sigma, error):
     with pytest.raises(error):
         learner.learn(q, x, sigma)
     assert learner.to_bytes() == before
+
+
+@pytest.mark.parametrize(
+    ("common", "error"),
+    [(np.zeros((2, 3)), ShapeError), (np.zeros((1, 3, 1)), ShapeError), (np.full((2, 3, 1), np.inf), NonFiniteError)],
+)
+def test_bad_common_errors_change_nothing(common, error):
+    learner = RigidLearner(rough_arm(np.random.default_rng(14)).nominal, ROUGH)
+    with pytest.raises(error):
+        learner.learn(np.zeros((2, learner.joints)), np.zeros((2, 3)), common=common)
+    assert learner.pairs == 0
 
 
 def test_one_pair_that_comes_twice_and_no_pair_at_all_are_learnt():

@@ -24,28 +24,40 @@ def focal_spread(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -
 
     Other errors leave residuals that a free focal length absorbs in part, so it competes with freedoms that absorb them
     too: the ratio of fx and fy, a board that is bent or not rectangular, and one that moved between the two images.
+    The shape that the board has in all views alike is removed first.
     """
     lenses, right_eye = lenses_and_rest(bundle.model, bundle.vector)
-    by_focal, by_others, factors, variances = [], [], [], []
-    squares, freedom = 0.0, 0
+    seen = list[tuple[FloatArray, FloatArray, FloatArray, FloatArray]]()
     for view, pose, weights in zip(views, bundle.poses, bundle.weights, strict=True):
         residual, slopes = seen_with_slopes(view, corners_m, lenses, right_eye, pose)
         root, by_pose = np.sqrt(np.repeat(weights, 2))[:, None], slopes[:, -6:]
         focal, aspect = _by_lenses(slopes, [lens.focal_px for lens in lenses])
-        others = [aspect, _by_board(view, corners_m, by_pose, pose)]
+        others = [aspect]
         if len(lenses) > 1:
             is_right = np.arange(len(slopes)) >= (0 if view.left is None else 2 * len(view.left))
             others.append(is_right[:, None] * by_pose)
         # The board's pose is free.
-        off, focal, rest = (
+        off, focal, board, rest = (
             _without(root * by_pose, root * each)
-            for each in (residual.reshape(-1, 1), focal[:, focal.any(axis=0)], np.column_stack(others))
+            for each in (
+                residual.reshape(-1, 1),
+                focal[:, focal.any(axis=0)],
+                _by_board(view, corners_m, by_pose, pose),
+                np.column_stack(others),
+            )
         )
+        seen.append((off, focal, board, rest))
+    shapes = np.concatenate([_without(focal, np.column_stack([board, off])) for off, focal, board, _ in seen])
+    shape = np.linalg.lstsq(shapes[:, :-1], shapes[:, -1:])[0]
+    by_focal, by_others, factors, variances = [], [], [], []
+    squares, freedom = 0.0, 0
+    for off, focal, board, rest in seen:
+        off = off - board @ shape
         normal, pull = np.sum(focal**2, axis=0), (focal.T @ off)[:, 0]
         factors.extend(pull / normal)
         variances.extend(1.0 / normal)
         by_focal.extend(pull**2 / normal)
-        off, rest = _without(focal, off), _without(focal, rest)
+        off, rest = _without(focal, off), _without(focal, np.column_stack([rest, board]))
         # One that is no freedom of this view explains nothing.
         by_others.append((rest.T @ off)[:, 0] ** 2 / np.maximum(np.sum(rest**2, axis=0), np.finfo(np.float64).tiny))
         squares += float(np.sum(off**2))

@@ -23,6 +23,8 @@ class TagConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
         dictionary: which tags there are.
         id: number of the tag, where it is one.
         side_m: side of its black square as printed [m]: measure it.
+        side_sigma_m: how far that may be off, 1-sigma [m]: a caliper on printed edges. One camera takes all distances
+            from it.
         min_side_px: a shorter side is too small to be measured [px].
         min_contrast: least difference of white and black [grey levels].
         min_visible: share of each edge that has to be on a line.
@@ -36,6 +38,7 @@ class TagConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     dictionary: Dictionary = "apriltag_36h11"
     id: Annotated[int, Meta(ge=0)] = 0
     side_m: Positive = 0.04
+    side_sigma_m: Annotated[float, Meta(ge=0)] = 0.0001
     min_side_px: Annotated[float, Meta(ge=12)] = 16.0
     min_contrast: Annotated[float, Meta(ge=10)] = 20.0
     min_visible: Annotated[float, Meta(ge=0.5, le=1)] = 0.7

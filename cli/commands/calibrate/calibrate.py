@@ -33,7 +33,6 @@ if TYPE_CHECKING:
     from bodyschema.calibration.rigid_chain import Calibration, Trusted
     from bodyschema.daemon.config import Config
     from bodyschema.recordings.recording import Recording
-    from bodyschema.robot.description import RobotDescription
 
 CAMERA_FRAME = "calibrated_camera"
 
@@ -72,13 +71,19 @@ class FitOptions:
             raise RequestError("--trust-urdf has no offsets to find. Give it, or --only offsets")
         return "urdf" if self.trust_urdf else "nothing" if self.only is None else "links"
 
-    def fitted(self, description: RobotDescription, recording: Recording) -> tuple[Calibration, Calibration | None]:
+    def fitted(self, config: Config, recording: Recording) -> tuple[Calibration, Calibration | None]:
         """Return the calibration, and that with everything free where the URDF is trusted."""
         from bodyschema.calibration.rigid_chain import Calibration
+        from bodyschema.daemon.wiring.cameras import common_error
+
+        cameras = common_error(config)
+        common = None if cameras is None else cameras.errors
 
         def of(trusted: Trusted) -> Calibration:
             zeros_rad = math.radians(self.zeros_deg)
-            return Calibration.of(description, recording, sigma_m=self.sigma_m, zeros_rad=zeros_rad, trusted=trusted)
+            return Calibration.of(
+                config.robot, recording, sigma_m=self.sigma_m, zeros_rad=zeros_rad, trusted=trusted, common=common
+            )
 
         trusted = self.trusted()
         return of(trusted), None if trusted == "nothing" else of("nothing")
@@ -201,7 +206,7 @@ def arm(
     )
     if seen.misread:
         seen.require(source, force=force)
-    found, free = fit.fitted(description, recording)
+    found, free = fit.fitted(config, recording)
     report = CalibrationReport.of(found, seen, source.name, first, camera_frame, free)
     if report.other_tool_from is None:
         seen.require(source, force=force)
