@@ -84,29 +84,33 @@ def find_limb(
     colour = ball_colour(samples[:, :_INNER_COLUMNS], gate)
     if colour is None:
         return None
-    turned = samples @ _own_colour_first(colour).astype(np.float32)
+    turned = samples.reshape(-1, 3) @ _own_colour_first(colour).astype(np.float32)
+    turned = turned.reshape(samples.shape)
     noise = _noise(turned[:, :_INNER_COLUMNS, 1:], turned[:, _INNER_COLUMNS:][:, at > _BEYOND_BLURS * blur_px])
-    channels = np.moveaxis(turned[:, _INNER_COLUMNS:].astype(np.float64) / noise, 2, 0)
+    channels = np.ascontiguousarray(np.moveaxis(turned[:, _INNER_COLUMNS:], 2, 0), np.float64)
+    channels /= noise
     return _filtered(rays, channels, filters(radius_px, blur_px), blur_px)
 
 
 def _filtered(rays: FloatArray, channels: FloatArray, both: tuple[Filters, Filters], blur_px: float) -> Limb:
     """Apply the filters to the samples (3, n, m) of n rays, in units of the noise, the ball's own colour first."""
     own, across = both
-    informations, shifts = np.zeros((2, len(channels), len(rays)))
-    widening, widening_information = 0.0, 1e-9
-    likeliest = np.concatenate([_likeliest(channels[:1], own), _likeliest(channels[1:], across)])
-    for number, (channel, one, texture) in enumerate(zip(channels, (own, across, across), likeliest, strict=True)):
-        contrast, shift = (np.einsum("nm,nm->n", part[texture], channel) for part in (one.contrast, one.shift))
-        contrast = mean_of_three(contrast)
-        inverse = 1.0 / one.shift_variance[texture]
-        informations[number] = contrast**2 * inverse
-        shifts[number] = contrast * shift * inverse
-        if one is across:
-            inverse = 1.0 / one.widening_variance[texture]
-            widening += float(np.sum(contrast * inverse * np.einsum("nm,nm->n", one.widening[texture], channel)))
-            widening_information += float(np.sum(contrast**2 * inverse))
-    information, moved = informations.sum(axis=0), shifts.sum(axis=0)
+    count = len(rays)
+    likelihood, found = (
+        np.concatenate(parts).reshape(3, count, *parts[0].shape[1:]).swapaxes(0, 1)
+        for parts in zip(own.apply(channels[0]), across.apply(np.concatenate(channels[1:])), strict=True)
+    )
+    # Each ray's most likely texture, averaged over three neighbours, per channel (n, 3).
+    texture = np.argmax(mean_of_three(likelihood), axis=2)
+    channel = np.arange(3)
+    shift, widening, contrast = np.moveaxis(found[np.arange(count)[:, None], channel, :, texture], 2, 0)
+    contrast = mean_of_three(contrast)
+    known = np.stack([own.information, across.information, across.information])[channel, :, texture]
+    informations = np.square(contrast) * known[..., 0]
+    shifts = contrast * shift
+    widening_information = 1e-9 + float((np.square(contrast) * known[..., 1])[:, 1:].sum())
+    wider_px = float((contrast * widening)[:, 1:].sum()) / widening_information
+    information, moved = informations.sum(axis=1), shifts.sum(axis=1)
     mean = np.divide(moved, information, out=np.zeros_like(moved), where=information > 0)
     doubt, excess = _doubt(informations, shifts, mean, information > _WORST_SIGMA_PX**-2)
     information /= doubt
@@ -116,7 +120,7 @@ def _filtered(rays: FloatArray, channels: FloatArray, both: tuple[Filters, Filte
         rays,
         np.where(told, mean, 0.0),
         told / (1.0 / information + _BEST_SIGMA_PX**2),
-        blur_px * min(max(1.0 + widening / widening_information / blur_px, 1 / _LARGEST_WIDENING), _LARGEST_WIDENING),
+        blur_px * min(max(1.0 + wider_px / blur_px, 1 / _LARGEST_WIDENING), _LARGEST_WIDENING),
         excess,
     )
 
@@ -127,27 +131,17 @@ def _doubt(
     """Return the factor on each ray's variance due to disagreeing channels, shape (n,), and `Limb.excess`.
 
     Args:
-        informations: inverse variances of each channel's estimate, shape (3, n) [1/px²].
-        shifts: the estimates times these, shape (3, n) [1/px].
+        informations: inverse variances of each channel's estimate, shape (n, 3) [1/px²].
+        shifts: the estimates times these, shape (n, 3) [1/px].
         mean: the combined estimate, shape (n,) [px].
         told: mask of the rays with an estimate, shape (n,).
     """
-    off = shifts - informations * mean
-    chi_squared = np.divide(off**2, informations, out=np.zeros_like(off), where=informations > 0).sum(axis=0)
+    off = shifts - informations * mean[:, None]
+    chi_squared = np.divide(off**2, informations, out=np.zeros_like(off), where=informations > 0).sum(axis=1)
     disagreement = mean_of_three(chi_squared)
     middle = median(disagreement[told]) if told.any() else 0.0
     usual = max(_LEAST_DISAGREEMENT, _USUAL_DISAGREEMENT * middle)
     return np.maximum(1.0, disagreement / usual) ** _DISAGREEMENT_POWER, max(1.0, middle / _OF_NOISE)
-
-
-def _likeliest(channels: FloatArray, one: Filters) -> NDArray[np.intp]:
-    """Return the index of each ray's most likely texture, averaged over three neighbours, per channel: (c, n)."""
-    _, count, columns = channels.shape
-    flat = channels.reshape(-1, columns)
-    whitened = (flat @ one.precisions).reshape(len(flat), -1, columns)
-    square = np.einsum("nkm,nm->nk", whitened, flat).reshape(-1, count, len(one.log_determinant))
-    likelihood = -0.5 * (square + one.log_determinant)
-    return np.argmax([mean_of_three(channel) for channel in likelihood], axis=2)
 
 
 def _own_colour_first(colour: FloatArray) -> FloatArray:
@@ -169,8 +163,8 @@ def _noise(inside: Float32Array, beyond: Float32Array) -> float:
     ball, orthogonal to its colour, shape (n, columns, 2); and along the rays with the most even background beyond the
     ball, shape (n, columns, 3).
     """
-    on_ball = 1.4826 * median(np.abs(np.diff(inside, axis=0)).ravel()) / math.sqrt(2.0)
+    on_ball = 1.4826 * median(np.abs(inside[1:] - inside[:-1]).ravel()) / math.sqrt(2.0)
     apart = round(1.0 / STEP_PX)
-    rough = mean_of_three(((beyond[:, apart:] - beyond[:, :-apart]) ** 2).mean(axis=(1, 2)))
+    rough = mean_of_three(np.square(beyond[:, apart:] - beyond[:, :-apart]).reshape(len(beyond), -1).mean(axis=1))
     even = int(_EVEN_RAYS * (len(rough) - 1))
     return max(_LEAST_NOISE, on_ball, math.sqrt(0.5 * float(np.partition(rough, even)[even])))
