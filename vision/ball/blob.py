@@ -229,7 +229,8 @@ def _level(image: ImageArray, box: Region, centre_px: FloatArray, radius_px: flo
 def _washed_out(image: ImageArray, patch: Patch) -> bool:
     """Return True if much of the ball is white in all channels, so that neither colour nor shading is usable."""
     pixels = patch.box.crop(image)
-    return float(np.mean(pixels.min(axis=2) >= WHITE)) > _MOST_WHITE * np.pi / 4
+    white = cv2.countNonZero(cv2.inRange(pixels, (WHITE,) * 3, (255,) * 3))
+    return white > _MOST_WHITE * np.pi / 4 * (pixels.size // 3)
 
 
 def _clear_of_border(box: Region, margin_px: float, size: tuple[int, int]) -> bool:
@@ -276,7 +277,8 @@ def _brighter_parts(image: ImageArray, patch: Patch, gate: Gate, config: VisionC
     amount = gate.amount(pixels)
     own = gate.mask(pixels) > 0
     # The ball may be a small part of the patch: use the level that half of the smallest ball reaches.
-    strongest = float(np.sort(amount[own])[-config.min_pixels // 2])
+    place = -config.min_pixels // 2
+    strongest = float(np.partition(amount[own], place)[place])
     return [
         part
         for share in _STRONG_SHARES

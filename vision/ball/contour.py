@@ -13,7 +13,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import cast
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -84,28 +86,27 @@ def find_limb(
     colour = ball_colour(samples[:, :_INNER_COLUMNS], gate)
     if colour is None:
         return None
-    turned = samples.reshape(-1, 3) @ _own_colour_first(colour).astype(np.float32)
-    turned = turned.reshape(samples.shape)
-    noise = _noise(turned[:, :_INNER_COLUMNS, 1:], turned[:, _INNER_COLUMNS:][:, at > _BEYOND_BLURS * blur_px])
-    channels = np.ascontiguousarray(np.moveaxis(turned[:, _INNER_COLUMNS:], 2, 0), np.float64)
-    channels /= noise
-    return _filtered(rays, channels, filters(radius_px, blur_px), blur_px)
+    turned = cv2.transform(samples, _own_colour_first(colour))
+    channels = np.stack(cast("list[Float32Array]", cv2.split(turned)))
+    limb = channels[..., _INNER_COLUMNS:]
+    noise = _noise(channels[1:, :, :_INNER_COLUMNS], limb[..., at > _BEYOND_BLURS * blur_px])
+    return _filtered(rays, limb / np.float32(noise), filters(radius_px, blur_px), blur_px)
 
 
-def _filtered(rays: FloatArray, channels: FloatArray, both: tuple[Filters, Filters], blur_px: float) -> Limb:
+def _filtered(rays: FloatArray, channels: Float32Array, both: tuple[Filters, Filters], blur_px: float) -> Limb:
     """Apply the filters to the samples (3, n, m) of n rays, in units of the noise, the ball's own colour first."""
     own, across = both
-    count = len(rays)
+    _, count, columns = channels.shape
     likelihood, found = (
-        np.concatenate(parts).reshape(3, count, *parts[0].shape[1:]).swapaxes(0, 1)
-        for parts in zip(own.apply(channels[0]), across.apply(np.concatenate(channels[1:])), strict=True)
+        np.concatenate(parts)
+        for parts in zip(own.apply(channels[0]), across.apply(channels[1:].reshape(-1, columns)), strict=True)
     )
     # Each ray's most likely texture, averaged over three neighbours, per channel (n, 3).
-    texture = np.argmax(mean_of_three(likelihood), axis=2)
-    channel = np.arange(3)
-    shift, widening, contrast = np.moveaxis(found[np.arange(count)[:, None], channel, :, texture], 2, 0)
+    texture = np.argmax(mean_of_three(likelihood.reshape(3, count, -1).swapaxes(0, 1)), axis=2)
+    found = found[np.arange(len(found)), :, texture.T.ravel()].astype(np.float64)
+    shift, widening, contrast = found.T.reshape(3, 3, count).swapaxes(1, 2)
     contrast = mean_of_three(contrast)
-    known = np.stack([own.information, across.information, across.information])[channel, :, texture]
+    known = np.stack([own.information, across.information, across.information])[np.arange(3), :, texture]
     informations = np.square(contrast) * known[..., 0]
     shifts = contrast * shift
     widening_information = 1e-9 + float((np.square(contrast) * known[..., 1])[:, 1:].sum())
@@ -145,26 +146,25 @@ def _doubt(
 
 
 def _own_colour_first(colour: FloatArray) -> FloatArray:
-    """Return an orthonormal basis of colours as columns: the ball's own, grey's part orthogonal to it, the third."""
-    own = colour / np.linalg.norm(colour)
-    grey = np.ones(3) - own.sum() * own
-    if np.linalg.norm(grey) < 0.1:
-        grey = np.array([1.0, 0.0, 0.0]) - own[0] * own
-    grey /= np.linalg.norm(grey)
-    # The cross product by hand: np.cross costs more than everything else here.
-    rest = own[[1, 2, 0]] * grey[[2, 0, 1]] - own[[2, 0, 1]] * grey[[1, 2, 0]]
-    return np.column_stack([own, grey, rest])
+    """Return an orthonormal basis of colours as rows: the ball's own, grey's part orthogonal to it, the third."""
+    b, g, r = (colour / math.hypot(*colour)).tolist()
+    across = [1.0 - (b + g + r) * part for part in (b, g, r)]
+    if math.hypot(*across) < 0.1:
+        across = [1.0 - b * b, -b * g, -b * r]
+    u, v, w = (part / math.hypot(*across) for part in across)
+    return np.array([[b, g, r], [u, v, w], [g * w - r * v, r * u - b * w, b * v - g * u]])
 
 
 def _noise(inside: Float32Array, beyond: Float32Array) -> float:
     """Estimate the noise of a sample (1-sigma) [grey levels].
 
     It is the larger of two estimates, because brighter pixels have more noise: from neighbouring samples inside the
-    ball, orthogonal to its colour, shape (n, columns, 2); and along the rays with the most even background beyond the
-    ball, shape (n, columns, 3).
+    ball, orthogonal to its colour, shape (2, n, columns); and along the rays with the most even background beyond the
+    ball, shape (3, n, columns).
     """
-    on_ball = 1.4826 * median(np.abs(inside[1:] - inside[:-1]).ravel()) / math.sqrt(2.0)
+    on_ball = 1.4826 * median(np.abs(inside[:, 1:] - inside[:, :-1]).ravel()) / math.sqrt(2.0)
     apart = round(1.0 / STEP_PX)
-    rough = mean_of_three(np.square(beyond[:, apart:] - beyond[:, :-apart]).reshape(len(beyond), -1).mean(axis=1))
+    change = beyond[..., apart:] - beyond[..., :-apart]
+    rough = mean_of_three(np.einsum("cnm,cnm->n", change, change)) / (3 * change.shape[2])
     even = int(_EVEN_RAYS * (len(rough) - 1))
     return max(_LEAST_NOISE, on_ball, math.sqrt(0.5 * float(np.partition(rough, even)[even])))

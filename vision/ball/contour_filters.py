@@ -22,6 +22,8 @@ from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray
 
+from .colour import Float32Array
+
 STEP_PX = 0.5
 # Sampled lengths on the ball and beyond [px], for a blur of USUAL_BLUR_PX; a wider blur needs longer ones.
 _INSIDE_PX, _OUTSIDE_PX, USUAL_BLUR_PX = 4.0, 8.0, 0.86
@@ -54,16 +56,16 @@ class Filters:
         information: inverse variances of shift and blur for a contrast of 1, shape (2, k) [1/px²].
     """
 
-    matrix: FloatArray
+    matrix: Float32Array
     starts: NDArray[np.intp]
-    log_ratio: FloatArray
+    log_ratio: Float32Array
     information: FloatArray
 
-    def apply(self, samples: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def apply(self, samples: Float32Array) -> tuple[Float32Array, Float32Array]:
         """Return the textures' log-likelihoods (n, k) for samples (n, m), and what the filters find (n, 3, k)."""
         found = samples @ self.matrix
         count = self.information.shape[1]
-        likelihood = np.zeros((len(samples), count))
+        likelihood = np.zeros((len(samples), count), np.float32)
         likelihood[:, 1:] = np.add.reduceat(np.square(found[:, : -3 * count]), self.starts, axis=1) - self.log_ratio
         return 0.5 * likelihood, found[:, -3 * count :].reshape(-1, 3, count)
 
@@ -125,9 +127,9 @@ def _filters(at: tuple[float, ...], radius_px: float, blur_px: float, own_colour
     roots = [_root(precisions[0] - precision) for precision in precisions[1:]]
     widths = [root.shape[1] for root in roots]
     return Filters(
-        np.hstack([*roots, *(filter.T for filter in finding)]),
+        np.hstack([*roots, *(filter.T for filter in finding)]).astype(np.float32),
         np.cumsum([0, *widths[:-1]]),
-        log_determinants[1:] - log_determinants[0],
+        (log_determinants[1:] - log_determinants[0]).astype(np.float32),
         np.stack([shift_informations, widening_informations]),
     )
 

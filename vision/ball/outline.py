@@ -13,7 +13,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import cast
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -199,22 +201,23 @@ def _find_edges(
     ring = radius_px - half_px + (np.arange(cells) + 0.5) * step
     outer = radius_px + half_px + (np.arange(round(_BACKGROUND_PX / _RING_STEP_PX)) + 0.5) * _RING_STEP_PX
     samples = sample(image, centre_px, rays, np.concatenate([inner, ring, outer]).astype(np.float64), shape)
-    inside, outside = samples[:, : len(inner)], samples[:, len(inner) + cells :]
-
+    inside = samples[:, : len(inner)]
     colour = ball_colour(inside, gate)
     if colour is None:
         return None
     limb = gate.amount(inside[:, -2:])
     level = np.maximum(mean_of_three(0.5 * (limb[:, 0] + limb[:, 1])), 0.0)
     covered = level < _LEAST_LEVEL * median(level)
-    background = mean_of_three(outside.mean(axis=1))
+    channels = np.stack(cast("list[Float32Array]", cv2.split(samples)))[..., len(inner) :]
+    background = mean_of_three(channels[..., cells:].mean(axis=2).T)
     towards, separation = _discriminant(level, colour, background, gate.shading_sigma)
     told = (separation > _LEAST_SEPARATION**2) & ~covered
-    scale = 1.0 / np.where(told, separation, 1.0)
+    towards /= np.where(told, separation, 1.0)[:, None]
     # The share of ball in each sample: 1 on the ball, 0 on the background.
-    share = np.matmul(samples[:, len(inner) :] - background[:, None], towards[:, :, None])[..., 0] * scale[:, None]
-    distance = radius_px - half_px + share[:, :cells].sum(axis=1) * step
-    unevenness_px = half_px * np.sqrt(np.mean(share[:, cells:] ** 2, axis=1))
+    apart = (channels - background.T[..., None].astype(np.float32)) * towards.T[..., None].astype(np.float32)
+    share = apart.sum(axis=0)
+    distance = radius_px - half_px + step * share[:, :cells].sum(axis=1, dtype=np.float64)
+    unevenness_px = half_px * np.sqrt(np.square(share[:, cells:]).mean(axis=1, dtype=np.float64))
     weight = told / (1.0 + (unevenness_px / _EDGE_SIGMA_PX) ** 2)
     return _Edges(rays, distance, weight, covered, ~told | (unevenness_px > _UNEVEN_PX))
 
@@ -272,8 +275,8 @@ def _outline(fit: _Fit, centre_px: FloatArray, shape: FloatArray) -> Outline:
         radius_px=radius_px,
         cov_px=shape @ inverse[:2, :2] @ shape + _FLOOR_PX**2 * np.eye(2),
         radius_sigma_px=math.sqrt(inverse[2, 2]),
-        visible=1.0 - float(np.mean(hidden)),
-        uneven=float(np.mean(edges.uneven | (apart & ~hidden))),
+        visible=1.0 - np.count_nonzero(hidden) / len(hidden),
+        uneven=np.count_nonzero(edges.uneven | (apart & ~hidden)) / len(hidden),
         off=_share_off(edges.weight, residual, max(_OFF_PX, _OFF_SHARE * radius_px)),
     )
 
