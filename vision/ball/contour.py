@@ -27,6 +27,7 @@ from .polar import ball_colour, mean_of_three, median, rays_round, sample
 
 # Number of samples on the ball for its colour and the noise, and where they begin (share of the radius).
 _INNER_COLUMNS, _INNER_PART = 4, 0.3
+_INNER = np.linspace(0.0, 1.0, _INNER_COLUMNS)
 # Least noise of a sample [grey levels]; share of the rays whose background is assumed to show little but noise.
 _LEAST_NOISE, _EVEN_RAYS = 1.0, 0.3
 # Distance from the edge beyond which the ball no longer shows, in blurs.
@@ -36,6 +37,7 @@ _BEST_SIGMA_PX, _WORST_SIGMA_PX = 0.03, 0.5
 # The channels' disagreement (chi-squared, 2 degrees of freedom): more than this, and than this times the median of the
 # ball's rays, is no noise, and makes a ray's variance larger by that power of it; what its median is of noise alone.
 _LEAST_DISAGREEMENT, _USUAL_DISAGREEMENT, _DISAGREEMENT_POWER, _OF_NOISE = 2.0, 1.5, 3, 3.0
+_NOTHING = 1e-12  # keeps from dividing by information that is 0
 # Largest factor of the blur's change from one iteration to the next.
 _LARGEST_WIDENING = 1.5
 
@@ -81,7 +83,8 @@ def find_limb(
     """
     rays = rays_round(radius_px)
     at = places(radius_px, blur_px)
-    inner = np.linspace(_INNER_PART * radius_px, max(radius_px + at[0], 0.5 * radius_px), _INNER_COLUMNS)
+    first_px, last_px = _INNER_PART * radius_px, max(radius_px + float(at[0]), 0.5 * radius_px)
+    inner = first_px + (last_px - first_px) * _INNER
     samples = sample(image, centre_px, rays, np.concatenate([inner, radius_px + at]), shape)
     colour = ball_colour(samples[:, :_INNER_COLUMNS], gate)
     if colour is None:
@@ -109,10 +112,10 @@ def _filtered(rays: FloatArray, channels: Float32Array, both: tuple[Filters, Fil
     known = np.stack([own.information, across.information, across.information])[np.arange(3), :, texture]
     informations = np.square(contrast) * known[..., 0]
     shifts = contrast * shift
-    widening_information = 1e-9 + float((np.square(contrast) * known[..., 1])[:, 1:].sum())
+    widening_information = _NOTHING + float((np.square(contrast) * known[..., 1])[:, 1:].sum())
     wider_px = float((contrast * widening)[:, 1:].sum()) / widening_information
     information, moved = informations.sum(axis=1), shifts.sum(axis=1)
-    mean = np.divide(moved, information, out=np.zeros_like(moved), where=information > 0)
+    mean = moved / np.maximum(information, _NOTHING)
     doubt, excess = _doubt(informations, shifts, mean, information > _WORST_SIGMA_PX**-2)
     information /= doubt
     told = information > _WORST_SIGMA_PX**-2
@@ -138,8 +141,7 @@ def _doubt(
         told: mask of the rays with an estimate, shape (n,).
     """
     off = shifts - informations * mean[:, None]
-    chi_squared = np.divide(off**2, informations, out=np.zeros_like(off), where=informations > 0).sum(axis=1)
-    disagreement = mean_of_three(chi_squared)
+    disagreement = mean_of_three((off * off / np.maximum(informations, _NOTHING)).sum(axis=1))
     middle = median(disagreement[told]) if told.any() else 0.0
     usual = max(_LEAST_DISAGREEMENT, _USUAL_DISAGREEMENT * middle)
     return np.maximum(1.0, disagreement / usual) ** _DISAGREEMENT_POWER, max(1.0, middle / _OF_NOISE)

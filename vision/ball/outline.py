@@ -35,7 +35,7 @@ _NARROW_PX, _WIDE_PX = 2.0, 4.0
 _SETTLED_PX, _ROUGH_PX = 0.5, 1.0
 _RING_STEP_PX = 0.5
 _BACKGROUND_PX = 2.0
-_INNER_COLUMNS = 6
+_INNER = np.linspace(0.0, 1.0, 6)  # places on the ball that show its colour
 # Difference of any channel between the limb and a little inside, apart from brightness (1-sigma, grey levels).
 _CHANNEL_SIGMA = 4.0
 # A ray shows the edge if ball and background differ by this many of these sigmas.
@@ -197,10 +197,11 @@ def _find_edges(
     rays = rays_round(radius_px)
     cells = max(2, round(2 * half_px / _RING_STEP_PX))
     step = 2 * half_px / cells
-    inner = np.linspace(0.3 * radius_px, radius_px - half_px, _INNER_COLUMNS)
+    inner = 0.3 * radius_px + (0.7 * radius_px - half_px) * _INNER
     ring = radius_px - half_px + (np.arange(cells) + 0.5) * step
     outer = radius_px + half_px + (np.arange(round(_BACKGROUND_PX / _RING_STEP_PX)) + 0.5) * _RING_STEP_PX
-    samples = sample(image, centre_px, rays, np.concatenate([inner, ring, outer]).astype(np.float64), shape)
+    radii = np.asarray(np.concatenate([inner, ring, outer]), np.float64)
+    samples = sample(image, centre_px, rays, radii, shape)
     inside = samples[:, : len(inner)]
     colour = ball_colour(inside, gate)
     if colour is None:
