@@ -36,6 +36,7 @@ _CHANCE = 2.5
 # Share of their length that lines across edges keep where the usual ones leave the margin.
 _SHORTER = 0.5
 
+_BEFORE = np.array([3, 0, 1, 2])  # edges before each edge
 _EVEN = Light(np.zeros((2, 2)), np.zeros((2, 2, 2)))
 
 
@@ -146,9 +147,11 @@ def _likeness(edges: Edges) -> FloatArray:
 def _meetings(edges: Edges) -> FloatArray:
     """Return the intersections (4, 2) [px] of each edge's line with that of the edge before it."""
     points, directions = edges.points, edges.directions
-    before = np.roll(directions, 1, axis=0)
-    steps = np.linalg.solve(np.stack([before, -directions], axis=2), (points - np.roll(points, 1, axis=0))[..., None])
-    return np.roll(points, 1, axis=0) + steps[:, 0] * before
+    before, across = directions[_BEFORE], points - points[_BEFORE]
+    # Cramer's rule
+    steps = across[:, 0] * directions[:, 1] - across[:, 1] * directions[:, 0]
+    steps /= before[:, 0] * directions[:, 1] - before[:, 1] * directions[:, 0]
+    return points[_BEFORE] + steps[:, None] * before
 
 
 def _corner_covariance(edges: Edges, together: float) -> FloatArray:
@@ -163,10 +166,9 @@ def _corner_covariance(edges: Edges, together: float) -> FloatArray:
     cov = np.zeros((4, 2, 4, 2))
     cov[:, 0, :, 0] = together
     cov[range(4), :, range(4)] += np.sqrt(np.multiply.outer(*[_likeness(edges)] * 2)) * edges.scatter + edges.shared
-    for corner in range(4):
-        solve = np.linalg.inv(normals[[corner - 1, corner]])
-        # The corner is the end (s = 1) of the edge before it, and the beginning (s = −1) of its own.
-        for column, edge, s in ((0, corner - 1, 1.0), (1, corner, -1.0)):
-            by_edge[corner, :, edge] = np.outer(solve[:, column], (1.0, s))
+    solve = np.linalg.inv(np.stack([normals[_BEFORE], normals], axis=1))
+    # The corner is the end (s = 1) of the edge before it, and the beginning (s = −1) of its own.
+    by_edge[range(4), :, _BEFORE] = solve[:, :, :1] * (1.0, 1.0)
+    by_edge[range(4), :, range(4)] = solve[:, :, 1:] * (1.0, -1.0)
     rows = by_edge.reshape(8, 8)
     return rows @ cov.reshape(8, 8) @ rows.T
