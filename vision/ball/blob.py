@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray, ImageArray, Reason
 from bodyschema.vision.config import VisionConfig
@@ -240,15 +241,22 @@ def _clear_of_border(box: Region, margin_px: float, size: tuple[int, int]) -> bo
 
 
 def _patches(mask: ImageArray, region: Region, config: VisionConfig) -> list[Patch]:
-    _, _, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=4)
-    large = np.flatnonzero(stats[1:, cv2.CC_STAT_AREA] >= config.min_pixels) + 1
-    by_size = large[np.argsort(-stats[large, cv2.CC_STAT_AREA], kind="stable")]
-    patches = (_patch(mask, stats[label], region) for label in by_size[: 4 * config.max_candidates])
+    points = cv2.findNonZero(mask)
+    if points is None:
+        return []
+    # The boxes of OpenCV's connectedComponentsWithStats cost ten times as much as its labels.
+    points = np.reshape(points, (-1, 2)).astype(np.int32, copy=False)
+    label = cv2.connectedComponents(mask, connectivity=4)[1].astype(np.int32, copy=False)[points[:, 1], points[:, 0]]
+    areas = np.bincount(label)
+    by_size = np.argsort(-areas, kind="stable")[: 4 * config.max_candidates]
+    patches = (
+        _patch(mask, points[label == number], region) for number in by_size if areas[number] >= config.min_pixels
+    )
     return [patch for patch in patches if patch is not None]
 
 
-def _patch(mask: ImageArray, stats: np.ndarray, region: Region) -> Patch | None:
-    left, top, width, height = (int(stats[i]) for i in range(4))
+def _patch(mask: ImageArray, points: NDArray[np.int32], region: Region) -> Patch | None:
+    left, top, width, height = cv2.boundingRect(points)
     box = Region(left, top, left + width, top + height)
     contours, _ = cv2.findContours(box.crop(mask).copy(), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     contour = max(contours, key=len)
