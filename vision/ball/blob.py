@@ -246,11 +246,13 @@ def _patches(mask: ImageArray, region: Region, config: VisionConfig) -> list[Pat
         return []
     # The boxes of OpenCV's connectedComponentsWithStats cost ten times as much as its labels.
     points = np.reshape(points, (-1, 2)).astype(np.int32, copy=False)
-    label = cv2.connectedComponents(mask, connectivity=4)[1].astype(np.int32, copy=False)[points[:, 1], points[:, 0]]
+    label = cv2.connectedComponents(mask, connectivity=4)[1][mask > 0].astype(np.intp)
     areas = np.bincount(label)
     by_size = np.argsort(-areas, kind="stable")[: 4 * config.max_candidates]
     patches = (
-        _patch(mask, points[label == number], region) for number in by_size if areas[number] >= config.min_pixels
+        _patch(mask, points.compress(label == number, axis=0), region)
+        for number in by_size
+        if areas[number] >= config.min_pixels
     )
     return [patch for patch in patches if patch is not None]
 
