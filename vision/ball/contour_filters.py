@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray
 
@@ -48,26 +47,24 @@ class Filters:
     """One filter for each of k textures of the background, over m samples of a ray in units of their noise.
 
     Attributes:
-        matrix: what samples (n, m) are multiplied by, shape (m, l + 3k). The first l columns make the likelihoods,
-            those from `starts` (k − 1,) on those of one texture after the other. Then there are k filters for the
-            edge's shift times the contrast and its information, k for the blur's error times the same, and k for the
-            contrast, ball less background at the edge.
-        log_ratio: logarithms of the covariances' determinants less that of the first texture, shape (k − 1,).
+        matrix: what samples (n, m) are multiplied by, shape (m, l + 3k). The squares of the first l columns' results
+            make the likelihoods. Then there are k filters for the edge's shift times the contrast and its information,
+            k for the blur's error times the same, and k for the contrast, ball less background at the edge.
+        groups: 1 where a square belongs to a texture, else 0, shape (l, k).
+        log_ratio: logarithms of the covariances' determinants less that of the first texture, shape (k,).
         information: inverse variances of shift and blur for a contrast of 1, shape (2, k) [1/px²].
     """
 
     matrix: Float32Array
-    starts: NDArray[np.intp]
+    groups: Float32Array
     log_ratio: Float32Array
     information: FloatArray
 
     def apply(self, samples: Float32Array) -> tuple[Float32Array, Float32Array]:
         """Return the textures' log-likelihoods (n, k) for samples (n, m), and what the filters find (n, 3, k)."""
         found = samples @ self.matrix
-        count = self.information.shape[1]
-        likelihood = np.zeros((len(samples), count), np.float32)
-        likelihood[:, 1:] = np.add.reduceat(np.square(found[:, : -3 * count]), self.starts, axis=1) - self.log_ratio
-        return 0.5 * likelihood, found[:, -3 * count :].reshape(-1, 3, count)
+        squares, count = np.square(found[:, : len(self.groups)]), self.information.shape[1]
+        return 0.5 * (squares @ self.groups - self.log_ratio), found[:, len(self.groups) :].reshape(-1, 3, count)
 
 
 def places(radius_px: float, blur_px: float) -> FloatArray:
@@ -125,11 +122,11 @@ def _filters(at: tuple[float, ...], radius_px: float, blur_px: float, own_colour
     )
     # The rougher the texture, the larger the covariance: precisions differ by a sum of squares.
     roots = [_root(precisions[0] - precision) for precision in precisions[1:]]
-    widths = [root.shape[1] for root in roots]
+    widths = [0, *(root.shape[1] for root in roots)]
     return Filters(
         np.hstack([*roots, *(filter.T for filter in finding)]).astype(np.float32),
-        np.cumsum([0, *widths[:-1]]),
-        (log_determinants[1:] - log_determinants[0]).astype(np.float32),
+        np.repeat(np.eye(len(widths), dtype=np.float32), widths, axis=0),
+        (log_determinants - log_determinants[0]).astype(np.float32),
         np.stack([shift_informations, widening_informations]),
     )
 

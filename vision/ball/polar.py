@@ -71,7 +71,7 @@ def ball_colour(inside: Float32Array, gate: Gate) -> FloatArray | None:
     coloured = amount > 1.0
     if np.count_nonzero(coloured) < len(amount) // 2:
         return None
-    relative = samples[coloured] / amount[coloured, None]
+    relative = samples.compress(coloured, axis=0) / amount.compress(coloured)[:, None]
     middle = len(relative) // 2
     return np.partition(relative, middle, axis=0)[middle].astype(np.float64)
 
