@@ -26,8 +26,7 @@ from .contour_filters import STEP_PX, Filters, filters, places
 from .polar import ball_colour, mean_of_three, median, rays_round, sample
 
 # Number of samples on the ball for its colour and the noise, and where they begin (share of the radius).
-_INNER_COLUMNS, _INNER_PART = 4, 0.3
-_INNER = np.linspace(0.0, 1.0, _INNER_COLUMNS)
+_INNER_PART, _INNER = 0.3, np.linspace(0.0, 1.0, 4)
 # Least noise of a sample [grey levels]; share of the rays whose background is assumed to show little but noise.
 _LEAST_NOISE, _EVEN_RAYS = 1.0, 0.3
 # Distance from the edge beyond which the ball no longer shows, in blurs.
@@ -86,13 +85,13 @@ def find_limb(
     first_px, last_px = _INNER_PART * radius_px, max(radius_px + float(at[0]), 0.5 * radius_px)
     inner = first_px + (last_px - first_px) * _INNER
     samples = sample(image, centre_px, rays, np.concatenate([inner, radius_px + at]), shape)
-    colour = ball_colour(samples[:, :_INNER_COLUMNS], gate)
+    colour = ball_colour(samples[:, : len(_INNER)], gate)
     if colour is None:
         return None
     turned = cv2.transform(samples, _own_colour_first(colour))
     channels = np.stack(cast("list[Float32Array]", cv2.split(turned)))
-    limb = channels[..., _INNER_COLUMNS:]
-    noise = _noise(channels[1:, :, :_INNER_COLUMNS], limb[..., at > _BEYOND_BLURS * blur_px])
+    limb = channels[..., len(_INNER) :]
+    noise = _noise(channels[1:, :, : len(_INNER)], limb[..., at > _BEYOND_BLURS * blur_px])
     return _filtered(rays, limb / np.float32(noise), filters(radius_px, blur_px), blur_px)
 
 

@@ -24,7 +24,7 @@ from bodyschema.interfaces.records import FloatArray
 from .colour import Float32Array, Gate
 from .contour_fit import fit_limb
 from .contour_spectrum import waves
-from .polar import ball_colour, fit_circle, mean_of_three, median, rays_round, sample
+from .polar import ENOUGH_RAYS, ball_colour, fit_circle, mean_of_three, median, rays_round, sample
 
 BoolArray = NDArray[np.bool_]
 
@@ -55,8 +55,6 @@ _ARC, _LEAST_HALF_ARC, _OFF_PX, _OFF_SHARE = 0.1, 3, 0.35, 0.05
 _ARCS = 10
 # If this share of the points is no farther than this from the circle through all [px], they are the ones.
 _NEARLY_ALL, _AGREED_PX = 0.9, 0.4
-# Number of points sufficient to find the circle that most points agree on.
-_ENOUGH = 60
 _TRIPLES = np.array(list(combinations(range(_ARCS), 3)))
 # Systematic error that averaging does not reduce [px].
 _FLOOR_PX = 0.001
@@ -316,7 +314,7 @@ def _agreeing(edges: _Edges) -> FloatArray:
     points = np.column_stack([edges.rays[told], edges.distance_px[told]])
     begins = np.arange(_ARCS) * len(told) // _ARCS
     means = (np.add.reduceat(points, begins) / np.diff(begins, append=len(told))[:, None])[_TRIPLES]
-    told = told[:: max(1, len(told) // _ENOUGH)]
+    told = told[:: max(1, len(told) // ENOUGH_RAYS)]
     circles = np.linalg.solve(means[..., :3] + 1e-9 * np.eye(3), means[..., 3:])[..., 0]
     off = np.abs(edges.distance_px[told] - circles @ edges.rays[told].T)
     middle = len(told) // 2

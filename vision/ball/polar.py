@@ -16,8 +16,8 @@ from .colour import Float32Array, Gate
 
 # Below this, relative to the cubed trace, an outline does not determine centre and radius.
 _LEAST_DETERMINANT = 1e-6
-# Rays that suffice to know the ball's colour.
-_ENOUGH = 60
+# Rays that suffice for the ball's colour, and to find the circle that most of them agree on.
+ENOUGH_RAYS = 60
 
 
 def rays_round(radius_px: float) -> FloatArray:
@@ -66,7 +66,7 @@ def sample(
 
 def ball_colour(inside: Float32Array, gate: Gate) -> FloatArray | None:
     """Return the ball's colour (3,) per unit of its amount; the median excludes highlights."""
-    samples = inside[:: max(1, len(inside) // _ENOUGH)].reshape(-1, 3)
+    samples = inside[:: max(1, len(inside) // ENOUGH_RAYS)].reshape(-1, 3)
     amount = gate.amount(samples)
     coloured = amount > 1.0
     if np.count_nonzero(coloured) < len(amount) // 2:
