@@ -50,4 +50,5 @@ def minimised(problem: P, stepped: Callable[[P, float], P | None]) -> P:
 def damped_step(jacobian: FloatArray, residuals: FloatArray, damping: float) -> FloatArray:
     """Return the step (p,) for residuals (n,) and their negative derivative (n, p) by what is sought."""
     normal = jacobian.T @ jacobian
-    return np.asarray(np.linalg.solve(normal + damping * np.diag(np.diag(normal)), jacobian.T @ residuals), np.float64)
+    normal.flat[:: len(normal) + 1] *= 1.0 + damping
+    return np.asarray(np.linalg.solve(normal, jacobian.T @ residuals), np.float64)

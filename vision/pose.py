@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.spatial.transform import Rotation
 
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
@@ -91,7 +90,8 @@ class PoseEstimator:
 
     def _stepped(self, now: _Linearised, damping: float) -> _Linearised | None:
         change = damped_step(now.jacobian, now.residuals, damping)
-        return self._linearised(Rotation.from_rotvec(change[:3]).as_matrix() @ now.rotation, now.x + change[3:])
+        turn = np.asarray(cv2.Rodrigues(change[:3])[0], np.float64)
+        return self._linearised(turn @ now.rotation, now.x + change[3:])
 
     def scale(self, pose: Pose) -> tuple[float, float]:
         """Return the relative size error of the body against its nominal size, and its 1-sigma.
@@ -169,6 +169,11 @@ def turned(arms: FloatArray) -> FloatArray:
     matrices[:, 1, 0], matrices[:, 1, 2] = -z, x
     matrices[:, 2, 0], matrices[:, 2, 1] = y, -x
     return matrices
+
+
+def angle_between(one: FloatArray, other: FloatArray) -> float:
+    """Return the angle [rad] of the turn from one rotation (3, 3) to another."""
+    return 2.0 * math.asin(min(float(np.linalg.norm(one - other)) / math.sqrt(8.0), 1.0))
 
 
 def mirrored(rotation: FloatArray, x: FloatArray) -> FloatArray:

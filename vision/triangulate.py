@@ -49,20 +49,22 @@ def triangulate(
         The most likely point (3,) [m] in the left optical frame and its covariance (3, 3) [m²], to first order;
         None when the rays do not meet before the eyes.
     """
-    ul, vl, ur, vr = centres_px
+    ul, vl, ur, vr = centres_px.tolist()
     disparity = ul - ur
     if not disparity > 0:
         return None
     cx, cy = calibration.principal_point_px
     share_left = variances_px[3] / (variances_px[1] + variances_px[3])
-    v = share_left * vl + (1.0 - share_left) * vr
+    share_right = 1.0 - share_left
     depth_per_px = calibration.baseline_m / disparity
-    x = depth_per_px * np.array([ul - cx, v - cy, calibration.focal_px])
+    off = np.array([ul - cx, share_left * vl + share_right * vr - cy, calibration.focal_px])
+    x = depth_per_px * off
+    by_disparity = -depth_per_px / disparity * off
     # Columns: derivatives by ul, vl, ur, vr.
-    jacobian = np.outer(x / disparity, (-1.0, 0.0, 1.0, 0.0))
+    jacobian = np.zeros((3, 4))
+    jacobian[:, 0], jacobian[:, 2] = by_disparity, -by_disparity
     jacobian[0, 0] += depth_per_px
-    jacobian[1, 1] += depth_per_px * share_left
-    jacobian[1, 3] += depth_per_px * (1.0 - share_left)
+    jacobian[1, 1], jacobian[1, 3] = depth_per_px * share_left, depth_per_px * share_right
     return x, (jacobian * variances_px) @ jacobian.T
 
 
@@ -75,14 +77,14 @@ def locate(calibration: StereoCalibration, radius_m: float, left: Disc, right: D
     used, then the triangulated one.
     """
     eye = Pinhole(calibration.focal_px, calibration.principal_point_px)
-    variances = np.concatenate([np.diag(disc.cov_px) for disc in (left, right)]) + calibration.pixel_sigma**2
+    variances = np.concatenate([left.cov_px.diagonal(), right.cov_px.diagonal()]) + calibration.pixel_sigma**2
     distances = [eye.distance_over_radius(disc.centre_px, disc.radius_px) for disc in (left, right)]
     rough = _centres(eye, left, right, distances)
     point = triangulate(calibration, rough, variances)
     if point is None:
         return None
     to_right_eye = np.array([calibration.baseline_m, 0.0, 0.0])
-    distances = [max(1.1, float(np.linalg.norm(x)) / radius_m) for x in (point[0], point[0] - to_right_eye)]
+    distances = [max(1.1, math.hypot(*x) / radius_m) for x in (point[0], point[0] - to_right_eye)]
     centres = _centres(eye, left, right, distances)
     point = triangulate(calibration, centres, variances)
     outlines = [] if point is None else [eye.outline(x, radius_m) for x in (point[0], point[0] - to_right_eye)]

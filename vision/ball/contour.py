@@ -13,7 +13,9 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import cast
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,7 +26,7 @@ from .contour_filters import STEP_PX, Filters, filters, places
 from .polar import ball_colour, mean_of_three, median, rays_round, sample
 
 # Number of samples on the ball for its colour and the noise, and where they begin (share of the radius).
-_INNER_COLUMNS, _INNER_PART = 4, 0.3
+_INNER_PART, _INNER = 0.3, np.linspace(0.0, 1.0, 4)
 # Least noise of a sample [grey levels]; share of the rays whose background is assumed to show little but noise.
 _LEAST_NOISE, _EVEN_RAYS = 1.0, 0.3
 # Distance from the edge beyond which the ball no longer shows, in blurs.
@@ -34,6 +36,7 @@ _BEST_SIGMA_PX, _WORST_SIGMA_PX = 0.03, 0.5
 # The channels' disagreement (chi-squared, 2 degrees of freedom): more than this, and than this times the median of the
 # ball's rays, is no noise, and makes a ray's variance larger by that power of it; what its median is of noise alone.
 _LEAST_DISAGREEMENT, _USUAL_DISAGREEMENT, _DISAGREEMENT_POWER, _OF_NOISE = 2.0, 1.5, 3, 3.0
+_NOTHING = 1e-12  # keeps from dividing by information that is 0
 # Largest factor of the blur's change from one iteration to the next.
 _LARGEST_WIDENING = 1.5
 
@@ -79,35 +82,39 @@ def find_limb(
     """
     rays = rays_round(radius_px)
     at = places(radius_px, blur_px)
-    inner = np.linspace(_INNER_PART * radius_px, max(radius_px + at[0], 0.5 * radius_px), _INNER_COLUMNS)
+    first_px, last_px = _INNER_PART * radius_px, max(radius_px + float(at[0]), 0.5 * radius_px)
+    inner = first_px + (last_px - first_px) * _INNER
     samples = sample(image, centre_px, rays, np.concatenate([inner, radius_px + at]), shape)
-    colour = ball_colour(samples[:, :_INNER_COLUMNS], gate)
+    colour = ball_colour(samples[:, : len(_INNER)], gate)
     if colour is None:
         return None
-    turned = samples @ _own_colour_first(colour).astype(np.float32)
-    noise = _noise(turned[:, :_INNER_COLUMNS, 1:], turned[:, _INNER_COLUMNS:][:, at > _BEYOND_BLURS * blur_px])
-    channels = np.moveaxis(turned[:, _INNER_COLUMNS:].astype(np.float64) / noise, 2, 0)
-    return _filtered(rays, channels, filters(radius_px, blur_px), blur_px)
+    turned = cv2.transform(samples, _own_colour_first(colour))
+    channels = np.stack(cast("list[Float32Array]", cv2.split(turned)))
+    limb = channels[..., len(_INNER) :]
+    noise = _noise(channels[1:, :, : len(_INNER)], limb[..., at > _BEYOND_BLURS * blur_px])
+    return _filtered(rays, limb / np.float32(noise), filters(radius_px, blur_px), blur_px)
 
 
-def _filtered(rays: FloatArray, channels: FloatArray, both: tuple[Filters, Filters], blur_px: float) -> Limb:
+def _filtered(rays: FloatArray, channels: Float32Array, both: tuple[Filters, Filters], blur_px: float) -> Limb:
     """Apply the filters to the samples (3, n, m) of n rays, in units of the noise, the ball's own colour first."""
     own, across = both
-    informations, shifts = np.zeros((2, len(channels), len(rays)))
-    widening, widening_information = 0.0, 1e-9
-    likeliest = np.concatenate([_likeliest(channels[:1], own), _likeliest(channels[1:], across)])
-    for number, (channel, one, texture) in enumerate(zip(channels, (own, across, across), likeliest, strict=True)):
-        contrast, shift = (np.einsum("nm,nm->n", part[texture], channel) for part in (one.contrast, one.shift))
-        contrast = mean_of_three(contrast)
-        inverse = 1.0 / one.shift_variance[texture]
-        informations[number] = contrast**2 * inverse
-        shifts[number] = contrast * shift * inverse
-        if one is across:
-            inverse = 1.0 / one.widening_variance[texture]
-            widening += float(np.sum(contrast * inverse * np.einsum("nm,nm->n", one.widening[texture], channel)))
-            widening_information += float(np.sum(contrast**2 * inverse))
-    information, moved = informations.sum(axis=0), shifts.sum(axis=0)
-    mean = np.divide(moved, information, out=np.zeros_like(moved), where=information > 0)
+    _, count, columns = channels.shape
+    likelihood, found = (
+        np.concatenate(parts)
+        for parts in zip(own.apply(channels[0]), across.apply(channels[1:].reshape(-1, columns)), strict=True)
+    )
+    # Each ray's most likely texture, averaged over three neighbours, per channel (n, 3).
+    texture = np.argmax(mean_of_three(likelihood.reshape(3, count, -1).swapaxes(0, 1)), axis=2)
+    found = found[np.arange(len(found)), :, texture.T.ravel()].astype(np.float64)
+    shift, widening, contrast = found.T.reshape(3, 3, count).swapaxes(1, 2)
+    contrast = mean_of_three(contrast)
+    known = np.stack([own.information, across.information, across.information])[np.arange(3), :, texture]
+    informations = np.square(contrast) * known[..., 0]
+    shifts = contrast * shift
+    widening_information = _NOTHING + float((np.square(contrast) * known[..., 1])[:, 1:].sum())
+    wider_px = float((contrast * widening)[:, 1:].sum()) / widening_information
+    information, moved = informations.sum(axis=1), shifts.sum(axis=1)
+    mean = moved / np.maximum(information, _NOTHING)
     doubt, excess = _doubt(informations, shifts, mean, information > _WORST_SIGMA_PX**-2)
     information /= doubt
     told = information > _WORST_SIGMA_PX**-2
@@ -116,7 +123,7 @@ def _filtered(rays: FloatArray, channels: FloatArray, both: tuple[Filters, Filte
         rays,
         np.where(told, mean, 0.0),
         told / (1.0 / information + _BEST_SIGMA_PX**2),
-        blur_px * min(max(1.0 + widening / widening_information / blur_px, 1 / _LARGEST_WIDENING), _LARGEST_WIDENING),
+        blur_px * min(max(1.0 + wider_px / blur_px, 1 / _LARGEST_WIDENING), _LARGEST_WIDENING),
         excess,
     )
 
@@ -127,50 +134,38 @@ def _doubt(
     """Return the factor on each ray's variance due to disagreeing channels, shape (n,), and `Limb.excess`.
 
     Args:
-        informations: inverse variances of each channel's estimate, shape (3, n) [1/px²].
-        shifts: the estimates times these, shape (3, n) [1/px].
+        informations: inverse variances of each channel's estimate, shape (n, 3) [1/px²].
+        shifts: the estimates times these, shape (n, 3) [1/px].
         mean: the combined estimate, shape (n,) [px].
         told: mask of the rays with an estimate, shape (n,).
     """
-    off = shifts - informations * mean
-    chi_squared = np.divide(off**2, informations, out=np.zeros_like(off), where=informations > 0).sum(axis=0)
-    disagreement = mean_of_three(chi_squared)
+    off = shifts - informations * mean[:, None]
+    disagreement = mean_of_three((off * off / np.maximum(informations, _NOTHING)).sum(axis=1))
     middle = median(disagreement[told]) if told.any() else 0.0
     usual = max(_LEAST_DISAGREEMENT, _USUAL_DISAGREEMENT * middle)
     return np.maximum(1.0, disagreement / usual) ** _DISAGREEMENT_POWER, max(1.0, middle / _OF_NOISE)
 
 
-def _likeliest(channels: FloatArray, one: Filters) -> NDArray[np.intp]:
-    """Return the index of each ray's most likely texture, averaged over three neighbours, per channel: (c, n)."""
-    _, count, columns = channels.shape
-    flat = channels.reshape(-1, columns)
-    whitened = (flat @ one.precisions).reshape(len(flat), -1, columns)
-    square = np.einsum("nkm,nm->nk", whitened, flat).reshape(-1, count, len(one.log_determinant))
-    likelihood = -0.5 * (square + one.log_determinant)
-    return np.argmax([mean_of_three(channel) for channel in likelihood], axis=2)
-
-
 def _own_colour_first(colour: FloatArray) -> FloatArray:
-    """Return an orthonormal basis of colours as columns: the ball's own, grey's part orthogonal to it, the third."""
-    own = colour / np.linalg.norm(colour)
-    grey = np.ones(3) - own.sum() * own
-    if np.linalg.norm(grey) < 0.1:
-        grey = np.array([1.0, 0.0, 0.0]) - own[0] * own
-    grey /= np.linalg.norm(grey)
-    # The cross product by hand: np.cross costs more than everything else here.
-    rest = own[[1, 2, 0]] * grey[[2, 0, 1]] - own[[2, 0, 1]] * grey[[1, 2, 0]]
-    return np.column_stack([own, grey, rest])
+    """Return an orthonormal basis of colours as rows: the ball's own, grey's part orthogonal to it, the third."""
+    b, g, r = (colour / math.hypot(*colour)).tolist()
+    across = [1.0 - (b + g + r) * part for part in (b, g, r)]
+    if math.hypot(*across) < 0.1:
+        across = [1.0 - b * b, -b * g, -b * r]
+    u, v, w = (part / math.hypot(*across) for part in across)
+    return np.array([[b, g, r], [u, v, w], [g * w - r * v, r * u - b * w, b * v - g * u]])
 
 
 def _noise(inside: Float32Array, beyond: Float32Array) -> float:
     """Estimate the noise of a sample (1-sigma) [grey levels].
 
     It is the larger of two estimates, because brighter pixels have more noise: from neighbouring samples inside the
-    ball, orthogonal to its colour, shape (n, columns, 2); and along the rays with the most even background beyond the
-    ball, shape (n, columns, 3).
+    ball, orthogonal to its colour, shape (2, n, columns); and along the rays with the most even background beyond the
+    ball, shape (3, n, columns).
     """
-    on_ball = 1.4826 * median(np.abs(np.diff(inside, axis=0)).ravel()) / math.sqrt(2.0)
+    on_ball = 1.4826 * median(np.abs(inside[:, 1:] - inside[:, :-1]).ravel()) / math.sqrt(2.0)
     apart = round(1.0 / STEP_PX)
-    rough = mean_of_three(((beyond[:, apart:] - beyond[:, :-apart]) ** 2).mean(axis=(1, 2)))
+    change = beyond[..., apart:] - beyond[..., :-apart]
+    rough = mean_of_three(np.einsum("cnm,cnm->n", change, change)) / (3 * change.shape[2])
     even = int(_EVEN_RAYS * (len(rough) - 1))
     return max(_LEAST_NOISE, on_ball, math.sqrt(0.5 * float(np.partition(rough, even)[even])))

@@ -21,6 +21,8 @@ import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
 
+from .colour import Float32Array
+
 STEP_PX = 0.5
 # Sampled lengths on the ball and beyond [px], for a blur of USUAL_BLUR_PX; a wider blur needs longer ones.
 _INSIDE_PX, _OUTSIDE_PX, USUAL_BLUR_PX = 4.0, 8.0, 0.86
@@ -36,27 +38,33 @@ _GLOSS, _EDGE_BLURS = 2.0, 1.4
 _FINE_PX = 0.05
 
 
+# Directions in which two textures' precisions differ by less tell them apart by less than thousandths.
+_SAME = 1e-9
+
+
 @dataclass(frozen=True, slots=True)
 class Filters:
     """One filter for each of k textures of the background, over m samples of a ray in units of their noise.
 
     Attributes:
-        precisions: inverse covariances of the samples side by side, shape (m, k·m), whose
-        log_determinant: logarithms of the covariances' determinants, shape (k,), make the likelihood.
-        shift: (k, m), what the edge is off by times the contrast [px], with
-        shift_variance: (k,) [px²].
-        contrast: (k, m), ball less background at the edge.
-        widening: (k, m), what the blur is off by times the contrast [px], with
-        widening_variance: (k,) [px²].
+        matrix: what samples (n, m) are multiplied by, shape (m, l + 3k). The squares of the first l columns' results
+            make the likelihoods. Then there are k filters for the edge's shift times the contrast and its information,
+            k for the blur's error times the same, and k for the contrast, ball less background at the edge.
+        groups: 1 where a square belongs to a texture, else 0, shape (l, k).
+        log_ratio: logarithms of the covariances' determinants less that of the first texture, shape (k,).
+        information: inverse variances of shift and blur for a contrast of 1, shape (2, k) [1/px²].
     """
 
-    precisions: FloatArray
-    log_determinant: FloatArray
-    shift: FloatArray
-    shift_variance: FloatArray
-    contrast: FloatArray
-    widening: FloatArray
-    widening_variance: FloatArray
+    matrix: Float32Array
+    groups: Float32Array
+    log_ratio: Float32Array
+    information: FloatArray
+
+    def apply(self, samples: Float32Array) -> tuple[Float32Array, Float32Array]:
+        """Return the textures' log-likelihoods (n, k) for samples (n, m), and what the filters find (n, 3, k)."""
+        found = samples @ self.matrix
+        squares, count = np.square(found[:, : len(self.groups)]), self.information.shape[1]
+        return 0.5 * (squares @ self.groups - self.log_ratio), found[:, len(self.groups) :].reshape(-1, 3, count)
 
 
 def places(radius_px: float, blur_px: float) -> FloatArray:
@@ -102,22 +110,40 @@ def _filters(at: tuple[float, ...], radius_px: float, blur_px: float, own_colour
     for roughness, slope_variance in _TEXTURES:
         background = _FREE + slope_variance * np.outer(t, t) + roughness**2 * walk
         cov: FloatArray = (known + np.outer(beyond, beyond) * background).astype(np.float64)
-        shift, shift_variance = _best_filter(cov + _BLUR * np.outer(wider, wider), slope)
-        widening, widening_variance = _best_filter(cov + _FREE * np.outer(slope, slope), wider)
+        shift, shift_information = _best_filter(cov + _BLUR * np.outer(wider, wider), slope)
+        widening, widening_information = _best_filter(cov + _FREE * np.outer(slope, slope), wider)
         cov += _BLUR * np.outer(wider, wider) + _FREE * np.outer(slope, slope)
         precision: FloatArray = np.linalg.inv(cov).astype(np.float64)
         contrast = (level * ball - _FREE * beyond) @ precision
         log_determinant = float(np.linalg.slogdet(cov)[1])
-        rows.append((precision, log_determinant, shift, shift_variance, contrast, widening, widening_variance))
-    precisions, *others = (np.array(column) for column in zip(*rows, strict=True))
-    return Filters(np.concatenate(list(precisions), axis=1), *others)
+        rows.append((precision, log_determinant, shift, widening, contrast, shift_information, widening_information))
+    precisions, log_determinants, *finding, shift_informations, widening_informations = (
+        np.array(column) for column in zip(*rows, strict=True)
+    )
+    # The rougher the texture, the larger the covariance: precisions differ by a sum of squares.
+    roots = [_root(precisions[0] - precision) for precision in precisions[1:]]
+    widths = [0, *(root.shape[1] for root in roots)]
+    return Filters(
+        np.hstack([*roots, *(filter.T for filter in finding)]).astype(np.float32),
+        np.repeat(np.eye(len(widths), dtype=np.float32), widths, axis=0),
+        (log_determinants - log_determinants[0]).astype(np.float32),
+        np.stack([shift_informations, widening_informations]),
+    )
+
+
+def _root(matrix: FloatArray) -> FloatArray:
+    """Return a (m, l) whose product with its transpose is a positive semidefinite matrix (m, m)."""
+    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
+    kept = values > _SAME
+    return np.asarray(vectors[:, kept] * np.sqrt(values[kept]), np.float64)
 
 
 def _best_filter(cov: FloatArray, signal: FloatArray) -> tuple[FloatArray, float]:
-    """Return the minimum-variance unbiased linear filter (m,) for the amplitude of `signal` (m,), and its variance."""
+    """Return the minimum-variance linear filter (m,) for the amplitude of `signal` (m,) times its information, and that
+    information.
+    """
     weighted: FloatArray = np.linalg.solve(cov, signal).astype(np.float64)
-    variance = 1.0 / float(signal @ weighted)
-    return weighted * variance, variance
+    return weighted, float(signal @ weighted)
 
 
 def _blurred_normal(t: FloatArray, radius_px: float, blur_px: float) -> FloatArray:

@@ -12,12 +12,11 @@ from bodyschema.interfaces.records import FloatArray
 from .colour import Float32Array, Gate
 from .contour import Limb, find_limb
 from .contour_filters import USUAL_BLUR_PX
-from .contour_spectrum import Waves, waves
-from .normal import inverse_of_normal
-from .polar import median
+from .contour_spectrum import waves
+from .polar import fit_circle, median
 
 # Most iterations; converged when the limb and its blur changed by less than these [px].
-_LOOKS, _SETTLED_PX, _SETTLED_BLUR_PX = 4, 0.02, 0.05
+_LOOKS, _SETTLED_PX, _SETTLED_BLUR_PX = 4, 0.06, 0.05
 # An edge sharper than this after interpolation [px] was not anti-aliased: coverage is then the better measure.
 _ALIASED_PX = 0.55
 # Student's degrees of freedom of an edge's error, which set the weight of outliers; residual limit [px]; iterations.
@@ -65,19 +64,17 @@ class _Fit:
     """Result of one fit.
 
     Attributes:
-        shift_px, growth_px: change of the circle's centre (2,) and radius [px].
+        solution: change of the circle's centre and of its radius (3,) [px].
         inverse: inverse normal matrix (3, 3) [px²].
-        waves: waves of the residuals.
-        pulls: influence of the rays on the circle, shape (n,), see `_pulls`.
-        off_px: RMS residual without noise [px].
+        used, weight: weights of the rays (n,) in this fit and in one that would follow [1/px²].
+        residual: of the rays (n,) [px].
     """
 
-    shift_px: FloatArray
-    growth_px: float
+    solution: FloatArray
     inverse: FloatArray
-    waves: Waves
-    pulls: FloatArray
-    off_px: float
+    used: FloatArray
+    weight: FloatArray
+    residual: FloatArray
 
 
 def fit_limb(
@@ -88,66 +85,54 @@ def fit_limb(
     Return None if there is no ball's limb all around. If the iteration has not settled, its last step is added to the
     covariance.
     """
-    blur_px = USUAL_BLUR_PX
-    fit: _Fit | None = None
-    unsettled, noise, excess, fewer = np.zeros(3), 1.0, 1.0, 1.0
-    for _ in range(_LOOKS):
+    blur_px, looks = USUAL_BLUR_PX, 0
+    while True:
         limb = find_limb(image, gate, centre_px, radius_px, shape, blur_px)
-        fit = None if limb is None else _fit(limb, radius_px)
+        fit = None if limb is None else _fit(limb)
         if limb is None or fit is None:
             return None
-        centre_px, radius_px = centre_px + shape @ fit.shift_px, radius_px + fit.growth_px
-        excess, fewer = limb.excess, max(1.0, _LEAST_EVENNESS / limb.evenness)
-        noise = limb.noise_share * excess
-        last_blur_px, blur_px = blur_px, limb.blur_px
-        moved_px = max(float(np.linalg.norm(fit.shift_px)), abs(fit.growth_px))
-        if moved_px < _SETTLED_PX and abs(blur_px - last_blur_px) < _SETTLED_BLUR_PX:
-            unsettled = np.zeros(3)
+        u, v, growth = fit.solution.tolist()
+        centre_px, radius_px = centre_px + shape @ fit.solution[:2], radius_px + growth
+        moved_px, widened_px = max(math.hypot(u, v), abs(growth)), limb.blur_px - blur_px
+        blur_px, looks = limb.blur_px, looks + 1
+        settled = moved_px < _SETTLED_PX and abs(widened_px) < _SETTLED_BLUR_PX
+        if settled or looks == _LOOKS:
             break
-        unsettled = np.array([*fit.shift_px, fit.growth_px])
+    excess, fewer = limb.excess, max(1.0, _LEAST_EVENNESS / limb.evenness)
+    around, told = waves(np.sqrt(fit.used) * fit.residual, radius_px), limb.weight > 0
+    off = np.minimum(np.abs(fit.residual[told]), _FARTHEST_PX)
+    off_px = math.sqrt(max(0.0, float(np.mean(off**2 - 1.0 / limb.weight[told]))))  # RMS without noise
     aliased = blur_px < _ALIASED_PX
-    if fit is None:
+    is_angular = off_px > max(_MOST_ANGULAR * radius_px, _MOST_ANGULAR_BLURS * blur_px)
+    if (is_angular or around.quick > _LARGEST_DENSITY * excess) and not aliased:
         return None
-    is_angular = fit.off_px > max(_MOST_ANGULAR * radius_px, _MOST_ANGULAR_BLURS * blur_px)
-    if (is_angular or fit.waves.quick > _LARGEST_DENSITY * excess) and not aliased:
-        return None
-    told = waves(fit.pulls, radius_px).mean
-    usual = _LEAST_DENSITY + _NOISE * noise
-    density = math.hypot(usual, (_TOLD + told / _USUAL_DENSITY) * told)
-    cov = fewer**2 * density * fit.inverse + np.outer(unsettled, unsettled)
+    pulled = waves(_pulls(limb.weight, fit.weight, fit.residual), radius_px).mean
+    usual = _LEAST_DENSITY + _NOISE * limb.noise_share * excess
+    density = math.hypot(usual, (_TOLD + pulled / _USUAL_DENSITY) * pulled)
+    cov = fewer**2 * density * fit.inverse
+    if not settled:
+        cov += np.outer(fit.solution, fit.solution)
     # A blurred disc's edge, where it is steepest, is nearer to the centre than the disc's.
     radius_px += blur_px**2 / (2.0 * radius_px)
-    is_round = fit.off_px < _ROUND * radius_px
-    unrest = 0.0 if is_round else math.sqrt(fit.waves.slow * fit.waves.quick) / excess
+    is_round = off_px < _ROUND * radius_px
+    unrest = 0.0 if is_round else math.sqrt(around.slow * around.quick) / excess
     return Circle(centre_px, radius_px, shape @ cov[:2, :2] @ shape, math.sqrt(cov[2, 2]), unrest, aliased)
 
 
-def _fit(limb: Limb, radius_px: float) -> _Fit | None:
+def _fit(limb: Limb) -> _Fit | None:
     """Fit a circle by robust weighted least squares: outliers get low weight."""
-    design, told = limb.rays, limb.weight > 0
-    if np.count_nonzero(told) < len(told) // 2:
-        return None
-    weight = used = limb.weight
-    solution: FloatArray = np.zeros(3)
-    inverse: FloatArray | None = None
-    residual = limb.offset_px
-    for _ in range(_ROUNDS):
-        used = weight
-        inverse = inverse_of_normal((design * used[:, None]).T @ design)
-        if inverse is None or np.count_nonzero(used) < len(told) // 2:
+    told = limb.weight > 0
+    weight, rounds = limb.weight, 0
+    while True:
+        fitted = None if np.count_nonzero(weight) < len(told) // 2 else fit_circle(limb.offset_px, weight)
+        if fitted is None:
             return None
-        solution = inverse @ (design.T @ (used * limb.offset_px))
-        residual = limb.offset_px - design @ solution
-        square = residual**2 * limb.weight
+        residual = limb.offset_px - limb.rays @ fitted[0]
+        square, rounds, used = residual**2 * limb.weight, rounds + 1, weight
         usual = max(1.0, 1.4826**2 * median(square[told]))
         weight = np.where(np.abs(residual) < _FARTHEST_PX, limb.weight / (1.0 + square / usual / _FREEDOM), 0.0)
-    if inverse is None:
-        return None
-    around = waves(np.sqrt(used) * residual, radius_px)
-    pulls = _pulls(limb.weight, weight, residual)
-    off = np.minimum(np.abs(residual[told]), _FARTHEST_PX)
-    off_px = math.sqrt(max(0.0, float(np.mean(off**2 - 1.0 / limb.weight[told]))))
-    return _Fit(solution[:2], float(solution[2]), inverse, around, pulls, off_px)
+        if rounds == _ROUNDS:
+            return _Fit(*fitted, used, weight, residual)
 
 
 def _pulls(full: FloatArray, used: FloatArray, residual: FloatArray) -> FloatArray:

@@ -8,10 +8,11 @@ slowest waves.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
-from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.records import FloatArray, frozen_array
 
 # Least number of slow waves; larger outlines count those up to the wave number radius / _WAVE_RADIUS_PX.
 _LEAST_WAVES, _WAVE_RADIUS_PX = 3, 3.0
@@ -54,10 +55,18 @@ def waves(residual: FloatArray, radius_px: float) -> Waves:
     quickest = len(residual) // 2
     last_slow = min(max(first + _LEAST_WAVES - 1, round(radius_px / _WAVE_RADIUS_PX)), quickest - 1)
     last_quick = min(max(last_slow + 1, min(2 * last_slow, round(radius_px))), quickest)
-    harmonics = np.arange(first, last_quick + 1)
+    squares, share, count = _band(first, last_slow, last_quick)
     parts = np.fft.rfft(residual)[first : last_quick + 1]
-    power = np.abs(parts) ** 2 * np.exp((harmonics * _SMOOTHING_PX / radius_px) ** 2) / np.count_nonzero(residual)
-    slow = last_slow - first + 1
-    weight = harmonics[:slow] ** -2.0
+    power = np.square(np.abs(parts)) * np.exp(squares * (_SMOOTHING_PX / radius_px) ** 2) / np.count_nonzero(residual)
+    return Waves(float(share @ power[: len(share)]), float(power[len(share) :].mean()), count)
+
+
+@lru_cache
+def _band(first: int, last_slow: int, last_quick: int) -> tuple[FloatArray, FloatArray, float]:
+    """Return the squares of all wave numbers, the shares of the slow ones in their mean, and the effective number of
+    these.
+    """
+    squares = np.arange(first, last_quick + 1, dtype=np.float64) ** 2
+    weight = 1.0 / squares[: last_slow - first + 1]
     share = weight / weight.sum()
-    return Waves(float(share @ power[:slow]), float(power[slow:].mean()), 1.0 / float(share @ share))
+    return frozen_array(squares), frozen_array(share), 1.0 / float(share @ share)

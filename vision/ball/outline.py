@@ -13,7 +13,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import cast
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,19 +24,18 @@ from bodyschema.interfaces.records import FloatArray
 from .colour import Float32Array, Gate
 from .contour_fit import fit_limb
 from .contour_spectrum import waves
-from .normal import inverse_of_normal
-from .polar import ball_colour, mean_of_three, median, rays_round, sample
+from .polar import ENOUGH_RAYS, ball_colour, fit_circle, mean_of_three, median, rays_round, sample
 
 BoolArray = NDArray[np.bool_]
 
 # Half-widths [px] of the ring in which the edge is searched: about a circle right to a pixel, and about others.
 _NARROW_PX, _WIDE_PX = 2.0, 4.0
-# The fit has converged when a step in the narrow ring moved it less than the first of these [px]; a rough circle that
-# is off by more than the second one is fitted in the wide ring.
-_SETTLED_PX, _ROUGH_PX = 0.4, 1.0
+# A fit in the narrow ring is final if it moved the circle by less than the first of these [px]; a rough circle that is
+# off by more than the second one is fitted in the wide ring.
+_SETTLED_PX, _ROUGH_PX = 0.5, 1.0
 _RING_STEP_PX = 0.5
 _BACKGROUND_PX = 2.0
-_INNER_COLUMNS = 6
+_INNER = np.linspace(0.0, 1.0, 6)  # places on the ball that show its colour
 # Difference of any channel between the limb and a little inside, apart from brightness (1-sigma, grey levels).
 _CHANNEL_SIGMA = 4.0
 # A ray shows the edge if ball and background differ by this many of these sigmas.
@@ -52,10 +53,8 @@ _LEAST_GATE_PX, _LARGEST_GATE_PX, _GATE_SIGMAS = 0.8, 2.0, 3.5
 _ARC, _LEAST_HALF_ARC, _OFF_PX, _OFF_SHARE = 0.1, 3, 0.35, 0.05
 # Number of arcs of the outline; any three give a candidate circle.
 _ARCS = 10
-# If no point is farther than this from the circle through all, none is left out [px].
-_AGREED_PX = 0.4
-# Number of points sufficient to find the circle that most points agree on.
-_ENOUGH = 60
+# If this share of the points is no farther than this from the circle through all [px], they are the ones.
+_NEARLY_ALL, _AGREED_PX = 0.9, 0.4
 _TRIPLES = np.array(list(combinations(range(_ARCS), 3)))
 # Systematic error that averaging does not reduce [px].
 _FLOOR_PX = 0.001
@@ -107,6 +106,26 @@ class _Edges:
     uneven: BoolArray
 
 
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    """Circle through the edges.
+
+    Attributes:
+        solution: shift of its centre and its radius, shape (3,) [px].
+        inverse: inverse normal matrix (3, 3), without the noise's variance.
+        residual: of each ray, shape (n,) [px].
+        used: weight of each ray, 0..1, shape (n,).
+        apart: mask (n,) of rays whose edge is too far off.
+    """
+
+    edges: _Edges
+    solution: FloatArray
+    inverse: FloatArray
+    residual: FloatArray
+    used: FloatArray
+    apart: BoolArray
+
+
 def fit_outline(
     image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray
 ) -> Outline | None:
@@ -118,21 +137,22 @@ def fit_outline(
         radius_px: rough radius [px], right to about a fifth.
         shape: the ellipse's shape (2, 2), see `sphere.Ellipse`.
     """
-    outline, moved_px = _step(image, gate, centre_px, radius_px, shape, _NARROW_PX)
+    fit, moved_px = _step(image, gate, centre_px, radius_px, shape, _NARROW_PX)
+    windows_px = (_NARROW_PX, _NARROW_PX)
     if moved_px > _ROUGH_PX:
-        outline, moved_px = _step(image, gate, centre_px, radius_px, shape, _WIDE_PX)
-        if moved_px > max(2.0, 0.5 * radius_px):
-            return None
-        # A fit in the wide ring is not final.
-        moved_px = max(moved_px, _SETTLED_PX)
-    for _ in range(2):
-        if outline is None or moved_px < _SETTLED_PX:
+        fit, moved_px = None, _ROUGH_PX
+        windows_px = (_WIDE_PX, *windows_px)  # a fit in the wide ring is not final
+    for window_px in windows_px:
+        if moved_px < _SETTLED_PX:
             break
-        radius_px = outline.radius_px
-        outline, moved_px = _step(image, gate, outline.centre_px, radius_px, shape, _NARROW_PX)
+        if fit is not None:
+            centre_px, radius_px = centre_px + shape @ fit.solution[:2], float(fit.solution[2])
+        fit, moved_px = _step(image, gate, centre_px, radius_px, shape, window_px)
         if moved_px > max(2.0, 0.5 * radius_px):
             return None
-    return outline
+        if window_px == _WIDE_PX:
+            moved_px = _ROUGH_PX
+    return None if fit is None else _outline(fit, centre_px, shape)
 
 
 def refine_outline(image: Float32Array, gate: Gate, rough: Outline, shape: FloatArray) -> Outline | None:
@@ -159,13 +179,14 @@ def refine_outline(image: Float32Array, gate: Gate, rough: Outline, shape: Float
 
 def _step(
     image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray, window_px: float
-) -> tuple[Outline | None, float]:
-    """Fit the outline in a ring of half-width `window_px` about a circle; return it and its shift [px]."""
+) -> tuple[_Fit | None, float]:
+    """Fit a circle in a ring of half-width `window_px` about another one; return it and its shift [px]."""
     edges = _find_edges(image, gate, centre_px, radius_px, shape, min(window_px, 0.6 * radius_px))
-    outline = None if edges is None else _fit_circle(edges, centre_px, shape)
-    if outline is None:
+    fit = None if edges is None else _fit(edges)
+    if fit is None:
         return None, math.inf
-    return outline, float(np.linalg.norm(outline.centre_px - centre_px)) + abs(outline.radius_px - radius_px)
+    u, v, radius = fit.solution.tolist()
+    return fit, math.hypot(u, v) + abs(radius - radius_px)
 
 
 def _find_edges(
@@ -174,25 +195,28 @@ def _find_edges(
     rays = rays_round(radius_px)
     cells = max(2, round(2 * half_px / _RING_STEP_PX))
     step = 2 * half_px / cells
-    inner = np.linspace(0.3 * radius_px, radius_px - half_px, _INNER_COLUMNS)
+    inner = 0.3 * radius_px + (0.7 * radius_px - half_px) * _INNER
     ring = radius_px - half_px + (np.arange(cells) + 0.5) * step
     outer = radius_px + half_px + (np.arange(round(_BACKGROUND_PX / _RING_STEP_PX)) + 0.5) * _RING_STEP_PX
-    samples = sample(image, centre_px, rays, np.concatenate([inner, ring, outer]).astype(np.float64), shape)
-    inside, outside = samples[:, : len(inner)], samples[:, len(inner) + cells :]
-
+    radii = np.asarray(np.concatenate([inner, ring, outer]), np.float64)
+    samples = sample(image, centre_px, rays, radii, shape)
+    inside = samples[:, : len(inner)]
     colour = ball_colour(inside, gate)
     if colour is None:
         return None
-    level = np.maximum(mean_of_three(gate.amount(inside[:, -2:]).mean(axis=1)), 0.0)
+    limb = gate.amount(inside[:, -2:])
+    level = np.maximum(mean_of_three(0.5 * (limb[:, 0] + limb[:, 1])), 0.0)
     covered = level < _LEAST_LEVEL * median(level)
-    background = mean_of_three(outside.mean(axis=1))
+    channels = np.stack(cast("list[Float32Array]", cv2.split(samples)))[..., len(inner) :]
+    background = mean_of_three(channels[..., cells:].mean(axis=2).T)
     towards, separation = _discriminant(level, colour, background, gate.shading_sigma)
     told = (separation > _LEAST_SEPARATION**2) & ~covered
-    scale = 1.0 / np.where(told, separation, 1.0)
+    towards /= np.where(told, separation, 1.0)[:, None]
     # The share of ball in each sample: 1 on the ball, 0 on the background.
-    share = np.matmul(samples[:, len(inner) :] - background[:, None], towards[:, :, None])[..., 0] * scale[:, None]
-    distance = radius_px - half_px + share[:, :cells].sum(axis=1) * step
-    unevenness_px = half_px * np.sqrt(np.mean(share[:, cells:] ** 2, axis=1))
+    apart = (channels - background.T[..., None].astype(np.float32)) * towards.T[..., None].astype(np.float32)
+    share = apart.sum(axis=0)
+    distance = radius_px - half_px + step * share[:, :cells].sum(axis=1, dtype=np.float64)
+    unevenness_px = half_px * np.sqrt(np.square(share[:, cells:]).mean(axis=1, dtype=np.float64))
     weight = told / (1.0 + (unevenness_px / _EDGE_SIGMA_PX) ** 2)
     return _Edges(rays, distance, weight, covered, ~told | (unevenness_px > _UNEVEN_PX))
 
@@ -219,41 +243,40 @@ def _discriminant(
     return direction, np.einsum("nc,nc->n", direction, apart)
 
 
-def _fit_circle(edges: _Edges, centre_px: FloatArray, shape: FloatArray) -> Outline | None:
-    """Least squares for the centre's shift and the radius; points too far off are left out in turn."""
-    design = edges.rays
+def _fit(edges: _Edges) -> _Fit | None:
+    """Fit a circle by least squares; points too far off are left out in turn."""
     told = edges.weight > 0
-    weight = _agreeing(design, edges)
-    solution, residual, used = np.zeros(3), edges.distance_px, weight
-    inverse: FloatArray | None = None
+    weight = _agreeing(edges)
+    fit: _Fit | None = None
     for _ in range(3):
-        if np.count_nonzero(weight) < len(weight) // 2:
+        fitted = None if np.count_nonzero(weight) < len(weight) // 2 else fit_circle(edges.distance_px, weight)
+        if fitted is None:
             return None
-        inverse = inverse_of_normal((design * weight[:, None]).T @ design)
-        if inverse is None:
-            return None
-        solution = inverse @ (design.T @ (weight * edges.distance_px))
-        residual = edges.distance_px - design @ solution
+        residual = edges.distance_px - edges.rays @ fitted[0]
         spread = 1.4826 * median(np.abs(residual[told]))
         gate = min(max(_GATE_SIGMAS * spread, _LEAST_GATE_PX), _LARGEST_GATE_PX)
-        used, weight = weight, np.where(np.abs(residual) < gate, edges.weight, 0.0)
-        if np.array_equal(used, weight):
+        agreeing = np.where(np.abs(residual) < gate, edges.weight, 0.0)
+        fit = _Fit(edges, *fitted, residual, weight, agreeing == 0)
+        if np.array_equal(weight, agreeing):
             break
-    if inverse is None or solution[2] <= 0:
-        return None
-    density = waves(np.sqrt(used) * residual, float(solution[2])).once_round()
-    inverse = density * inverse
+        weight = agreeing
+    return fit if fit is not None and fit.solution[2] > 0 else None
+
+
+def _outline(fit: _Fit, centre_px: FloatArray, shape: FloatArray) -> Outline:
+    edges, residual, radius_px = fit.edges, fit.residual, float(fit.solution[2])
+    inverse = waves(np.sqrt(fit.used) * residual, radius_px).once_round() * fit.inverse
     # What hides a ball moves its edge inwards; outwards does what has its colour behind it.
-    apart = (weight == 0) & ~edges.uneven
+    apart = fit.apart & ~edges.uneven
     hidden = edges.covered | (apart & (residual < 0))
     return Outline(
-        centre_px=centre_px + shape @ solution[:2],
-        radius_px=float(solution[2]),
+        centre_px=centre_px + shape @ fit.solution[:2],
+        radius_px=radius_px,
         cov_px=shape @ inverse[:2, :2] @ shape + _FLOOR_PX**2 * np.eye(2),
         radius_sigma_px=math.sqrt(inverse[2, 2]),
-        visible=1.0 - float(np.mean(hidden)),
-        uneven=float(np.mean(edges.uneven | (apart & ~hidden))),
-        off=_share_off(edges.weight, residual, max(_OFF_PX, _OFF_SHARE * float(solution[2]))),
+        visible=1.0 - np.count_nonzero(hidden) / len(hidden),
+        uneven=np.count_nonzero(edges.uneven | (apart & ~hidden)) / len(hidden),
+        off=_share_off(edges.weight, residual, max(_OFF_PX, _OFF_SHARE * radius_px)),
     )
 
 
@@ -274,33 +297,28 @@ def _arc_sums(values: FloatArray, half: int) -> FloatArray:
     return sums[2 * half + 1 :] - sums[: -2 * half - 1]
 
 
-def _agreeing(design: FloatArray, edges: _Edges) -> FloatArray:
+def _agreeing(edges: _Edges) -> FloatArray:
     """Return the points' weights (n,), with 0 for those far from the circle that most points agree on.
 
     Rousseeuw's least median of squares, over circles through the means of three arcs. Occlusions hide whole arcs, up to
     nearly half of the outline, and all of them pull inwards: plain least squares would follow them.
     """
     told = np.flatnonzero(edges.weight > 0)
-    if len(told) < 2 * _ARCS or _all_agree(design, edges):
+    fitted = fit_circle(edges.distance_px, edges.weight)
+    if fitted is not None:
+        agree = np.abs(edges.distance_px - edges.rays @ fitted[0]) < _AGREED_PX
+        if np.count_nonzero(agree[told]) >= _NEARLY_ALL * len(told):
+            return np.where(agree, edges.weight, 0.0)
+    if len(told) < 2 * _ARCS:
         return edges.weight
-    points = np.column_stack([design[told], edges.distance_px[told]])
+    points = np.column_stack([edges.rays[told], edges.distance_px[told]])
     begins = np.arange(_ARCS) * len(told) // _ARCS
     means = (np.add.reduceat(points, begins) / np.diff(begins, append=len(told))[:, None])[_TRIPLES]
-    told = told[:: max(1, len(told) // _ENOUGH)]
+    told = told[:: max(1, len(told) // ENOUGH_RAYS)]
     circles = np.linalg.solve(means[..., :3] + 1e-9 * np.eye(3), means[..., 3:])[..., 0]
-    off = np.abs(edges.distance_px[told] - circles @ design[told].T)
+    off = np.abs(edges.distance_px[told] - circles @ edges.rays[told].T)
     middle = len(told) // 2
     spread = np.partition(off, middle, axis=1)[:, middle]
     best = int(np.argmin(spread))
     gate = min(max(_GATE_SIGMAS * 1.4826 * float(spread[best]), _LEAST_GATE_PX), _LARGEST_GATE_PX)
-    return np.where(np.abs(edges.distance_px - design @ circles[best]) < gate, edges.weight, 0.0)
-
-
-def _all_agree(design: FloatArray, edges: _Edges) -> bool:
-    """Return True if one circle fits all points."""
-    weighted = design * edges.weight[:, None]
-    inverse = inverse_of_normal(weighted.T @ design)
-    if inverse is None:
-        return False
-    off = np.abs(edges.distance_px - design @ (inverse @ (weighted.T @ edges.distance_px)))
-    return bool(off[edges.weight > 0].max() < _AGREED_PX)
+    return np.where(np.abs(edges.distance_px - edges.rays @ circles[best]) < gate, edges.weight, 0.0)

@@ -14,51 +14,72 @@ from bodyschema.interfaces.records import FloatArray, frozen_array
 
 from .colour import Float32Array, Gate
 
+# Below this, relative to the cubed trace, an outline does not determine centre and radius.
+_LEAST_DETERMINANT = 1e-6
+# Rays that suffice for the ball's colour, and to find the circle that most of them agree on.
+ENOUGH_RAYS = 60
+
 
 def rays_round(radius_px: float) -> FloatArray:
     """Return rays about a pixel apart on the outline, as rows (cos, sin, 1) of their angles, shape (n, 3).
 
     These are the derivatives of a circle's points along the rays by its centre and its radius, too.
     """
-    return _rays(min(max(round(2 * math.pi * radius_px), 24), 400))
+    return _rays(min(max(round(2 * math.pi * radius_px), 24), 400))[0]
 
 
 @lru_cache(maxsize=400)
-def _rays(count: int) -> FloatArray:
+def _rays(count: int) -> tuple[FloatArray, FloatArray]:
+    """Return the rays and the products of their columns (n, 6)."""
     angles = np.linspace(0.0, 2 * np.pi, count, endpoint=False)
-    return frozen_array(np.stack([np.cos(angles), np.sin(angles), np.ones(count)], axis=1))
+    rays = np.stack([np.cos(angles), np.sin(angles), np.ones(count)], axis=1)
+    rows, columns = np.triu_indices(3)
+    return frozen_array(rays), frozen_array(rays[:, rows] * rays[:, columns])
+
+
+def fit_circle(distance_px: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+    """Fit shift of the centre and radius (3,) [px] to distances (n,) on `rays_round` by weighted least squares.
+
+    Return them and the inverse normal matrix (3, 3); None if the weights (n,) determine too little.
+    """
+    rays, products = _rays(len(weight))
+    # By hand: NumPy's own routines cost more than the arithmetic.
+    a, b, c, d, e, f = (weight @ products).tolist()
+    A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
+    determinant = a * A + b * B + c * C
+    if not determinant >= _LEAST_DETERMINANT * (a + d + f) ** 3 or determinant <= 0:
+        return None
+    D, E, F = a * f - c * c, b * c - a * e, a * d - b * b
+    inverse = np.array([[A, B, C], [B, D, E], [C, E, F]]) / determinant
+    return inverse @ ((weight * distance_px) @ rays), inverse
 
 
 def sample(
     image: Float32Array, centre_px: FloatArray, rays: FloatArray, radii: FloatArray, shape: FloatArray
 ) -> Float32Array:
     """Sample `image` on every ray (rows) and at every radius (columns) of the ellipse's own polar coordinates."""
-    directions = rays[:, :2] @ shape
-    at = (centre_px + directions[:, None, :] * radii[:, None]).astype(np.float32)
-    samples = cv2.remap(image, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return cast(Float32Array, samples)
+    at = np.multiply.outer(shape @ rays[:, :2].T, radii)
+    at += centre_px[:, None, None]
+    u, v = at.astype(np.float32)
+    return cast(Float32Array, cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE))
 
 
 def ball_colour(inside: Float32Array, gate: Gate) -> FloatArray | None:
     """Return the ball's colour (3,) per unit of its amount; the median excludes highlights."""
-    samples = inside.reshape(-1, 3)
+    samples = inside[:: max(1, len(inside) // ENOUGH_RAYS)].reshape(-1, 3)
     amount = gate.amount(samples)
     coloured = amount > 1.0
     if np.count_nonzero(coloured) < len(amount) // 2:
         return None
-    relative = samples[coloured] / amount[coloured, None]
+    relative = samples.compress(coloured, axis=0) / amount.compress(coloured)[:, None]
     middle = len(relative) // 2
     return np.partition(relative, middle, axis=0)[middle].astype(np.float64)
 
 
 def mean_of_three(values: NDArray[np.floating]) -> FloatArray:
     """Return the mean over three neighbours along the closed first axis."""
-    wrapped = np.empty((len(values) + 2, *values.shape[1:]))
-    wrapped[0], wrapped[1:-1], wrapped[-1] = values[-1], values, values[0]
-    sums = wrapped[:-2] + wrapped[1:-1]
-    sums += wrapped[2:]
-    sums /= 3.0
-    return sums
+    wrapped = np.concatenate([values[-1:], values, values[:1]])
+    return np.asarray((wrapped[:-2] + wrapped[1:-1] + wrapped[2:]) / 3.0, np.float64)
 
 
 def median(values: NDArray[np.floating]) -> float:

@@ -33,10 +33,12 @@ class BallSize:
         """Start with the configured radius."""
         self._calibration = calibration
         self._shares: deque[tuple[float, float]] = deque(maxlen=_MEMORY)
+        self._known = self._estimated()
 
     def forget(self) -> None:
         """Forget the learned radius."""
         self._shares.clear()
+        self._known = self._estimated()
 
     def contradicts(self, found: Location) -> Reason | None:
         """Return SIZE_MISMATCH if the size differs too much from that of the previous fixes."""
@@ -59,13 +61,14 @@ class BallSize:
     def learn(self, found: Location) -> None:
         """Update the radius with the size of a fix."""
         self._shares.append((float(found.sizes.mean()), float(np.sqrt(_variances(found).mean()))))
+        self._known = self._estimated()
 
     def _off(self, found: Location) -> tuple[FloatArray, FloatArray]:
         """Return each eye's relative size error, shape (2,), and its 1-sigma."""
-        share, share_sigma = self._known()
+        share, share_sigma = self._known
         return found.sizes / share - 1.0, np.sqrt(_variances(found) + share_sigma**2)
 
-    def _known(self) -> tuple[float, float]:
+    def _estimated(self) -> tuple[float, float]:
         """Return the estimated share and its 1-sigma."""
         if not self._shares:
             return 1.0, RADIUS_SIGMA

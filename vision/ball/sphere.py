@@ -48,23 +48,26 @@ class Pinhole:
         """Return the outline of a sphere around `x_eye` (3,) [m] in this eye's frame; None if it is not in front of
         the eye.
         """
-        distance = float(np.linalg.norm(x_eye))
-        if not (x_eye[2] > 0 and distance > radius_m):
+        x, y, z = x_eye.tolist()
+        across, distance = math.hypot(x, y), math.hypot(x, y, z)
+        if not (z > 0 and distance > radius_m):
             return None
         gamma = math.asin(radius_m / distance)
-        theta = math.acos(min(1.0, float(x_eye[2]) / distance))
+        theta = math.acos(min(1.0, z / distance))
         if theta + gamma > _LARGEST_ANGLE:
             return None
         spread = math.cos(gamma) ** 2 - math.sin(theta) ** 2
-        away = _unit(x_eye[:2])
-        centre = np.array(self.principal_point_px) + away * (self.focal_px * math.sin(theta) * math.cos(theta) / spread)
+        u, v = (x / across, y / across) if across > 0 else (1.0, 0.0)
+        off_px = self.focal_px * math.sin(theta) * math.cos(theta) / spread
+        u0, v0 = self.principal_point_px
         major = self.focal_px * math.sin(gamma) * math.cos(gamma) / spread
         minor = self.focal_px * math.sin(gamma) / math.sqrt(spread)
-        return Ellipse(centre, math.sqrt(major * minor), _stretch(away, math.sqrt(major / minor)))
+        shape = _stretch(u, v, math.sqrt(major / minor))
+        return Ellipse(np.array([u0 + u * off_px, v0 + v * off_px]), math.sqrt(major * minor), shape)
 
     def distance_over_radius(self, centre_px: FloatArray, radius_px: float) -> float:
         """Return the approximate distance, in sphere radii, of a sphere whose outline has this centre and radius."""
-        tan_theta = float(np.linalg.norm(centre_px - self.principal_point_px)) / self.focal_px
+        tan_theta = math.dist(centre_px, self.principal_point_px) / self.focal_px
         # For small γ the ellipse has the area π f² sin²γ / cos³θ.
         cos_theta = 1.0 / math.hypot(1.0, tan_theta)
         sin_gamma = radius_px / self.focal_px * cos_theta**1.5
@@ -76,8 +79,7 @@ class Pinhole:
         Args:
             distance_over_radius: distance of the sphere's centre from the eye in units of its radius.
         """
-        offset = centre_px - np.array(self.principal_point_px)
-        tan_ellipse = float(np.linalg.norm(offset)) / self.focal_px
+        tan_ellipse = math.dist(centre_px, self.principal_point_px) / self.focal_px
         if tan_ellipse == 0.0:
             return centre_px
         # With T = tanθ and s = sin²γ the centre lies at T / (1 − s(1 + T²)); solved for T, stably for small s.
@@ -85,20 +87,16 @@ class Pinhole:
         a = tan_ellipse * s
         root = math.sqrt(max(0.0, 1.0 + 4.0 * a * tan_ellipse * (1.0 - s)))
         tan_theta = 2.0 * tan_ellipse * (1.0 - s) / (1.0 + root)
-        return np.array(self.principal_point_px) + offset * (tan_theta / tan_ellipse)
+        return self.principal_point_px + (centre_px - self.principal_point_px) * (tan_theta / tan_ellipse)
 
     def shape(self, centre_px: FloatArray) -> FloatArray:
         """Return the shape (2, 2) of the outline of a small sphere seen at `centre_px` (2,) [px]."""
-        offset = centre_px - np.array(self.principal_point_px)
-        tan_theta = float(np.linalg.norm(offset)) / self.focal_px
-        return _stretch(_unit(offset), (1.0 + tan_theta**2) ** 0.25)
+        u, v = (centre_px - self.principal_point_px).tolist()
+        off_px = math.hypot(u, v)
+        direction = (u / off_px, v / off_px) if off_px > 0 else (1.0, 0.0)
+        return _stretch(*direction, math.sqrt(math.hypot(1.0, off_px / self.focal_px)))
 
 
-def _unit(direction: FloatArray) -> FloatArray:
-    length = float(np.linalg.norm(direction))
-    return direction / length if length > 0 else np.array([1.0, 0.0])
-
-
-def _stretch(direction: FloatArray, factor: float) -> FloatArray:
-    along = np.outer(direction, direction)
-    return factor * along + (np.eye(2) - along) / factor
+def _stretch(u: float, v: float, factor: float) -> FloatArray:
+    more, less = factor - 1.0 / factor, 1.0 / factor
+    return np.array([[less + more * u * u, more * u * v], [more * u * v, less + more * v * v]])

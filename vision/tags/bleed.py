@@ -49,11 +49,11 @@ def bleed(grey: ImageArray, corners_px: FloatArray, blur_px: float, modules: Flo
     counts = [int(min(round((length - 1.0) * module), _MOST)) for module in (width, height)]
     x, y = (0.5 + (np.arange(count) + 0.5) * (length - 1.0) / count for count in counts)
     across, down = np.meshgrid(x, y)
-    there = np.stack([across, down, np.ones_like(across)], axis=-1) @ np.asarray(to_px, np.float64).T
-    spots = there[..., :2] / there[..., 2:]
+    there = np.asarray(to_px, np.float64) @ np.stack([across.ravel(), down.ravel(), np.ones(across.size)])
+    spots = there[:2] / there[2]
     if leave(grey, spots):
         return unseen
-    levels = sampled(grey, spots).ravel()
+    levels = sampled(grey, spots)
     printed = np.pad(modules, 1, constant_values=1.0)
     white, by_x, by_xx = _blurred(x + 1.0, width, blur_px, len(printed))
     white_y, by_y, by_yy = _blurred(y + 1.0, height, blur_px, len(printed))
@@ -65,17 +65,17 @@ def bleed(grey: ImageArray, corners_px: FloatArray, blur_px: float, modules: Flo
     # The grid itself comes from edges that have bled towards the tag's middle.
     bled = np.hypot(slope_x, slope_y) - right * slope_x - below * slope_y
     lit = np.stack([np.ones_like(right), right, below])
-    design = np.concatenate([lit, lit * pattern, [wider, bled]]).reshape(8, -1).T
+    design = np.concatenate([lit, lit * pattern, [wider, bled]]).reshape(8, -1)
     try:
-        found = np.linalg.solve(design.T @ design, design.T @ levels)
-        kept = np.abs(levels - design @ found) < 0.5 * found[3]  # the rest show the other colour
+        found = np.linalg.solve(design @ design.T, design @ levels)
+        kept = np.abs(levels - found @ design) < 0.5 * found[3]  # the rest show the other colour
         if not found[3] >= 1.0 or kept.mean() < _FITS:  # white is not one grey level brighter than black, or hidden
             return unseen
-        cov = np.linalg.inv(design[kept].T @ design[kept])
+        cov = np.linalg.inv((design * kept) @ design.T)
     except np.linalg.LinAlgError:  # too few modules, or too sharp, to tell shift and blur apart
         return unseen
-    found = cov @ (design[kept].T @ levels[kept])
-    spread = float(np.square(levels[kept] - design[kept] @ found).mean())
+    found = cov @ (design @ (levels * kept))
+    spread = float(np.square((levels - found @ design)[kept]).mean())
     moved = float(found[7] / found[3])
     by_chance = spread * float(cov[7, 7] / found[3] ** 2) * _SHARED**2
     if not math.isfinite(moved) or not by_chance > 0.0:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -126,9 +125,9 @@ class _Rays:
         counts: number of lines of each edge (4,).
         steps: places of the samples along the lines (4, m) [px], outward.
         weights: 1 for samples (4, m), 0 for those that pad.
-        spots: places (4, n, m, 2) [px] of the samples.
-        ends: distance (4, n, 2) [px] to the inner end of the black border and the outer end of a white margin.
-        beyond: centres (4, n, 2, 2) [px] of the modules beyond these ends.
+        spots: u and v (2, 4, n, m) [px] of the samples.
+        ends: distance (4, 2, n) [px] to the inner end of the black border and the outer end of a white margin.
+        beyond: u and v (2, 4, 2, n) [px] of the centres of the modules beyond these ends; none if corners are rough.
     """
 
     s: FloatArray
@@ -177,7 +176,7 @@ def find_edges(
         light: None if the corners may be wrong by pixels.
         shorter: share of their usual length that the lines across the edges have.
     """
-    begin, end = corners_px, np.roll(corners_px, -1, axis=0)
+    begin, end = corners_px, corners_px[[1, 2, 3, 0]]
     lengths = np.linalg.norm(end - begin, axis=1)
     if lengths.min() < _FEWEST_POINTS:
         return Reason.NO_MARKER
@@ -236,7 +235,7 @@ def _rays(
     to_px = to_px @ _TURNS
     to_modules = np.asarray(np.linalg.inv(to_px), np.float64)
     quads = corners_px[(np.arange(4)[:, None] + np.arange(4)) % 4]
-    modules = np.abs(_module_ends(to_modules, quads[:, :2], normals)).min(axis=(1, 2))
+    modules = np.abs(_module_ends(to_modules, quads[:, :2].mT, normals)).min(axis=(1, 2))
     share = _CLEAR_SHARE * modules
     clear = np.minimum(np.maximum(modules - _CLEAR_BLURS * blur_px, share), LONGEST_REACH_PX)
     reaches = shorter * (np.maximum(clear, share) if rough else clear)
@@ -254,75 +253,76 @@ def _rays(
     samples = 2 * np.ceil(reaches / _SAMPLE_PX).astype(np.intp)[:, None]
     sample = np.arange(samples.max())
     steps = (np.minimum(sample, samples - 1) + 0.5) * (2.0 * reaches[:, None] / samples) - reaches[:, None]
-    points = origins[:, None] + (0.5 * lengths[:, None] * s)[..., None] * along[:, None]
+    points = origins[..., None] + (0.5 * lengths[:, None] * along)[..., None] * s[:, None]
     ends = _module_ends(to_modules, points, normals)
-    across = normals[:, None, None]
-    spots = points[:, :, None] + steps[:, None, :, None] * across
-    beyond = _beyond(to_px, to_modules, points[:, :, None] + ends[..., None] * across)
+    spots = points.swapaxes(0, 1)[..., None] + normals.T[..., None, None] * steps[:, None]
+    there = points[:, :, None] + ends[:, None] * normals[..., None, None]
+    beyond = np.empty((2, 0)) if rough else _beyond(to_px, to_modules, there)
     weights = (sample < samples).astype(np.float64)
     return _Rays(s, number < counts[:, None], counts, steps, weights, spots, ends, beyond)
 
 
 def _module_ends(to_modules: FloatArray, points: FloatArray, normals: FloatArray) -> FloatArray:
-    """Return the distances (4, n, 2) [px] along `normals` from points (4, n, 2) on the edges to two lines.
+    """Return the distances (4, 2, n) [px] along `normals` from points (4, 2, n) on the edges to two lines.
 
     They are the inner end of the black border and the outer end of a margin of one module.
     """
     depths = np.array([[1.0], [-1.0]])
     lines = to_modules[:, None, 1] - depths * to_modules[:, None, 2]  # (4, 2, 3)
-    there = points @ lines[..., :2].mT + lines[:, None, :, 2]
-    return np.asarray(-there / (lines[..., :2] @ normals[..., None]).mT, np.float64)
+    there = lines[..., :2] @ points + lines[..., 2:]
+    return np.asarray(-there / (lines[..., :2] @ normals[..., None]), np.float64)
 
 
 def _beyond(to_px: FloatArray, to_modules: FloatArray, places: FloatArray) -> FloatArray:
-    """Return the centres (4, n, 2, 2) [px] of the modules beyond the ends of black border and margin, at `places`."""
-    row, weight = (
-        (places * to_modules[:, k, None, None, :2]).sum(axis=3) + to_modules[:, k, None, None, 2] for k in (0, 2)
-    )
+    """Return u and v (2, 4, 2, n) [px] of the centres of the modules beyond the ends of black border and margin, which
+    are at `places` (4, 2, 2, n): of each edge u and v of both ends.
+    """
+    count = places.shape[3]
+    row, weight = (to_modules[:, ::2, :2] @ places.reshape(4, 2, -1) + to_modules[:, ::2, 2:]).swapaxes(0, 1)
     columns = np.clip(row / weight, 0.5, MODULES - 0.5)
-    there = np.stack([columns, np.broadcast_to([1.5, -1.5], columns.shape), np.ones_like(columns)], axis=3)
-    there = there @ to_px[:, None].mT
-    return np.asarray(there[..., :2] / there[..., 2:], dtype=np.float64)
+    depths = np.repeat([1.5, -1.5], count)
+    there = to_px[..., :1] * columns[:, None] + (to_px[..., 1:2] * depths + to_px[..., 2:])
+    return np.asarray(there[:, :2] / there[:, 2:], dtype=np.float64).swapaxes(0, 1).reshape(2, 4, 2, count)
 
 
 def leave(grey: ImageArray, places: FloatArray) -> bool:
-    """Return True if some places (..., 2) are too near to the image's border to be sampled."""
+    """Return True if some places, u and v (2, ...), are too near to the image's border to be sampled."""
     height, width = grey.shape
-    return bool((places < 1.0).any() or (places > (width - 2.0, height - 2.0)).any())
+    return bool(places.min() < 1.0 or places[0].max() > width - 2.0 or places[1].max() > height - 2.0)
 
 
 def _within(grey: ImageArray, places: FloatArray) -> FloatArray:
-    """Return the places (..., 2), each moved to the nearest one that can be sampled."""
+    """Return the places, u and v (2, ...), each moved to the nearest one that can be sampled."""
     height, width = grey.shape
-    return np.clip(places, 1.0, (width - 2.0, height - 2.0))
+    return np.stack([np.clip(places[0], 1.0, width - 2.0), np.clip(places[1], 1.0, height - 2.0)])
 
 
 def sampled(grey: ImageArray, places: FloatArray) -> FloatArray:
-    """Return the grey levels at places (..., 2)."""
+    """Return the grey levels at places, u and v (2, ...)."""
     # By hand: cv2.remap would round places to 1/32 px.
     whole = places.astype(np.intp)
     width = grey.shape[1]
-    first = whole[..., 1] * width + whole[..., 0]
+    first = whole[1] * width + whole[0]
     pixels = np.ravel(grey)
-    return _interpolated([pixels[first + more] for more in (0, 1, width, width + 1)], places - whole)
+    return _interpolated([pixels[first + more].astype(np.float64) for more in (0, 1, width, width + 1)], places - whole)
 
 
 def _ideal(places: FloatArray, origins: FloatArray, normals: FloatArray, blur_px: float) -> FloatArray:
-    """Return the shares of white of edges through `origins` at places (4, n, m, 2), interpolated from pixels."""
+    """Return the shares of white of edges through `origins` at places (2, 4, n, m), interpolated from pixels."""
     # Interpolation adds to the pixels' own blur.
     normals = normals / math.sqrt(max(blur_px**2, SHARPEST_PX**2) - _INTERPOLATION)
     whole = np.floor(places)
     u, v = normals.T[:, :, None, None]
-    level = whole[..., 0] * u + whole[..., 1] * v - (origins * normals).sum(axis=1)[:, None, None]
-    return _interpolated([ndtr(level), ndtr(level + u), ndtr(level + v), ndtr(level + u + v)], places - whole)
+    level = whole[0] * u + whole[1] * v - (origins * normals).sum(axis=1)[:, None, None]
+    return _interpolated([ndtr(level), ndtr(level + u), ndtr(level + v), ndtr(level + (u + v))], places - whole)
 
 
-def _interpolated(pixels: list[Any], parts: FloatArray) -> FloatArray:
-    """Interpolate bilinearly, at parts (..., 2) of a pixel, the values of four neighbouring pixels."""
-    right, down = parts[..., 0], parts[..., 1]
-    top = pixels[0] * (1.0 - right) + pixels[1] * right
-    bottom = pixels[2] * (1.0 - right) + pixels[3] * right
-    return top * (1.0 - down) + bottom * down
+def _interpolated(pixels: list[FloatArray], parts: FloatArray) -> FloatArray:
+    """Interpolate bilinearly, at parts, u and v (2, ...), of a pixel, the values of four neighbouring pixels."""
+    right, down = parts
+    top = pixels[0] + (pixels[1] - pixels[0]) * right
+    bottom = pixels[2] + (pixels[3] - pixels[2]) * right
+    return np.asarray(top + (bottom - top) * down, np.float64)
 
 
 def _rough_points(profiles: FloatArray, rays: _Rays, blur_px: float, min_contrast: float) -> _Points | Reason:
@@ -362,7 +362,7 @@ def _points(
     Args:
         profiles: grey levels (4, n, m) on the lines.
         ideal: levels of an ideal edge at 0 there, 0 black and 1 white.
-        beyond: grey levels (4, n, 2) beyond the ends of black border and margin.
+        beyond: grey levels (4, 2, n) beyond the ends of black border and margin.
         cumulants: the fourth one (4,) of the blur across each edge, in units of `blur_px`.
         gradients: change of black and white (4, 2, 2) per unit of s [grey levels] and of `steps` [grey levels/px].
         unlit: their variances (4, 2, 2).
@@ -385,8 +385,9 @@ def _points(
         return Reason.LOW_CONTRAST
     around = rays.steps[:, None]
     cumulant = cumulants[:, None, None]
-    shown = (beyond[..., :1] - black[..., None]) * blurred_step((rays.ends[..., :1] - around) / blur_px, cumulant)
-    shown += (beyond[..., 1:] - white[..., None]) * blurred_step((around - rays.ends[..., 1:]) / blur_px, cumulant)
+    inner, outer = rays.ends.swapaxes(0, 1)[..., None]
+    shown = (beyond[:, 0] - black)[..., None] * blurred_step((inner - around) / blur_px, cumulant)
+    shown += (beyond[:, 1] - white)[..., None] * blurred_step((around - outer) / blur_px, cumulant)
     cleared = profiles - shown
     fitted = levels(cleared)
     contrast = fitted[..., 1] - fitted[..., 0]

@@ -8,19 +8,19 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
-from scipy.fft import dct
 
-from bodyschema.interfaces.records import FloatArray, ImageArray, Reason
+from bodyschema.interfaces.records import FloatArray, ImageArray, Reason, frozen_array
 
 from .bleed import bleed
 from .config import TagConfig
 from .dictionary import tag_modules
 from .edge import LONGEST_REACH_PX, MODULES, SHARPEST_PX, Edges, Light, find_edges
 
-# Most rounds with rough corners, and half of all; converged when no corner moved by more than this [px].
-_ROUNDS, _SETTLED_PX = 4, 0.01
+# Most rounds with rough corners, and half of all; converged when no corner would move by more than this [px].
+_ROUNDS, _SETTLED_PX = 4, 0.003
 # Corners are rough until they move by less than this share of a module.
 _ROUGH_SHARE = 0.3
 # Usual blur of lens and interpolation (1-sigma) [px]; its prior spread, in an image with a noise of one grey level.
@@ -36,6 +36,7 @@ _CHANCE = 2.5
 # Share of their length that lines across edges keep where the usual ones leave the margin.
 _SHORTER = 0.5
 
+_BEFORE = np.array([3, 0, 1, 2])  # edges before each edge
 _EVEN = Light(np.zeros((2, 2)), np.zeros((2, 2, 2)))
 
 
@@ -70,7 +71,7 @@ def _measured(
     """Measure the tag with lines across its edges that are so much shorter than usual."""
     blur_px = _USUAL_BLUR_PX
     light: Light | None = None
-    number = 0
+    number, before_px = 0, math.inf
     while True:
         edges = find_edges(grey, corners_px, blur_px, light, shorter, config)
         if isinstance(edges, Reason):
@@ -83,11 +84,14 @@ def _measured(
             return Reason.OCCLUDED
         corners_px, blur_px = moved, _blur(edges, blur_px)
         if light is None:
+            before_px = moved_px
             light = _EVEN if moved_px < _ROUGH_SHARE * module_px or number >= _ROUNDS else None
             continue
         light = _light(edges)
-        if moved_px < _SETTLED_PX or number >= 2 * _ROUNDS:
+        # Each round moves the corners less, by about the same factor.
+        if min(moved_px, moved_px * moved_px / before_px) < _SETTLED_PX or number >= 2 * _ROUNDS:
             break
+        before_px = moved_px
     shortest_px = 2.0 * float(edges.half_lengths.min())
     if shortest_px < config.min_side_px:
         return Reason.NO_MARKER
@@ -124,10 +128,9 @@ def _likeness(edges: Edges) -> FloatArray:
     waves along the edges have more noise than quick ones. The power of waves of index k from 2 on is that of a random
     walk, b/k², on top of the noise a. Place and slope are the waves of index 1/2 and 1.
     """
-    slow = [np.square(np.asarray(dct(points, norm="ortho"))) for points in edges.residuals]
-    quickest = [max(len(power) // _SLOW, _LEAST_QUICKEST) for power in slow]
-    power = np.concatenate([power[2:last] for power, last in zip(slow, quickest, strict=True)])
-    index = np.concatenate([np.arange(2.0, min(last, len(all_))) for last, all_ in zip(quickest, slow, strict=True)])
+    waves = [_slow_waves(len(points)) for points in edges.residuals]
+    power = np.concatenate([np.square(w @ points) for w, points in zip(waves, edges.residuals, strict=True)])
+    index = np.concatenate([np.arange(2.0, 2.0 + len(w)) for w in waves])
     # The prior counts as waves that are quick enough to show no walk.
     power = np.append(power, _SMOOTHED)
     design = np.stack([np.ones_like(power), np.append(index**-2.0, 0.0)])
@@ -143,12 +146,22 @@ def _likeness(edges: Edges) -> FloatArray:
     return (noise if walk else alone) + walk * np.array([4.0, 1.0])
 
 
+@lru_cache
+def _slow_waves(count: int) -> FloatArray:
+    """Return the cosine waves (k, n) of unit power along n points, from index 2 on, that are slow."""
+    index = np.arange(2, min(max(count // _SLOW, _LEAST_QUICKEST), count))
+    angles = np.pi / count * np.outer(index, np.arange(count) + 0.5)
+    return frozen_array(math.sqrt(2.0 / count) * np.cos(angles))
+
+
 def _meetings(edges: Edges) -> FloatArray:
     """Return the intersections (4, 2) [px] of each edge's line with that of the edge before it."""
     points, directions = edges.points, edges.directions
-    before = np.roll(directions, 1, axis=0)
-    steps = np.linalg.solve(np.stack([before, -directions], axis=2), (points - np.roll(points, 1, axis=0))[..., None])
-    return np.roll(points, 1, axis=0) + steps[:, 0] * before
+    before, across = directions[_BEFORE], points - points[_BEFORE]
+    # Cramer's rule
+    steps = across[:, 0] * directions[:, 1] - across[:, 1] * directions[:, 0]
+    steps /= before[:, 0] * directions[:, 1] - before[:, 1] * directions[:, 0]
+    return points[_BEFORE] + steps[:, None] * before
 
 
 def _corner_covariance(edges: Edges, together: float) -> FloatArray:
@@ -163,10 +176,9 @@ def _corner_covariance(edges: Edges, together: float) -> FloatArray:
     cov = np.zeros((4, 2, 4, 2))
     cov[:, 0, :, 0] = together
     cov[range(4), :, range(4)] += np.sqrt(np.multiply.outer(*[_likeness(edges)] * 2)) * edges.scatter + edges.shared
-    for corner in range(4):
-        solve = np.linalg.inv(normals[[corner - 1, corner]])
-        # The corner is the end (s = 1) of the edge before it, and the beginning (s = −1) of its own.
-        for column, edge, s in ((0, corner - 1, 1.0), (1, corner, -1.0)):
-            by_edge[corner, :, edge] = np.outer(solve[:, column], (1.0, s))
+    solve = np.linalg.inv(np.stack([normals[_BEFORE], normals], axis=1))
+    # The corner is the end (s = 1) of the edge before it, and the beginning (s = −1) of its own.
+    by_edge[range(4), :, _BEFORE] = solve[:, :, :1] * (1.0, 1.0)
+    by_edge[range(4), :, range(4)] = solve[:, :, 1:] * (1.0, -1.0)
     rows = by_edge.reshape(8, 8)
     return rows @ cov.reshape(8, 8) @ rows.T

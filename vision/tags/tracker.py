@@ -8,7 +8,6 @@ from collections.abc import Iterable, Sequence
 
 import cv2
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import (
@@ -22,7 +21,7 @@ from bodyschema.interfaces.records import (
 )
 from bodyschema.vision.config import LONGEST_PAUSE_S
 from bodyschema.vision.images import check_calibration, check_images
-from bodyschema.vision.pose import Pose, PoseEstimator, Sighting, first_pose, fitted_motion, mirrored
+from bodyschema.vision.pose import Pose, PoseEstimator, Sighting, angle_between, first_pose, fitted_motion, mirrored
 from bodyschema.vision.triangulate import triangulate
 
 from .body import TagBody
@@ -76,6 +75,7 @@ class TagTracker:
         self._finder = TagFinder(self.config, body.corners)
         self._whole = (0, 0, *calibration.image_size_px)
         self._last: tuple[float, list[FloatArray], FloatArray] | None = None
+        self._planes: dict[frozenset[int], tuple[FloatArray, FloatArray]] = {}
         self._met = False  # a marker that has been found is neither mirrored nor of another dictionary
 
     def track(self, frame: StereoFrame) -> MarkerFix | MarkerMiss:
@@ -108,9 +108,8 @@ class TagTracker:
     def _fix(self, t: float, pose: Pose) -> MarkerFix:
         ul, vl, ur, vr = self.calibration.project(pose.x).tolist()
         centres = (ul, vl, ur, vr) if self.calibration.is_stereo else None
-        turn = Rotation.from_matrix(pose.rotation).as_quat(canonical=True)
         cov, cov_R = frozen_array(pose.cov[3:, 3:]), frozen_array(pose.cov[:3, :3])
-        return MarkerFix(t, frozen_array(pose.x), cov, centres, R=frozen_array(turn), cov_R=cov_R)
+        return MarkerFix(t, frozen_array(pose.x), cov, centres, R=frozen_array(_quaternion(pose.rotation)), cov_R=cov_R)
 
     def _look(
         self, t: float, greys: Sequence[ImageArray], regions: Sequence[tuple[int, int, int, int]]
@@ -195,7 +194,9 @@ class TagTracker:
         for rotation, x in self._starts(seen):
             for turn in (rotation, self._mirrored(rotation, x, seen)):
                 pose = estimator.refine(turn, x)
-                if pose is not None and all(_apart(pose, other) > _TWO_POSES_RAD for other in poses):
+                if pose is not None and all(
+                    angle_between(pose.rotation, other.rotation) > _TWO_POSES_RAD for other in poses
+                ):
                     poses.append(pose)
         return sorted(poses, key=lambda pose: pose.squares)
 
@@ -203,9 +204,10 @@ class TagTracker:
         """Return the pose, of two, that is consistent with the last frame; None if that is unclear."""
         if self._last is None or not 0 < t - self._last[0] <= LONGEST_PAUSE_S:
             return None
-        turned = [float(Rotation.from_matrix(self._last[2].T @ pose.rotation).magnitude()) for pose in poses]
+        turned = [angle_between(self._last[2], pose.rotation) for pose in poses]
         nearest = int(np.argmin(turned))
-        return poses[nearest] if turned[nearest] < _STAYED * _apart(poses[0], poses[1]) else None
+        apart = angle_between(poses[0].rotation, poses[1].rotation)
+        return poses[nearest] if turned[nearest] < _STAYED * apart else None
 
     def _starts(self, seen: list[dict[int, TagImage]]) -> list[tuple[FloatArray, FloatArray]]:
         """Return a first pose from the corners that all eyes see."""
@@ -225,10 +227,18 @@ class TagTracker:
 
     def _mirrored(self, rotation: FloatArray, x: FloatArray, seen: list[dict[int, TagImage]]) -> FloatArray:
         """Return the mirrored rotation, with which the corners' (best-fitting) plane looks nearly the same."""
-        corners = np.concatenate([self.body.corners[id] for id in sorted(_ids(seen))])
-        axes = np.linalg.svd(corners - corners.mean(axis=0))[2].T
-        axes[:, 2] *= np.sign(np.linalg.det(axes))
-        return mirrored(rotation @ axes, x + rotation @ corners.mean(axis=0)) @ axes.T
+        middle, axes = self._plane(frozenset(_ids(seen)))
+        return mirrored(rotation @ axes, x + rotation @ middle) @ axes.T
+
+    def _plane(self, ids: frozenset[int]) -> tuple[FloatArray, FloatArray]:
+        """Return the middle (3,) of some tags' corners, and axes (3, 3) of their plane, whose normal is the last."""
+        if ids not in self._planes:
+            corners = np.concatenate([self.body.corners[id] for id in sorted(ids)])
+            middle = corners.mean(axis=0)
+            axes = np.linalg.svd(corners - middle)[2].T
+            axes[:, 2] *= np.sign(np.linalg.det(axes))
+            self._planes[ids] = middle, axes
+        return self._planes[ids]
 
     def _predicted(self, t: float) -> list[tuple[int, int, int, int]] | None:
         if self._last is None or not 0 < t - self._last[0] <= LONGEST_PAUSE_S:
@@ -254,5 +264,8 @@ def _why(eyes: Iterable[Seen]) -> Reason:
     return next((reason for reason in _TELLING if reason in reasons), Reason.NO_MARKER)
 
 
-def _apart(one: Pose, other: Pose) -> float:
-    return float(Rotation.from_matrix(one.rotation.T @ other.rotation).magnitude())
+def _quaternion(rotation: FloatArray) -> FloatArray:
+    """Return the quaternion (4,) of a rotation (3, 3), its real part last and not negative."""
+    vector = np.ravel(np.asarray(cv2.Rodrigues(rotation)[0], np.float64))
+    angle = math.hypot(*vector)
+    return np.append(0.5 * np.sinc(0.5 * angle / math.pi) * vector, math.cos(0.5 * angle))
