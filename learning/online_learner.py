@@ -152,7 +152,7 @@ class OnlineLearner:
     def common_error_m(self) -> float | None:
         """Return the expected mean error [m] in the data's region that all pairs share; None if it is not known."""
         with self._lock:
-            regime, snapshot = self._core.regimes.present, self._snapshot
+            regime, snapshot = self._regimes.present, self._snapshot
             if regime is None or len(regime.memory) == 0:
                 return None
             region = self._region(regime)
