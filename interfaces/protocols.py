@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from types import TracebackType
-from typing import Protocol, Self, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, Self, runtime_checkable
 
-from .camera import StereoCalibration
-from .records import JointReading, MarkerFix, MarkerMiss, StereoFrame
+if TYPE_CHECKING:  # a client that only asks loads no NumPy
+    from .camera import StereoCalibration
+    from .records import JointReading, MarkerFix, MarkerMiss, StereoFrame
 
 
 class Clock(Protocol):

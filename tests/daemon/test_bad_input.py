@@ -117,7 +117,6 @@ def fix(file: Path, right: str, wrong: str) -> None:
         ("run sampler", "state_dir", "statedir", 12, "unknown key 'statedir' in [daemon]. Did you mean 'state_dir'?"),
         ("run learner", "state_dir", "statedir", 12, "unknown key 'statedir' in [daemon]. Did you mean 'state_dir'?"),
         ("replay", '"arm.urdf"', '"leg.urdf"', None, "cannot read the URDF: No such file or directory. Fix [robot]"),
-        ("predict", '"waist", ', '"wrist", ', 4, "there is no joint 'wrist' in arm.urdf. Did you mean 'waist'?"),
         ("config", "state_dir", "statedir", 12, "unknown key 'statedir' in [daemon]. Did you mean 'state_dir'?"),
     ],
 )
