@@ -174,8 +174,15 @@ class Sets:
         for kind in kinds:
             yield tuple(k for k, effect in enumerate(self.effects) if effect.kind is kind)
         yield tuple(dict.fromkeys((*own, *zeros)))
+        yield from self.zeros_for_links(own)
         for key in dict.fromkeys(effect.key for effect in self.effects if effect.kind.in_parts and links):
             yield tuple(k for k, effect in enumerate(self.effects) if effect.key == key)
+
+    def zeros_for_links(self, own: tuple[int, ...]) -> list[tuple[int, ...]]:
+        """Return the set with all joint offsets in the place of its links; an empty list if it has no links."""
+        zeros = [k for k, effect in enumerate(self.effects) if effect.kind.is_zero]
+        others = [k for k in own if not self.effects[k].kind.in_parts]
+        return [tuple(dict.fromkeys((*others, *zeros)))] if len(others) < len(own) else []
 
     def again(self, effects: Iterable[Effect]) -> tuple[int, ...]:
         """Return the set of the same effects and numbers, as far as they are candidates here."""
@@ -548,7 +555,7 @@ class _Place:
         self.fit = fit
         present = {cause.key for cause in fit.causes}
         absent = [one for one in hypotheses if one.key not in present and not one.kind.refines]
-        scanned = Scan(fit).candidates(absent)
+        scanned = _beside_links(fit, absent)
         candidates = [Candidate(cause, 0.0, 1) for cause in fit.causes] + [_at_rest(one) for one in scanned]
         candidates = [part for candidate in candidates for part in _in_parts(candidate)]
         self._sets = Sets(fit, candidates, float(np.log(max(len(hypotheses), 1))))
@@ -559,8 +566,8 @@ class _Place:
         else:
             # A fit that is not clearly better than others leads on from what these have reached.
             reached = (self._sets.again(place.numbers_of(one)) for place in others for one in place.reached)
-            starts = dict.fromkeys([own, *reached])
-        self.reached = self._sets.climbed(starts)
+            starts = [own, *reached, *self._sets.zeros_for_links(own)]
+        self.reached = self._sets.climbed(dict.fromkeys(starts))
         self.name = self.name_of(self.here)
         # Drop cached results, which are large for many rows.
         self.fit = replace(fit)
@@ -577,6 +584,20 @@ class _Place:
         """Refit one of the sets about its own parameters."""
         possible = [cause for cause in self._sets.causes(one) if cause.is_possible]
         return self.fit.starting(possible).tolerating(one.scales).tolerating(one.scales)
+
+
+def _beside_links(fit: Fit, absent: Sequence[Effect]) -> list[Candidate]:
+    """Return the candidates; joint offsets, too, that are identifiable only without one of the fit's links.
+
+    A link contains the zeros of the joints at both of its ends.
+    """
+    links = [cause for cause in fit.causes if cause.kind.in_parts]
+    scan = Scan(fit, links)
+    found = {one.effect.key: one for one in scan.candidates(absent)}
+    for link in links:
+        zeros = [one for one in absent if one.kind.is_zero and one.key not in found]
+        found |= {one.effect.key: one for one in scan.without(link).candidates(zeros)}
+    return list(found.values())
 
 
 def _in_parts(candidate: Candidate) -> list[Candidate]:
