@@ -90,6 +90,13 @@ def test_an_offset_is_named_rather_than_a_link_that_can_do_the_same(robot) -> No
     assert names(found) == {("joint_offset", ELBOW)}
 
 
+def test_a_link_gives_way_to_the_offsets_that_it_contains(robot) -> None:
+    truth = [Effect.at(robot, "joint_offset", joint, values=[0.03]) for joint in (SHOULDER, ELBOW)]
+    link = Effect.at(robot, "link_geometry", ELBOW)
+    start = start_of(robot, walk(robot, 2), tuple(truth), 2).with_causes([at_rest(link)])
+    assert names(together(start, [link, *map(at_rest, truth)])) == {(effect.name, effect.where) for effect in truth}
+
+
 def test_several_causes_are_named_and_no_others(robot) -> None:
     truth = (
         Effect.at(robot, "joint_scale", SHOULDER, values=[0.01]),
