@@ -18,6 +18,7 @@ from bodyschema.recordings.recording import Recording
 from bodyschema.robot.description import RobotDescription
 
 PER_RAD = 0.03
+ROWS = 200
 # Of the effects, those that are most like it: the search among all sets of all effects takes seconds.
 NEAREST = ("joint_offset", "joint_scale", "joint_eccentricity", "joint_compliance", "link_geometry")
 
@@ -35,7 +36,7 @@ def squared_positions(robot: RobotDescription, motion: Motion) -> FloatArray:
 
 
 def squared_recording(robot: RobotDescription) -> Recording:
-    motion = walk(robot, 1)
+    motion = walk(robot, 1, ROWS)
     x = squared_positions(robot, motion)
     return measured(robot, motion, x + SIGMA_M * np.random.default_rng([1, 1]).normal(size=x.shape))
 
@@ -80,7 +81,7 @@ def stored(diagnosis: Diagnosis, folder: Path) -> Simulation:
 def test_the_stored_model_makes_the_simulation_right_on_another_way(robot, diagnosis, tmp_path) -> None:
     motion = walk(robot, 2)
     left = stored(diagnosis, tmp_path).positions(motion) - squared_positions(robot, motion)
-    learnt = walk(robot, 1).q
+    learnt = walk(robot, 1, ROWS).q
     inside = np.abs(motion.q - np.median(learnt, axis=0)) < 0.4 * np.ptp(learnt, axis=0)
     assert np.sqrt(np.square(left[inside.all(axis=1)]).sum(axis=1).mean()) < 0.5 * SIGMA_M * np.sqrt(3.0)
 
@@ -92,7 +93,7 @@ def test_a_further_diagnosis_with_the_stored_model_finds_nothing(robot, diagnosi
 
 
 def test_the_held_out_error_is_that_of_the_stored_model(robot, diagnosis, file, tmp_path) -> None:
-    motion = walk(robot, 1)
+    motion = walk(robot, 1, ROWS)
     off = stored(diagnosis, tmp_path).positions(motion) - squared_positions(robot, motion)
     truth_mm = 1e3 * np.sqrt(np.square(off).sum(axis=1).mean() + 3.0 * SIGMA_M**2)
     assert abs(file.rms_mm.extended / truth_mm - 1.0) < 0.05
@@ -146,6 +147,6 @@ def test_where_nothing_is_hidden_nothing_is_found(robot, seed) -> None:
 
 def test_a_named_cause_alone_leaves_nothing_unexplained(robot) -> None:
     truth = Effect.at(robot, "joint_eccentricity", SHOULDER, values=[0.02, 0.01])
-    found = conclusion(diagnose(seen(robot, walk(robot, 1), (truth,), 1), Simulation(robot)))
+    found = conclusion(diagnose(seen(robot, walk(robot, 1, ROWS), (truth,), 1), Simulation(robot)))
     assert [(cause.effect, cause.where) for cause in found.causes] == [("joint_eccentricity", SHOULDER)]
     assert found.unexplained.depends_on == ()

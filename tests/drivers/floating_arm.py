@@ -51,6 +51,10 @@ class Pendulum:
         if self.servo is None:
             self.times, self.path = [t], [self.q]
             return
+        if self.times[-1] < t <= self.held_until:  # nothing moves
+            self.v = 0.0
+            self.times.append(t)
+            self.path.append(self.q)
         while self.times[-1] < t:
             self._step(self.times[-1], min(STEP_S, t - self.times[-1]))
 
@@ -90,7 +94,7 @@ class FloatingArm:
         told_directions: Sequence[int] | None = None,
         current_limit_a: float = 2.0,
         mode: int = CURRENT_MODE,
-        rate_hz: float = 250.0,
+        rate_hz: float = 100.0,
         **settings,
     ) -> None:
         self.clock = VirtualClock()

@@ -41,7 +41,7 @@ def nobody(payload: bytes) -> bytes:
 class GazingRobot:
     """A driver with gaze on the emulator, in virtual time; `truth` is the true arm."""
 
-    def __init__(self, predict=nobody, truth: RigidChain | None = None, **settings) -> None:
+    def __init__(self, predict=nobody, truth: RigidChain | None = None, rate_hz: float = 100.0, **settings) -> None:
         self.clock = VirtualClock()
         self.robot = robot = RobotDescription.load(demonstration_model())
         assert robot.calibration is not None
@@ -66,7 +66,7 @@ class GazingRobot:
         self.port = HeardPort(self.chain, self.clock)
         self.table = GazeConfig(joints=HEAD, **{"max_speed_deg_s": 60.0, **settings})
         entries = tuple(ServoConfig(joint, id, MODEL) for id, joint in enumerate(robot.joints, 1))
-        self.config = DynamixelConfig({"arm": BusConfig("bench")}, entries, gaze=self.table)
+        self.config = DynamixelConfig({"arm": BusConfig("bench")}, entries, gaze=self.table, rate_hz=rate_hz)
         limits = list(zip(robot.lower.tolist(), robot.upper.tolist(), strict=True))
         self.gaze = Gaze(self.table, robot.joints, limits, self.clock)
         self.model = HandModel(robot, predict, self.clock)

@@ -321,7 +321,7 @@ def test_a_servo_that_was_restarted_is_another_epoch() -> None:
 
 
 def turning(t: float) -> float:
-    return 4.0 * max(t - 100.0, 0.0)
+    return 10.0 * max(t - 100.0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -329,8 +329,8 @@ def turning(t: float) -> float:
 )
 def test_positions_go_on_across_turns(model) -> None:
     with (arm := Arm((model,), [turning])).joints:
-        for reading in read(arm, 1500):
-            assert arm.error(reading) < 4.0 * 0.6e-3 + TICK
+        for reading in read(arm, 600):
+            assert arm.error(reading) < 10.0 * 0.6e-3 + TICK
     assert reading.q[0] > 3 * 2 * math.pi
 
 
@@ -384,8 +384,8 @@ def test_limits_within_a_turn_tell_the_turn() -> None:
 )
 def test_times_are_those_of_the_sampling_to_half_a_millisecond(fast, delay_s) -> None:
     with (arm := Arm(("XM430-W350",) * 6, latency_s=2e-3, delay_s=delay_s, fast=fast)).joints:
-        off = [abs(reading.t - arm.sampled()) for reading in (read(arm)[0] for _ in range(1000))]
-    assert np.percentile(off, 99) < 0.5e-3
+        off = [abs(reading.t - arm.sampled()) for reading in (read(arm)[0] for _ in range(300))]
+    assert np.count_nonzero(np.array(off) >= 0.5e-3) <= 10  # at the beginning, while the delay is hardly known
 
 
 @pytest.mark.parametrize(("model", "fast"), [("XM430-W350", "auto"), ("XM430-W350", "never"), ("MX-28", "never")])
@@ -401,8 +401,8 @@ def test_a_reading_tells_how_sure_its_time_is(model, fast, held_s) -> None:
 def test_six_servos_are_read_two_hundred_times_a_second() -> None:
     with (arm := Arm(("XM430-W350",) * 6, fast="never")).joints:
         begin = arm.clock.now()
-        read(arm, 500)
-        assert 500 / (arm.clock.now() - begin) >= 200
+        read(arm, 200)
+        assert 200 / (arm.clock.now() - begin) >= 200
 
 
 @pytest.mark.parametrize(
@@ -417,7 +417,7 @@ def test_six_servos_are_read_two_hundred_times_a_second() -> None:
 def test_in_a_storm_of_faults_no_wrong_reading_is_believed(models, fast) -> None:
     arm = Arm(models, fast=fast, seed=5)
     with arm.joints:
-        arm.chain.faults = storm(0.02, Random(6))
-        readings = read(arm, 600)
+        arm.chain.faults = storm(0.06, Random(6))
+        readings = read(arm, 300)
     assert sum(arm.chain.faults.struck.values()) > 18
     assert max(arm.error(reading) for reading in readings) < 0.01

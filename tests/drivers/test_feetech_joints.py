@@ -212,9 +212,9 @@ def test_an_encoder_s_glitch_is_not_believed() -> None:
 def test_in_a_storm_of_faults_no_wrong_reading_is_believed(sync) -> None:
     arm = FeetechArm(("STS3215",) * 6, sync=sync, seed=5)
     with arm.joints:
-        arm.chain.faults = struck = storm(0.02, Random(6))
-        readings = read(arm, 600)
-    assert arm.chain.instructions > 600
+        arm.chain.faults = struck = storm(0.04, Random(6))
+        readings = read(arm, 300)
+    assert arm.chain.instructions > 300
     assert sum(struck.struck.values()) > 18
     assert max(arm.error(reading) for reading in readings) < 0.01
 
@@ -224,9 +224,9 @@ def test_in_a_storm_of_faults_no_wrong_reading_is_believed(sync) -> None:
 
 @pytest.mark.parametrize("multi_turn", [False, True])
 def test_positions_go_on_across_turns(multi_turn) -> None:
-    with (arm := FeetechArm(("STS3215",), [lambda t: 4.0 * (t - 100.0)], multi_turn=multi_turn)).joints:
-        readings = read(arm, 1500)
-    assert max(arm.error(reading) for reading in readings) < 4.0 * 0.6e-3 + TICK
+    with (arm := FeetechArm(("STS3215",), [lambda t: 10.0 * (t - 100.0)], multi_turn=multi_turn)).joints:
+        readings = read(arm, 600)
+    assert max(arm.error(reading) for reading in readings) < 10.0 * 0.6e-3 + TICK
     assert readings[-1].q[0] > 3 * 2 * math.pi
 
 
@@ -243,7 +243,7 @@ def test_a_turn_count_lost_with_the_power_is_restored_from_the_last_pose() -> No
 
 def test_times_are_those_of_the_sampling_to_half_a_millisecond() -> None:
     with (arm := FeetechArm(("STS3215",) * 6, latency_s=1e-3)).joints:
-        off = [abs(reading.t - arm.sampled()) for reading in (read(arm)[0] for _ in range(1000))]
+        off = [abs(reading.t - arm.sampled()) for reading in (read(arm)[0] for _ in range(300))]
     assert np.percentile(off, 99) < 0.5e-3
 
 
@@ -277,5 +277,5 @@ def test_most_readings_of_an_adapter_that_holds_bytes_back_are_kept(unsure) -> N
 def test_six_servos_are_read_two_hundred_times_a_second() -> None:
     with (arm := FeetechArm(("STS3215",) * 6)).joints:
         begin = arm.clock.now()
-        read(arm, 500)
-        assert 500 / (arm.clock.now() - begin) >= 200
+        read(arm, 200)
+        assert 200 / (arm.clock.now() - begin) >= 200

@@ -61,7 +61,7 @@ def test_only_the_head_has_torque() -> None:
 
 
 def test_the_head_turns_no_faster_than_allowed() -> None:
-    with (robot := GazingRobot(max_speed_deg_s=5.0)).joints:
+    with (robot := GazingRobot(rate_hz=250.0, max_speed_deg_s=5.0)).joints:
         robot.switch_on()
         angles = []
         for _ in range(30):

@@ -104,8 +104,8 @@ def test_a_clock_of_another_rate_is_followed(drift) -> None:
     rng = Random(4)
     robot = Robot([said("a", *PATHS, rate_hz=10.0, drift=drift)], delay=lambda: rng.uniform(0.0, 1e-3))
     with robot.joints:
-        readings = robot.read(400.0)
-    assert len(readings) >= 3990
+        readings = robot.read(150.0)
+    assert len(readings) >= 1490
     assert max(map(robot.error, readings)) < FASTEST * 0.003
 
 
@@ -200,9 +200,9 @@ def test_no_wrong_reading_is_believed_among_faults_of_many_kinds(seed) -> None:
     robot = Robot(share=0.2, kinds=kinds, seed=seed)
     with robot.joints:
         robot.read(2.0)  # where the first stamp is wrong, this shows within a second
-        readings = robot.read(60.0)
+        readings = robot.read(20.0)
     assert max(map(robot.error, readings)) < FASTEST * 0.011  # a stamp may be wrong by a period unseen
-    assert len(readings) > 4300
+    assert len(readings) > 1430
     assert len(robot.faults.given) == len(kinds)
 
 
@@ -210,10 +210,10 @@ def test_no_wrong_reading_is_believed_among_faults_of_many_kinds(seed) -> None:
 def test_what_only_the_gate_can_see_is_wrong_by_no_more_than_a_joint_can_move(kind) -> None:
     robot = Robot(share=0.2, kinds=(kind,), max_speed_deg_s=180.0)
     with robot.joints:
-        readings = robot.read(30.0)
+        readings = robot.read(10.0)
     gaps = np.diff([reading.t for reading in readings])
     assert max(map(robot.error, readings)) < (np.radians(180.0) + FASTEST) * gaps.max() + 0.02
-    assert len(readings) > 2000
+    assert len(readings) > 660
 
 
 def test_stamps_that_are_zero_are_refused() -> None:
@@ -312,9 +312,9 @@ def test_a_network_that_stutters_about_the_longest_delay_does_not_shift_the_time
     rng = Random(5)
     robot = Robot(delay=lambda: rng.choice((0.0,) * 30 + (0.08, 0.0995, 0.1, 0.1005, 0.15)))
     with robot.joints:
-        readings = robot.read(30.0)
+        readings = robot.read(12.0)
     assert max(map(robot.error, readings)) < FASTEST * 0.002
-    assert len(readings) > 2000
+    assert len(readings) > 800
 
 
 def stalled(robot: Robot, begin: float) -> bool:

@@ -146,10 +146,10 @@ def test_a_share_of_the_weight_is_borne() -> None:
 def test_readings_are_as_many_as_without() -> None:
     rates = {}
     for on in (False, True):
-        with (arm := FloatingArm((0.1,) * 6)).joints:
+        with (arm := FloatingArm((0.1,) * 6, rate_hz=250.0)).joints:
             if on:
                 arm.switch_on()
-            rates[on] = arm.run(1.0)
+            rates[on] = arm.run(0.5)
     assert rates[True] > 0.97 * rates[False]
 
 
@@ -244,7 +244,7 @@ def test_torque_is_off_after_any_exception() -> None:
 
 
 def test_a_wrong_direction_makes_the_arm_run_away_and_the_speed_limit_catches_it() -> None:
-    with (arm := FloatingArm((-0.5, 0.3), directions=(1, 1), torques=lambda q: -holding(q))).joints:
+    with (arm := FloatingArm((-0.5, 0.3), directions=(1, 1), torques=lambda q: -holding(q), rate_hz=250.0)).joints:
         arm.float()
         assert "turned at" in dropped(arm)
         gained = 2 * WEIGHT_N_M / INERTIA * LATE_S
@@ -284,7 +284,7 @@ def test_a_hot_servo_ends_it() -> None:
 
 
 def test_a_servo_that_lost_its_torque_ends_it() -> None:
-    with (arm := FloatingArm()).joints:
+    with (arm := FloatingArm(rate_hz=250.0)).joints:
         arm.float()
         arm.chain.servo(1)["torque"] = 0
         assert "lost torque" in dropped(arm)
@@ -306,7 +306,7 @@ def test_a_program_that_is_held_up_ends_it() -> None:
 
 
 def test_readings_that_are_doubtful_for_long_end_it() -> None:
-    with (arm := FloatingArm(heartbeat_ms=500)).joints:
+    with (arm := FloatingArm(heartbeat_ms=500, rate_hz=250.0)).joints:
         arm.float()
         arm.faults.add(1, mute, 20)
         assert "could not be believed" in dropped(arm)

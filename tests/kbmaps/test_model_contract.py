@@ -160,7 +160,7 @@ def test_the_estimate_for_one_configuration_is_its_row_of_a_batch(taught, q):
 
 @pytest.mark.parametrize("name", LAWFUL)
 def test_all_learnt_pairs_are_in_support(model, arm):
-    q, x = arm.pairs(np.random.default_rng(8), 60, 0.001)
+    q, x = arm.pairs(np.random.default_rng(8), 40, 0.001)
     model.learn(q, x)
     assert model.estimate(q).in_support.all()
 
@@ -168,8 +168,8 @@ def test_all_learnt_pairs_are_in_support(model, arm):
 @pytest.mark.parametrize("name", LOCAL)
 def test_far_from_a_small_zone_nothing_is_in_support(model, arm):
     rng = np.random.default_rng(9)
-    model.learn(*arm.pairs(rng, 60, 0.001, reach_deg=10.0))
-    q = arm.pairs(rng, 500)[0]
+    model.learn(*arm.pairs(rng, 40, 0.001, reach_deg=10.0))
+    q = arm.pairs(rng, 200)[0]
     far = np.abs(q)[:, [0, 2]].max(axis=1) > np.radians(50.0)
     assert model.estimate(q[far]).in_support.mean() < 0.05
 

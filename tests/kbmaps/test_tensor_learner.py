@@ -69,7 +69,7 @@ def test_the_learner_is_a_model():
     assert model.joints == 2
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.soak)])
 def test_seven_joints_are_exact_from_nothing_and_110_pairs(seed):
     chain, _, q, x = case("R" * 7, 110, seed)
     learner = TensorLearner(bases_for("R" * 7))
@@ -129,8 +129,8 @@ def test_with_outliers_the_train_is_that_of_the_good_pairs():
 
 def test_the_claimed_sigma_holds_two_thirds_of_the_errors():
     inside = []
-    for seed in range(12):
-        chain, prior, q, x = case("RRRR", 80, seed, SIGMA_M)
+    for seed in range(8):
+        chain, prior, q, x = case("RRRR", 60, seed, SIGMA_M)
         learner = TensorLearner.around(prior, bases_for("RRRR"))
         learner.learn(q, x)
         test = random_q(np.random.default_rng(seed + 500), "RRRR", 100, 80)
@@ -188,14 +188,14 @@ def test_a_rigid_arm_is_seldom_taken_for_another():
 
 def test_the_pairs_say_how_far_from_rigid_an_arm_is():
     errors: dict[float | None, list[float]] = {None: [], 0.003: [], 0.03: []}
-    for seed in range(4):
+    for seed in range(3):
         for ellipse_std, found in errors.items():
-            chain, prior, q, x = case("RRRRR", 300, seed, SIGMA_M)
-            settings = TensorSettings(refit_every=300)
-            learner = TensorLearner.around(prior, bases_for("RRRRR"), settings, ellipse_std=ellipse_std)
+            chain, prior, q, x = case("RRRR", 150, seed, SIGMA_M)
+            settings = TensorSettings(refit_every=150)
+            learner = TensorLearner.around(prior, bases_for("RRRR"), settings, ellipse_std=ellipse_std)
             learner.learn(q, x)
             learner.refit()
-            found.append(largest_error(learner, chain, "RRRRR"))
+            found.append(largest_error(learner, chain, "RRRR"))
     assert np.mean(errors[None]) < min(np.mean(errors[0.003]), np.mean(errors[0.03]))
 
 
@@ -217,7 +217,7 @@ def test_sigma_grows_away_from_the_data():
 
 
 def test_support_ends_where_the_data_end():
-    _, _, q, x = case("RRR", 200, 3, 1e-3, revolute_deg=20.0)
+    _, _, q, x = case("RRR", 80, 3, 1e-3, revolute_deg=20.0)
     learner = TensorLearner(bases_for("RRR", 20.0))
     learner.learn(q, x)
     assert learner.estimate(np.array([np.full(3, 0.1), np.full(3, 1.4)])).in_support.tolist() == [True, False]

@@ -178,11 +178,6 @@ def test_before_black_most_centres_stay_within_a_tenth_of_a_pixel():
     assert np.median(np.abs(found.centres_px)) < 0.1
 
 
-@pytest.fixture(scope="module")
-def bullet_errors() -> Errors:
-    return errors_on_bullet_images(SMALL, frames=20, seed=2)
-
-
 def errors_on_bullet_images(calibration: StereoCalibration, frames: int, seed: int) -> Errors:
     pytest.importorskip("pybullet")
     from bullet_renderer import BulletScene
@@ -200,13 +195,15 @@ def errors_on_bullet_images(calibration: StereoCalibration, frames: int, seed: i
 
 
 @pytest.mark.soak
-def test_the_simulator_s_pixels_are_where_the_tracker_expects_them(bullet_errors):
+def test_the_simulator_s_pixels_are_where_the_tracker_expects_them():
+    bullet_errors = errors_on_bullet_images(SMALL, frames=20, seed=2)
     # Half a pixel would be the renderer's own convention.
     assert np.abs(np.median(bullet_errors.centres_px, axis=0)).max() < 0.05
 
 
-def test_the_ball_is_found_in_nearly_all_images_of_the_simulator_s_renderer(bullet_errors):
-    assert len(bullet_errors.misses) <= 2, bullet_errors.misses
+def test_the_ball_is_found_in_nearly_all_images_of_the_simulator_s_renderer():
+    found = errors_on_bullet_images(SMALL, frames=8, seed=2)
+    assert len(found.misses) <= 1, found.misses
 
 
 @pytest.mark.soak

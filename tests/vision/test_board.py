@@ -25,8 +25,14 @@ BOARDS = [Board(), Board(7, 5, 0.025, dictionary="6X6_250"), Board(10, 7, 0.020,
 # --- the page, read back from the files' own numbers
 
 
-@pytest.mark.parametrize("board", BOARDS, ids=lambda board: board.name)
-@pytest.mark.parametrize(("write", "read"), [(pdf, from_pdf), (svg, from_svg)], ids=["pdf", "svg"])
+@pytest.mark.parametrize(
+    ("board", "write", "read"),
+    [
+        *((board, pdf, from_pdf) for board in BOARDS),
+        (BOARDS[0], svg, from_svg),
+        *(pytest.param(board, svg, from_svg, marks=pytest.mark.soak) for board in BOARDS[1:]),
+    ],
+)
 def test_squares_on_the_page_are_of_the_size_that_was_asked_for(board, write, read) -> None:
     drawn = page(board)
     image = rasterised(*read(write(drawn)))
@@ -106,7 +112,7 @@ def shown(taken: Taken, printed: Printed | None = None, turned: float = 0.2) -> 
 
 
 def test_corners_are_found_to_a_few_hundredths_of_a_pixel() -> None:
-    rig, pairs, shown_at = photographed(count=6)
+    rig, pairs, shown_at = photographed(count=4)
     photographer = Photographer(rig, Printed(), Taken(), np.random.default_rng(0))
     errors = []
     for pair, pose in zip(pairs, shown_at, strict=True):
@@ -119,7 +125,7 @@ def test_corners_are_found_to_a_few_hundredths_of_a_pixel() -> None:
     assert np.abs(errors.mean(axis=0)).max() < 0.005
 
 
-@pytest.mark.parametrize("turned", [0.2, 2.9, -1.5])
+@pytest.mark.parametrize("turned", [2.9, *(pytest.param(turned, marks=pytest.mark.soak) for turned in (0.2, -1.5))])
 def test_a_plain_chessboards_corners_are_in_one_order_however_it_is_turned(turned) -> None:
     rng = np.random.default_rng(3)
     rig = webcams(rng)
@@ -148,12 +154,16 @@ def test_over_exposure_is_named() -> None:
     assert (found.why, "Shorten the exposure" in found.text) == ("over_exposed", True)
 
 
-@pytest.mark.parametrize("taken", [Taken(blur_px=4.0), Taken(motion_px=13.0), Taken(blur_px=9.0)], ids=str)
+@pytest.mark.parametrize(
+    "taken",
+    [Taken(blur_px=4.0), Taken(motion_px=13.0), pytest.param(Taken(blur_px=9.0), marks=pytest.mark.soak)],
+    ids=str,
+)
 def test_a_blurred_image_is_named(taken) -> None:
     assert fault(shown(taken)[0]).why == "blurred"
 
 
-@pytest.mark.parametrize("sigma", [0.8, 1.2, 1.8])
+@pytest.mark.parametrize("sigma", [0.8, 1.8, pytest.param(1.2, marks=pytest.mark.soak)])
 def test_blur_is_measured(sigma) -> None:
     found = BoardDetector(BOARD).find(shown(Taken(blur_px=sigma))[0])
     assert isinstance(found, Corners)
@@ -173,7 +183,9 @@ def test_a_board_with_markers_is_no_plain_chessboard() -> None:
     assert "has 4X4_50 markers in its squares. Leave out --pattern, and give --dictionary 4X4_50" in found.text
 
 
-@pytest.mark.parametrize(("columns", "rows"), [(10, 7), (6, 6), (9, 6)])
+@pytest.mark.parametrize(
+    ("columns", "rows"), [(10, 7), *(pytest.param(*size, marks=pytest.mark.soak) for size in ((6, 6), (9, 6)))]
+)
 def test_another_number_of_squares_is_named(columns, rows) -> None:
     found = fault(shown(Taken(), Printed(columns, rows, 0.024))[0])
     assert found.why == "other_squares"

@@ -50,7 +50,7 @@ def refusal(views: list[View], asked: Asked = PINHOLE, board=BOARD) -> str:
 def planted() -> tuple:
     rng = np.random.default_rng(11)
     rig = webcams(rng)
-    return rig, corner_views(rig, rng, 12)
+    return rig, corner_views(rig, rng, 10)
 
 
 # --- results
@@ -120,7 +120,7 @@ def test_views_of_one_eye_alone_count_too(planted) -> None:
 def test_the_lens_model_is_chosen_that_foretells_views_better(fisheye) -> None:
     rng = np.random.default_rng(4)
     rig = webcams(rng, fisheye=fisheye)
-    found = calibrate(corner_views(rig, rng, 12), BOARD, ASKED)
+    found = calibrate(corner_views(rig, rng, 9), BOARD, ASKED)
     assert found.rig.model == ("fisheye" if fisheye else "pinhole")
 
 
@@ -260,12 +260,12 @@ def test_a_board_printed_at_97_percent_is_contradicted_by_the_baseline_measured_
 
 def test_noise_of_pixels_is_refused_by_the_held_out_error(planted) -> None:
     rig, _ = planted
-    views = corner_views(rig, np.random.default_rng(5), 12, noise_px=1.5)
+    views = corner_views(rig, np.random.default_rng(5), 9, noise_px=1.5)
     assert re.search(r"views that were not fitted are off by 1\.\d+ px, 0.96 px is the most", refusal(views))
 
 
 def test_eyes_of_different_resolutions_are_named() -> None:
-    _, pairs, _ = photographed(count=6)
+    _, pairs, _ = photographed(count=3)
     smaller = ImagePair("00", pairs[0].left, pairs[0].right[::2, ::2])
     with pytest.raises(CalibrationError, match=r"the left image has 640x480 pixels, the right one 320x240"):
         gathered([smaller], BOARD)
@@ -279,7 +279,7 @@ def test_when_no_image_can_be_used_the_usual_reason_is_said() -> None:
 
 
 def test_an_eye_that_never_sees_the_board_is_named_with_the_reason() -> None:
-    _, pairs, _ = photographed(count=6)
+    _, pairs, _ = photographed(count=3)
     found = gathered([ImagePair(pair.name, pair.left, np.zeros_like(pair.right)) for pair in pairs[:3]], BOARD)
     with pytest.raises(CalibrationError, match=r"no right image .*; 3 of 3: the image is black. Take the lens cap off"):
         require_both(found)
