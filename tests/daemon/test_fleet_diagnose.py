@@ -52,7 +52,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def told(folder: Path) -> tuple[object, str, str]:
-    few = ("--effects", "joint_scale,backlash")
+    few = ("--effects", "joint_scale")
     return fleet("--from", folder, "--robot", DESK_ARM, "--out", folder / "out", *few, "--workers", "1", "--json")
 
 
