@@ -81,7 +81,7 @@ def pairs(
     seed: int = 0,
     *,
     joints: int = 6,
-    count: int = 60,
+    count: int = 120,
     noise: float = 0.0005,
     zeros_deg: float = 3.0,
     tool: float = 0.02,
@@ -304,7 +304,7 @@ def test_positions_of_another_row_are_named(rows, said) -> None:
 
 @pytest.mark.parametrize(
     ("rows", "said"),
-    [(slice(30, None), "1 row later"), pytest.param(slice(1, None, 2), "2 rows later", marks=pytest.mark.soak)],
+    [(slice(60, None), "1 row later"), pytest.param(slice(1, None, 2), "2 rows later", marks=pytest.mark.soak)],
 )
 def test_positions_of_another_row_in_half_of_the_rows_are_named(rows, said) -> None:
     right = pairs(joints=4)
