@@ -11,7 +11,7 @@ from guided_arm import NOW_AND_THEN, Scene, make_pair, near, new_learning, teach
 from test_calibration import DESK_ARM, figures_of
 
 import bodyschema.daemon.learner.findings
-from bodyschema.calibration.chain_figures import is_told, no_surer_than_possible
+from bodyschema.calibration.chain_figures import ChainFigures, is_told, no_surer_than_possible
 from bodyschema.calibration.plausibility.check import FEWEST_ROWS
 from bodyschema.daemon.learner.findings import EVERY_S, SHARE, Findings, FindingTurns, figures
 from bodyschema.interfaces.records import FloatArray
@@ -27,6 +27,8 @@ from kbmaps import ChainParameters, ChainTolerances
 SIGMA_M = 0.0005
 OTHER_TOOL = np.array([0.0, 0.02, 0.15])
 NAMES = ("a", "b", "c", "d")
+# From FEWEST_ROWS pairs on, they are checked in a turn of their own.
+FEW = FEWEST_ROWS - 2
 
 
 class Ticking:
@@ -138,11 +140,19 @@ def covered_after_another_tool(seed: int) -> list[bool]:
     return arm.covered()
 
 
-def test_freeing_what_nothing_shows_leaves_every_position_where_it_is() -> None:
-    arm = Planted.of(4, 40)
+@pytest.fixture(scope="module")
+def retooled() -> tuple[ChainFigures, Planted]:
+    """Return what an arm's figures were before another tool, and the arm with pairs of it; no test changes it."""
+    arm = Planted.of(3, 60)
+    before, _ = figures(arm.robot, arm.known())
     arm.change[arm.parameters.tool] += OTHER_TOOL
     arm.learning.tool_changed()
-    arm.teach(np.random.default_rng(8), 20)
+    arm.teach(np.random.default_rng(7), 15)
+    return before, arm
+
+
+def test_freeing_what_nothing_shows_leaves_every_position_where_it_is(retooled) -> None:
+    arm = retooled[1]
     known = arm.known()
     prior = known.nominal.belief(known.belief.parameters.reference, known.tolerances)
     freed = no_surer_than_possible(known.belief, prior, arm.robot)
@@ -157,14 +167,14 @@ def test_the_95_percent_intervals_cover_95_percent_after_a_tool_change_too() -> 
 
 
 def test_zeros_that_no_motion_shows_are_null_and_the_others_are_not() -> None:
-    findings = findings_of(shared(1, 60))
+    findings = findings_of(shared(2, 60))
     findings.renew()
     zeros = findings.calibration.zeros
     assert [name for name, zero in zeros.items() if zero is None] == ["base_yaw", "wrist_roll"]
 
 
 def test_the_status_has_the_camera_s_pose_as_ros_takes_it() -> None:
-    findings = findings_of(shared(1, 60))
+    findings = findings_of(shared(2, 60))
     findings.renew()
     found = findings.calibration
     assert np.array(found.hand_eye.matrix)[:3, 3] == pytest.approx([figure.learnt for figure in found.camera_xyz])
@@ -181,12 +191,8 @@ def test_the_arm_is_found_to_be_better_made_than_the_learner_s_tolerances() -> N
     assert points < 0.005
 
 
-def test_what_is_known_of_the_zeros_outlives_a_tool_change() -> None:
-    arm = Planted.of(3, 60)
-    before, _ = figures(arm.robot, arm.known())
-    arm.change[arm.parameters.tool] += OTHER_TOOL
-    arm.learning.tool_changed()
-    arm.teach(np.random.default_rng(7), 15)
+def test_what_is_known_of_the_zeros_outlives_a_tool_change(retooled) -> None:
+    before, arm = retooled
     after, _ = figures(arm.robot, arm.known())
     assert (after.half_widths[10:12] < 1.2 * before.half_widths[10:12]).all()
     assert np.linalg.norm((after.values - before.values)[6:9] - OTHER_TOOL) < 0.02
@@ -286,25 +292,29 @@ def test_before_the_first_solution_nothing_is_told() -> None:
 
 
 def test_they_are_found_again_when_a_new_chain_was_found_and_not_too_soon() -> None:
-    arm, clock = Planted.of(1, 40), Ticking()
+    arm, clock = Planted.of(1, FEW), Ticking()
     findings = findings_of(arm, clock)
+    rested = [findings.at_rest]
     findings.renew()
+    rested.append(findings.at_rest)
     first = findings.calibration
-    arm.teach(np.random.default_rng(8), 30)
+    arm.teach(np.random.default_rng(8), 12)
+    rested.append(findings.at_rest)
     findings.renew()
     assert findings.calibration is first
     clock.time += EVERY_S
     findings.renew()
     assert findings.calibration.pairs > first.pairs
+    assert rested == [False, True, False]  # they rest only while they are of the present chain
 
 
 def test_waiting_for_a_processor_is_no_reason_to_rest() -> None:
-    arm, clock = Planted.of(1, 40), Slow()
+    arm, clock = Planted.of(1, FEW), Slow()
     clock.TICK_S = 60.0  # a minute passes on a busy machine, and the finding takes no time of the processor
     findings = Findings(arm.learning, arm.robot, clock, turns=FindingTurns(lambda: 0.0))
     findings.renew()
     first = findings.calibration
-    arm.teach(np.random.default_rng(8), 30)
+    arm.teach(np.random.default_rng(8), 12)
     findings.renew()
     assert findings.calibration.pairs > first.pairs
 
@@ -312,9 +322,8 @@ def test_waiting_for_a_processor_is_no_reason_to_rest() -> None:
 def test_of_several_robots_one_finds_at_a_time() -> None:
     clock = Slow()
     turns = FindingTurns(clock.now)
-    # From FEWEST_ROWS pairs on, they are checked in a turn of their own.
-    arms = [Planted.of(seed, FEWEST_ROWS - 2) for seed in (1, 2)]
-    found = [Findings(arm.learning, arm.robot, clock, 2, turns) for arm in arms]
+    arm = shared(1, FEW)
+    found = [Findings(arm.learning, arm.robot, clock, 2, turns) for _ in range(2)]
     for findings in found:
         findings.renew()
     assert [findings.calibration is not None for findings in found] == [True, False]
@@ -324,7 +333,7 @@ def test_of_several_robots_one_finds_at_a_time() -> None:
 
 
 def test_the_same_chain_is_not_gone_through_twice() -> None:
-    arm, clock = shared(1, 40), Ticking()
+    arm, clock = shared(1, FEW), Ticking()
     findings = findings_of(arm, clock)
     findings.renew()
     first = findings.calibration
@@ -333,33 +342,16 @@ def test_the_same_chain_is_not_gone_through_twice() -> None:
     assert findings.calibration is first
 
 
-def test_with_another_tool_nothing_is_told_before_its_first_solution() -> None:
-    arm = Planted.of(1, 40)
+def test_with_another_tool_and_its_first_solution_nothing_is_told_of_the_old_one() -> None:
+    arm = Planted.of(1, FEW)
     findings = findings_of(arm)
     findings.renew()
     arm.learning.tool_changed()
     assert (findings.calibration, findings.outlook) == (None, None)
-
-
-def test_what_was_found_with_another_tool_is_not_told_with_this_one_s_first_solution() -> None:
-    arm = Planted.of(1, 40)
-    findings = findings_of(arm)
-    findings.renew()
-    arm.learning.tool_changed()
     findings.renew()
     arm.teach(np.random.default_rng(8), 12)
     assert arm.learning.belief is not None
     assert (findings.calibration, findings.outlook) == (None, None)  # it is not time to find them yet
-
-
-def test_they_are_at_rest_when_they_are_of_the_present_chain() -> None:
-    arm = Planted.of(1, 40)
-    findings = findings_of(arm)
-    rested = [findings.at_rest]
-    findings.renew()
-    rested.append(findings.at_rest)
-    arm.teach(np.random.default_rng(8), 30)
-    assert [*rested, findings.at_rest] == [False, True, False]
 
 
 def test_an_arm_that_may_be_ten_times_better_made_than_seems_is_not_said_to_be_made_so() -> None:
@@ -372,17 +364,17 @@ def test_a_failure_to_find_them_does_not_stop_the_learner(monkeypatch, caplog) -
         raise np.linalg.LinAlgError("Eigenvalues did not converge")
 
     monkeypatch.setattr(bodyschema.daemon.learner.findings, "figures", failing)
-    findings = findings_of(shared(1, 40))
+    findings = findings_of(shared(1, FEW))
     findings.renew()
     assert findings.calibration is None
     assert "status has no calibration for now: Eigenvalues did not converge" in caplog.text
 
 
 def test_while_no_solution_answers_there_is_a_calibration_but_no_outlook() -> None:
-    arm = Planted.of(1, 40)
+    arm = Planted.of(1, FEW)
     arm.learning.tool_changed()
     q = arm.robot.lower / 2.0
-    arm.learning.learn(make_pair(42, q, arm.parameters.positions(arm.change, q), SIGMA_M), 0.0)
+    arm.learning.learn(make_pair(FEW + 2, q, arm.parameters.positions(arm.change, q), SIGMA_M), 0.0)
     arm.solve()  # a solution that has not met a pair yet
     findings = findings_of(arm)
     findings.renew()

@@ -42,18 +42,17 @@ def fleet(*words: object) -> tuple[object, str, str]:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return two nominal units, one whose elbow turns 2 % farther than it reads, and a file that is not a recording."""
+    """Return a nominal unit, one whose elbow turns 2 % farther than it reads, and a file that is not a recording."""
     folder, robot = tmp_path_factory.mktemp("units"), RobotDescription.load(DESK_ARM)
     unit(robot, 1).write_csv(folder / "left.csv")
     unit(robot, 2, scaled=(2, 1.02)).write_csv(folder / "right.csv")
-    unit(robot, 3).write_csv(folder / "spare.csv")
     (folder / "broken.csv").write_text("nonsense\n1\n")
     return folder
 
 
 @pytest.fixture(scope="module")
 def told(folder: Path) -> tuple[object, str, str]:
-    few = ("--effects", "joint_scale,backlash")
+    few = ("--effects", "joint_scale")
     return fleet("--from", folder, "--robot", DESK_ARM, "--out", folder / "out", *few, "--workers", "1", "--json")
 
 
@@ -70,22 +69,22 @@ def test_the_unit_with_the_hidden_fault_is_named_with_its_joint_and_number(rows:
     assert float(cause.split("+")[1].split(" ")[0]) == pytest.approx(2.0, abs=0.1)
 
 
-def test_units_without_a_fault_have_none(rows: dict[str, dict]) -> None:
-    assert [rows[name]["verdict"] for name in ("left", "spare")] == ["nothing_found"] * 2
+def test_a_unit_without_a_fault_has_none(rows: dict[str, dict]) -> None:
+    assert rows["left"]["verdict"] == "nothing_found"
 
 
 def test_a_recording_that_fails_is_a_row_and_ends_no_other(rows: dict[str, dict]) -> None:
     assert "there is no column for the joint" in rows["broken"]["error"]
-    assert len(rows) == 4
+    assert len(rows) == 3
 
 
 def test_the_unit_that_is_off_is_told_apart_from_its_type(told: tuple[object, str, str]) -> None:
     (found,) = json.loads(told[1])["types"]
-    assert (sorted(found["well"]), list(found["off"])) == (["left", "spare"], ["right"])
+    assert (sorted(found["well"]), list(found["off"])) == (["left"], ["right"])
 
 
 def test_each_robot_has_a_folder_with_its_report(folder: Path, rows: dict[str, dict]) -> None:
-    assert {file.parent.name for file in (folder / "out").glob("*/report.html")} == {"left", "right", "spare"}
+    assert {file.parent.name for file in (folder / "out").glob("*/report.html")} == {"left", "right"}
 
 
 def test_what_was_found_loads_as_a_robot_s_description(folder: Path, rows: dict[str, dict]) -> None:
@@ -93,7 +92,7 @@ def test_what_was_found_loads_as_a_robot_s_description(folder: Path, rows: dict[
 
 
 def test_progress_is_a_line_for_each_that_is_done(told: tuple[object, str, str]) -> None:
-    assert [line.split(":")[0] for line in told[2].splitlines()] == [f"{k} of 4" for k in range(1, 5)]
+    assert [line.split(":")[0] for line in told[2].splitlines()] == [f"{k} of 3" for k in range(1, 4)]
 
 
 def test_a_scheduler_that_does_not_answer_is_told_with_its_address(folder: Path, endpoint: str) -> None:

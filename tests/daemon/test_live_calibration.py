@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from io import StringIO
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import msgspec
@@ -81,6 +82,11 @@ def fitted(found: Gathered, serials: tuple[str, str], tell: Callable[[str], None
     return calibrated(found, KnownCameras(lens="pinhole"), tell, serials)
 
 
+def unfitted(found: Gathered, serials: tuple[str, str], tell: Callable[[str], None]) -> Calibrated:
+    """Fit nothing, for tests of the views alone."""
+    return Mock(spec=Calibrated)
+
+
 def live(eyes: PluggedEyes, views: LiveViews, made=fitted, show=lambda _: None, **given) -> LiveCalibration:
     return LiveCalibration(eyes, views, made, show, SystemClock(), **given)
 
@@ -112,7 +118,7 @@ def test_a_refusal_is_shown_and_views_are_taken_on(views) -> None:
         tries.append(len(found.views))
         if len(tries) == 1:
             raise CalibrationError("the left focal length is known to 2 % only")
-        return fitted(found, serials, tell)
+        return unfitted(found, serials, tell)
 
     seen, frames = held(views)
     live(PluggedEyes(frames), seen, strict, shown.append).run()
@@ -149,7 +155,7 @@ def test_views_survive_cameras_that_are_unplugged_on_the_way(views, impatient) -
     shown: list[Shown] = []
     seen, frames = held(views, range(10))
     eyes = PluggedEyes([*frames[:9], SourceLost("the left camera is gone"), *frames[9:]])
-    found, _ = live(eyes, seen, show=shown.append).run()
+    found, _ = live(eyes, seen, unfitted, shown.append).run()
     # The board was seen once before the loss and once after it: these two are not held against each other.
     assert (len(found.views), eyes.opened) == (9, 2)
     assert any("the cameras are lost (the left camera is gone)" in text for each in shown for text in each.trouble)
@@ -159,14 +165,20 @@ def test_other_cameras_that_are_plugged_in_on_the_way_are_refused(views, impatie
     shown: list[Shown] = []
     seen, frames = held(views, range(10))
     eyes = PluggedEyes([*frames[:8], SourceLost("unplugged"), *frames[8:]], [RIGHT, ("A1", "C3"), RIGHT])
-    found, result = live(eyes, seen, show=shown.append).run()
-    assert (len(found.views), eyes.opened, result.rig.serials) == (10, 3, RIGHT)
+    told: list[tuple[str, str]] = []
+
+    def made(found: Gathered, serials: tuple[str, str], tell: Callable[[str], None]) -> Calibrated:
+        told.append(serials)
+        return unfitted(found, serials, tell)
+
+    found, _ = live(eyes, seen, made, shown.append).run()
+    assert (len(found.views), eyes.opened, told) == (10, 3, [RIGHT])
     assert any("A1 and C3 with 640x480 pixels, the views are of A1 and B2" in "".join(each.trouble) for each in shown)
 
 
 def test_the_images_of_every_view_are_kept(views, tmp_path) -> None:
     seen, frames = held(views, range(9))
-    live(PluggedEyes(frames), seen, keep=kept_in(tmp_path / "kept")).run()
+    live(PluggedEyes(frames), seen, unfitted, keep=kept_in(tmp_path / "kept")).run()
     assert len(pair_files(tmp_path / "kept", None, None, side_by_side=False)) == 9
 
 

@@ -85,11 +85,11 @@ def stored(config: Config, pairs: int) -> Stored:
 
 
 def test_a_diagnosis_leaves_its_report(config, said, diagnoses) -> None:
-    asked = diagnoses(lambda: stored(config, 150))
+    asked = diagnoses(lambda: stored(config, 60))
     assert asked.report() is None
     assert asked.start() == 1
     assert said.over.wait(LIMIT_S)
-    assert (said.newest.state, said.newest.pairs, said.newest.report) == ("done", 150, 1), said.newest.said
+    assert (said.newest.state, said.newest.pairs, said.newest.report) == ("done", 60, 1), said.newest.said
     assert b"<!doctype html>" in asked.report()
 
 

@@ -131,7 +131,7 @@ def test_the_tracker_tells_why_there_is_no_dot(tracker: MarkerTracker, eyes, rea
 def test_the_effect_is_found_where_it_is_hidden_and_told_in_its_words(packages: Path, robot_toml: Path) -> None:
     robot = RobotDescription.load(robot_toml)
     rng = np.random.default_rng(0)
-    q = rng.uniform(0.9 * robot.lower, 0.9 * robot.upper, (400, len(robot.joints)))
+    q = rng.uniform(0.9 * robot.lower, 0.9 * robot.upper, (200, len(robot.joints)))
     turned = q.copy()
     travelled = (q[:, 2] + np.radians(150.0)) / np.radians(300.0)
     turned[:, 2] += np.radians(300.0) * 0.12 * travelled**2 * (1.0 - travelled)

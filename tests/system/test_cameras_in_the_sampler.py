@@ -72,6 +72,7 @@ def moving(tmp_path: Path, free_endpoint: Callable[[], str]) -> Iterator[tuple[C
         yield benched, camera
 
 
+@pytest.mark.soak  # with images in a folder: below; cameras below OpenCV: test_v4l2; latency_s: test_cameras
 def test_servos_and_a_stereo_camera_give_pairs_that_agree_in_time(library, moving) -> None:
     config, _ = moving
     with sampling(config, preloaded(library)) as sampler:
