@@ -1,1 +1,1 @@
-"""Sampler and learner: the two processes, their store, their zenoh interface, and the command line."""
+"""Sampler and learner: the two processes, their zenoh interface, and the check of robot.toml as a whole (`config`)."""

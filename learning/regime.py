@@ -59,11 +59,11 @@ class Regime:
         task_numbers: numbers for the solver's tasks that no other regime has.
 
     Attributes:
-        members: the models.
+        models: learnt side by side.
         memory: the pairs with this tool.
-        doubts: the outlier gate.
+        gate: the outlier gate.
         orientations: models of the marker's orientation, where pairs have one.
-        watch: the change monitor.
+        monitor: the change monitor.
         arm: as given, or with the last solutions if these stand for pairs that are no longer kept.
         answering: the model that answers.
         task_number: of the solver's current task.

@@ -270,9 +270,10 @@ def joints_in(file: Path) -> tuple[str, ...]:
 @contextmanager
 def _explained(file: Path) -> Iterator[None]:
     """Convert errors of reading `file` to RecordingError, after a look at its ending."""
-    if file.suffix.lower() not in (CSV, PARQUET):
-        raise RecordingError(f"recordings end in {CSV} or {PARQUET}", file=file, remedy="Rename or convert it")
     try:
+        if file.suffix.lower() not in (CSV, PARQUET):
+            file.stat()  # a wrong path is the likelier mistake
+            raise RecordingError(f"recordings end in {CSV} or {PARQUET}", file=file, remedy="Rename or convert it")
         yield
     except Fault as fault:
         raise _located(fault, file) from None

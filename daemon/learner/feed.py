@@ -45,7 +45,7 @@ class _Stored:
 
 
 class PairFeed:
-    """Feeds a `OnlineLearner`. `offer` and `wake` may be called from any thread, `step` from one only.
+    """Feeds an `OnlineLearner`. `offer` and `wake` may be called from any thread, `step` from one only.
 
     Attributes:
         problem: reason why arriving pairs are not learnt, or None.

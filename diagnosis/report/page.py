@@ -197,7 +197,7 @@ def _against(residuals: Residuals) -> str:
     folded = ""
     if silent:
         folded = (
-            f"<details><summary>{len(silent)} plots in which nothing is to be seen</summary>"
+            f"<details><summary>Plots without a visible trend: {len(silent)}</summary>"
             f'<div class="panels">{_panels(silent)}</div></details>'
         )
     return (
@@ -212,8 +212,8 @@ def _hypotheses(file: DiagnosisFile) -> str:
         return ""
     return (
         '<section id="hypotheses"><h2>What it is not</h2><p>By how much the squared error on data not used in the fit '
-        f"would fall with each of these beside the causes, and how probable it is by chance, over all of them together."
-        f"</p>{tables.hypotheses(file.rejected)}</section>"
+        f"would fall with each of these beside the causes, and how probable this is by chance, corrected for their "
+        f"number.</p>{tables.hypotheses(file.rejected)}</section>"
     )
 
 
@@ -226,16 +226,15 @@ def _limits(file: DiagnosisFile) -> str:
 def _done(diagnosis: Diagnosis, file: DiagnosisFile, about: About) -> str:
     away = np.flatnonzero(~diagnosis.markers) + 1
     rows = ", ".join(str(k) for k in away[:_NAMED_ROWS]) + (" …" if len(away) > _NAMED_ROWS else "")
-    left_out = f"<p>Not the marker, and left out: rows {rows}.</p>" if len(away) else ""
+    left_out = f"<p>Rows left out: {rows}.</p>" if len(away) else ""
     return (
         '<section id="method"><h2>What was done</h2>'
         f"<p>{len(diagnosis.hypotheses.effects)} hypotheses, each effect at each place where it can sit, were tried "
         "as extensions of the simulation, alone and beside each other. Their numbers were fitted to all pairs together "
-        "by maximum likelihood, with a share of fixes that may be anything. One was added while it made the data more "
-        "probable by more than its freedom and the number of trials explain, and removed again when others made it "
-        f"needless. Every error on this page is that of pairs that were not fitted: {diagnosis.blocks.count} blocks of "
-        "time, left out in turn. Intervals of gains come from drawing blocks anew, since neighbouring pairs are not "
-        f"independent.</p>{left_out}"
+        "by maximum likelihood, with a share of outliers. An effect was added if it made the data more probable by "
+        "more than its freedom and the number of trials explain, and removed when others made it redundant. Every "
+        f"error on this page is of held-out pairs: {diagnosis.blocks.count} blocks of time, left out in turn. "
+        f"Intervals of gains are from a bootstrap over blocks: neighbouring pairs are not independent.</p>{left_out}"
         f'<p class="of">bodyschema {escape(about.version)}, {file.pairs.total:,} pairs of {escape(about.recording)}, '
         f"seed {diagnosis.seed}.</p></section>"
     )

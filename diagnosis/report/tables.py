@@ -96,7 +96,7 @@ def hypotheses(rejected: Sequence[Rejected]) -> str:
         f"<td>{escape(row.why)}</tr>"
         for row in rejected
     ]
-    heads = ("Not there", "would gain, held out", "p-value, corrected", "and yet")
+    heads = ("Not there", "would gain, held out", "p-value, corrected", "why not")
     shown = _table(heads, rows[:NEAREST])
     if len(rows) <= NEAREST:
         return shown

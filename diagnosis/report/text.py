@@ -212,7 +212,7 @@ def to_do(diagnosis: DiagnosisFile, remedies: Sequence[str]) -> tuple[list[str],
     if of is not None and of.in_extended and of.share_percent >= SMALL:
         told.append(
             f"Use extended.toml: small errors of links and drives have a share of {of.share_percent:.0f} % of the gain,"
-            " and no single one is worth mending."
+            " and no single one is worth fixing."
         )
     return told, small
 

@@ -1,4 +1,7 @@
-"""An arm of Dynamixel servos as a `JointSource`."""
+"""An arm of Dynamixel servos as a `JointSource`: their settings, read methods and answers.
+
+`drivers/servos/joints.py` makes joint readings of the answers.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""An arm of bus servos of any vendor as a `JointSource`."""
+"""An arm of bus servos of any vendor as a `JointSource`.
+
+`daemon/sampler/sampler.py` makes pairs of its readings.
+"""
 
 from __future__ import annotations
 

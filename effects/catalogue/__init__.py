@@ -1,1 +1,4 @@
-"""The effects: one file each, with one class, found by `registry`."""
+"""The effects: one file each, with one class, found by `registry`.
+
+The sentences and plots of a report are in `diagnosis/report/presenters`; docs/extending.md has an example.
+"""

@@ -171,8 +171,9 @@ def test_a_folder_for_a_recording_is_refused(robot) -> None:
     assert refused("replay", "a.csv", cwd=robot.parent) == "a.csv: a folder, not a file. Name the recording in it"
 
 
-def test_a_recording_that_is_not_there_is_refused(robot) -> None:
-    assert refused("replay", "a.csv", cwd=robot.parent).startswith("a.csv: there is no such file")
+@pytest.mark.parametrize("name", ["a.csv", "a.txt", "a"])
+def test_a_recording_that_is_not_there_is_refused(robot, name) -> None:
+    assert refused("replay", name, cwd=robot.parent).startswith(f"{name}: there is no such file")
 
 
 def test_a_sampler_of_an_unreadable_recording_leaves_no_store(robot) -> None:

@@ -145,9 +145,9 @@ def test_predict_loads_no_numpy(learner: Config) -> None:
 
 
 def test_joint_values_that_the_arm_cannot_have_are_named_with_their_limits_and_deg(learner: Config, capsys) -> None:
-    said = predicted(learner, capsys, "--", "-60", "0")
+    said = predicted(learner, capsys, "-60", "0")
     assert "waist cannot be at -60 rad: its limits are -3 to 3 rad (-171.9° to 171.9°). --deg takes degrees." in said
-    assert "cannot be" not in predicted(learner, capsys, "--deg", "--", "-60", "0")
+    assert "cannot be" not in predicted(learner, capsys, "--deg", "-60", "0")
 
 
 def test_degrees_beyond_the_limits_are_named_without_the_option_that_was_given(learner: Config, capsys) -> None:

@@ -41,7 +41,7 @@ def ik(
     """Ask the learner for joint angles that bring the marker to a position in the measurement frame.
 
     The angles are within the URDF's limits. If the position cannot be reached, shows the closest solution and ends with
-    exit code 1. Nothing moves. Write negative values after `--`, as in `bodyschema ik -- -0.1 0.2 0.7`.
+    exit code 1. Nothing moves. For example: `bodyschema ik -0.1 0.2 0.7`.
 
     Needs: a running learner (`bodyschema run` or `bodyschema run learner`).
 

@@ -30,8 +30,8 @@ def predict(
 ) -> None:
     """Ask the learner for the marker position in the measurement frame.
 
-    Without values, reads them from standard input as JSON: one vector, or a list of them. Write negative values
-    after `--`, as in `bodyschema predict --deg -- 10 -20 30 40 0 15 5`.
+    Without values, reads them from standard input as JSON: one vector, or a list of them. For example:
+    `bodyschema predict --deg 10 -20 30 40 0 15 5`.
 
     Needs: a running learner (`bodyschema run` or `bodyschema run learner`).
 

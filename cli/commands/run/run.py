@@ -50,7 +50,8 @@ def run(
     or another; without one, the learner answers from what it has learnt. With several robots, each pair is learnt as it
     arrives, and less urgent work is done in turns (docs/fleet.md).
 
-    Needs: robot.toml (`bodyschema init`) with joints and cameras, or a recording in its table [drivers]; or --sim.
+    Needs: robot.toml (`bodyschema init`) with joints and cameras, or a recording in its table [drivers]; with --sim,
+    the arm alone (`bodyschema init --sim` writes an example).
 
     Next: in another terminal, `bodyschema status --watch`, `bodyschema view` and `bodyschema predict`.
     """
