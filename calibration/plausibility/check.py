@@ -589,9 +589,11 @@ class _Search:
         """Return the most probable reading with links of some tolerance, and the errors of better fits that it refutes.
 
         With nominal links a wrong reading may fit better: its marker and joint offsets make up for errors of the links.
+        They do so only where the columns as they are place the arm.
         """
         rivals = self._distinct([])
-        if rivals[0] == as_it_is or as_it_is not in self.fits:
+        own = self.fits.get(as_it_is)
+        if rivals[0] == as_it_is or own is None or own.error >= _SETTINGS.named * spread_m(self._x):
             return rivals[0], []
         rivals += [as_it_is] if as_it_is not in rivals else []
         slides = self._chain.prismatic
