@@ -145,7 +145,7 @@ class SolverProcess:
         child = self._child
         if child is None or child.stdout is None:
             return None
-        self._hand_over()
+        self._hand_over(0.0)
         while select.select([child.stdout], [], [], 0)[0]:
             part = os.read(child.stdout.fileno(), 1 << 20)
             if not part:
@@ -186,15 +186,15 @@ class SolverProcess:
         if self._child is None:
             raise SolverLostError("the solver has not been started")
         self._unsent += _framed(order)
-        self._hand_over()
+        self._hand_over(READS_WITHIN_S)
 
-    def _hand_over(self) -> None:
-        """Write what the child reads now; `poll` writes the rest, so that a stopped child blocks nothing."""
+    def _hand_over(self, within_s: float) -> None:
+        """Write what the child reads within this time each; `poll` writes the rest: a stopped child blocks nothing."""
         child = self._child
         if child is None or child.stdin is None:
             return
         try:
-            while self._unsent and select.select([], [child.stdin], [], READS_WITHIN_S)[1]:
+            while self._unsent and select.select([], [child.stdin], [], within_s)[1]:
                 del self._unsent[: os.write(child.stdin.fileno(), self._unsent)]
         except OSError as error:
             raise self._lost() from error
