@@ -29,12 +29,16 @@ from bodyschema.cli.commands.options import (
 from bodyschema.interfaces.errors import BodyschemaError, RequestError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from bodyschema.calibration.report import CalibrationReport
     from bodyschema.calibration.rigid_chain import Calibration, Trusted
     from bodyschema.daemon.config import Config
+    from bodyschema.interfaces.records import FloatArray
     from bodyschema.recordings.recording import Recording
     from bodyschema.robot.description import RobotDescription
-    from bodyschema.vision.rig.common_error import CommonError
+
+    CommonErrors = Callable[[FloatArray], FloatArray]
 
 CAMERA_FRAME = "calibrated_camera"
 
@@ -74,18 +78,16 @@ class FitOptions:
         return "urdf" if self.trust_urdf else "nothing" if self.only is None else "links"
 
     def fitted(
-        self, robot: RobotDescription, recording: Recording, cameras: CommonError | None
+        self, robot: RobotDescription, recording: Recording, common: CommonErrors | None
     ) -> tuple[Calibration, Calibration | None]:
         """Return the calibration, and that with everything free where the URDF is trusted.
 
         Args:
             robot: the nominal model.
             recording: what to learn.
-            cameras: the error that all positions share; None: none is known.
+            common: returns the errors that all positions share, as for `Calibration.of`; None: none are known.
         """
         from bodyschema.calibration.rigid_chain import Calibration
-
-        common = None if cameras is None else cameras.errors
 
         def of(trusted: Trusted) -> Calibration:
             zeros_rad = math.radians(self.zeros_deg)
@@ -214,26 +216,26 @@ def arm(
     )
     if seen.misread:
         seen.require(source, force=force)
-    cameras, unknown = _common_error(config, source, taken)
-    found, free = fit.fitted(description, recording, cameras)
+    common, unknown = _common_errors(config, source, taken)
+    found, free = fit.fitted(description, recording, common)
     report = CalibrationReport.of(found, seen, source.name, first, camera_frame, free)
     if report.other_tool_from is None:
         seen.require(source, force=force)
     if out is not None or servos.write:
         _require_writable(report, force=force)
     told = [] if out is None else _written(config, found, report, out, replace=force)
-    lines = [*unknown, *_contained(found), *plan.written(found)]
+    of_cameras, lines = [*unknown, *_contained(found)], plan.written(found)
     offsets = {zero.joint: math.radians(zero.zero) for zero in report.zeros if zero.half_width is not None}
     changed = servos.lines(config, offsets, source)
     if as_json:
         print_json(report)
-        sys.stderr.writelines(f"{line}\n" for line in changed)
+        sys.stderr.writelines(f"{line}\n" for line in [*of_cameras, *changed])
     else:
-        _show(report, [*lines, *changed], told)
+        _show(report, [*of_cameras, *lines, *changed], told)
 
 
-def _common_error(config: Config, source: Path, taken: SourceOptions) -> tuple[CommonError | None, list[str]]:
-    """Return the error that all positions share, and why it is left out although robot.toml names a calibration."""
+def _common_errors(config: Config, source: Path, taken: SourceOptions) -> tuple[CommonErrors | None, list[str]]:
+    """Return the errors that all positions share, and why they are left out although robot.toml names a calibration."""
     from bodyschema.cli.recordings.foreign import seen_elsewhere
 
     if config.tables.vision.cameras is None or seen_elsewhere(source, taken):
@@ -241,9 +243,10 @@ def _common_error(config: Config, source: Path, taken: SourceOptions) -> tuple[C
     from bodyschema.daemon.wiring.cameras import common_error
 
     try:
-        return common_error(config), []
+        cameras = common_error(config)
     except BodyschemaError as fault:
         return None, [f"The intervals leave out how well the cameras are calibrated: {fault}"]
+    return None if cameras is None else cameras.errors, []
 
 
 def _contained(found: Calibration) -> list[str]:
