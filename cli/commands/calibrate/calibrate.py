@@ -256,7 +256,8 @@ def _contained(found: Calibration) -> list[str]:
     rms_m = math.sqrt(float((found.common**2).sum(axis=(1, 2)).mean()))
     return [
         f"The intervals contain the cameras' calibration, which leaves {1e3 * rms_m:.2g} mm (1-sigma) in all positions "
-        "alike. Where another instrument measured these, give a robot.toml without `calibration` in [vision.cameras]."
+        "alike; distances and expected errors are without its estimated part. Where another instrument measured the "
+        "positions, give a robot.toml without `calibration` in [vision.cameras]."
     ]
 
 
