@@ -108,6 +108,15 @@ def _fixes(config: Config, file: Path, parts: list[VideoPart]) -> list[tuple[flo
     return found
 
 
+def seen_elsewhere(source: Path, taken: SourceOptions) -> bool:
+    """Return True if the positions in `source` are not known to be those of the cameras in robot.toml.
+
+    They are of a bag's topic, or of a file of their own. A table or store is taken for one of these cameras.
+    """
+    foreign = is_lerobot_dataset(source) or is_bag(source)
+    return foreign and (taken.markers is not None or taken.video is None)
+
+
 def opened(config: Config, source: Path, taken: SourceOptions, lerobot: Path | None) -> Recording:
     """Return the recording in `source`, whatever its format.
 

@@ -27,7 +27,7 @@ from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.status import LearnerStatus
 from bodyschema.daemon.transport.wire import OCTETS, CommandReply, CommandRequest, decode, encode
 from bodyschema.daemon.wiring.wiring import open_marker_topic
-from bodyschema.interfaces.errors import RequestError
+from bodyschema.interfaces.errors import BodyschemaError, RequestError
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.interfaces.waits import READ_S
@@ -79,10 +79,9 @@ class Learner:
         self._keys = Keys(config.robot.name)
         self._version = version("bodyschema")  # reads a file: once, while descriptors are available
         self._nominal = NominalModel.extended_by(config.simulation)
+        common, self._calibration_problem = _common_variance(config)
         self._learning, self._set_aside = go_on(
-            lambda: OnlineLearner(
-                self._nominal, self._settings, solver, together_s=together_s(robots), common=_common_variance(config)
-            ),
+            lambda: OnlineLearner(self._nominal, self._settings, solver, together_s=together_s(robots), common=common),
             config.checkpoint_file,
             config.robot.name,
         )
@@ -199,7 +198,7 @@ class Learner:
                 f"no sampler on {self._config.tables.zenoh.sampler}, so no new pairs; start it with "
                 "`bodyschema run sampler`. Predictions go on"
             )
-        for problem in (self._feed.problem, self._checkpoint_problem, self._set_aside):
+        for problem in (self._feed.problem, self._checkpoint_problem, self._set_aside, self._calibration_problem):
             if problem is not None:
                 yield problem
         yield from self._findings.doubts
@@ -355,14 +354,23 @@ def more_rarely(robots: int) -> float:
     return max(1.0, robots / AS_OFTEN_AS_ONE)
 
 
-def _common_variance(config: Config) -> Callable[[FloatArray], FloatArray] | None:
-    """Return the variance that the cameras' calibration leaves in all positions; None if that is not known."""
+def _common_variance(config: Config) -> tuple[Callable[[FloatArray], FloatArray] | None, str | None]:
+    """Return the variance that the cameras' calibration leaves in all positions, and why it is not known.
+
+    Learning and predictions go on without it.
+    """
     if config.tables.vision.cameras is None:
-        return None
+        return None, None
     from bodyschema.daemon.wiring.cameras import common_error
 
-    error = common_error(config)
-    return None if error is None else error.variance
+    try:
+        error = common_error(config)
+    except BodyschemaError as fault:
+        return None, (
+            f"the sigma of predictions leaves out how well the cameras are calibrated: {fault}. On another machine "
+            "than theirs, copy the file there and restart the learner"
+        )
+    return None if error is None else error.variance, None
 
 
 def together_s(robots: int) -> float:

@@ -16,7 +16,7 @@ import subprocess
 import sys
 import time
 from collections import defaultdict
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import IO, Any, Self
 
 import msgspec
@@ -145,7 +145,7 @@ class SolverProcess:
         child = self._child
         if child is None or child.stdout is None:
             return None
-        self._hand_over()
+        self._hand_over(0.0)
         while select.select([child.stdout], [], [], 0)[0]:
             part = os.read(child.stdout.fileno(), 1 << 20)
             if not part:
@@ -179,6 +179,8 @@ class SolverProcess:
             return None
         solved = _solutions.decode(bytes(self._received[_LENGTH.size : end]))
         del self._received[:end]
+        if isinstance(solved["model"], ResidualModel):
+            solved["belief"] = solved["model"]
         turned = solved.pop("orientation")
         return Solved(**solved, orientation=None if turned is None else OrientationSolution(**turned))
 
@@ -186,15 +188,15 @@ class SolverProcess:
         if self._child is None:
             raise SolverLostError("the solver has not been started")
         self._unsent += _framed(order)
-        self._hand_over()
+        self._hand_over(READS_WITHIN_S)
 
-    def _hand_over(self) -> None:
-        """Write what the child reads now; `poll` writes the rest, so that a stopped child blocks nothing."""
+    def _hand_over(self, within_s: float) -> None:
+        """Write what the child reads within this time each; `poll` writes the rest: a stopped child blocks nothing."""
         child = self._child
         if child is None or child.stdin is None:
             return
         try:
-            while self._unsent and select.select([], [child.stdin], [], READS_WITHIN_S)[1]:
+            while self._unsent and select.select([], [child.stdin], [], within_s)[1]:
                 del self._unsent[: os.write(child.stdin.fileno(), self._unsent)]
         except OSError as error:
             raise self._lost() from error
@@ -245,7 +247,8 @@ def _solve(solver: DirectSolver, solutions: IO[bytes]) -> float:
     """Solve, and send each solution as it is found; return the processor time used [s]."""
     begin = time.process_time()  # on a busy machine most of the wall time is waiting, which is rest enough
     for solved in solver.solutions():
-        _write(solutions, _fields(solved))
+        # A chain with residual is its own belief: sent once, as reading one takes milliseconds.
+        _write(solutions, _fields(replace(solved, belief=None) if solved.belief is solved.model else solved))
     return time.process_time() - begin
 
 

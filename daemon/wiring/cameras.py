@@ -86,16 +86,24 @@ def names_calibration(config: Config) -> bool:
 
 
 def common_error(config: Config) -> CommonError | None:
-    """Return what all positions of the only cameras share of their calibration's error; None if that is not known."""
+    """Return what all positions share of the error of the cameras' calibration.
+
+    Return None where robot.toml names no calibration, or where positions of several sources are fused.
+
+    Raises:
+        ConfigError: the file cannot be read. A learner may run on another machine than the cameras.
+        CalibrationError: the eyes share no view, or a lens folds over within its image.
+    """
     vision = config.tables.vision
-    if vision.cameras is None or vision.cameras.calibration is None or vision.further_cameras:
+    if vision.cameras is None or vision.cameras.calibration is None:
         return None
-    file = calibration_file(config)
-    if not file.exists():  # a learner may run on another machine
+    if vision.further_cameras or config.tables.marker_source:
         return None
-    rig = read_rig(file)
+    rig = read_rig(calibration_file(config))
     sized = isinstance(rig, OneEyeRig) and vision.marker in ("tag", "cluster")  # a fix of a ball has its radius's error
-    return CommonError(rig, vision.tag.side_sigma_m / vision.tag.side_m if sized else 0.0)
+    error = CommonError(rig, vision.tag.side_sigma_m / vision.tag.side_m if sized else 0.0)
+    error.require_usable()
+    return error
 
 
 def camera_of(config: Config, eyes: Eyes) -> StereoCamera:

@@ -16,7 +16,9 @@ from fitted_once import fitted_once as fitted_once
 from bodyschema.calibration.plausibility.check import Plausibility
 from bodyschema.calibration.report import CalibrationReport
 from bodyschema.calibration.rigid_chain import Calibration, CalibrationError
+from bodyschema.cli.commands.options import SourceOptions
 from bodyschema.cli.main import app
+from bodyschema.cli.recordings.foreign import seen_elsewhere
 from bodyschema.cli.terminal.calibration_view import sentences
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.learner.checkpoint import write_checkpoint
@@ -38,6 +40,9 @@ from bodyschema.sim_backend import SimConfig, model_file
 from bodyschema.sim_backend.config import ErrorConfig
 from bodyschema.sim_backend.physics import Physics
 from bodyschema.sim_backend.truth import TrueRobot
+from bodyschema.vision.rig.lens import Lens
+from bodyschema.vision.rig.rig_file import write_rig
+from bodyschema.vision.rig.stereo_rig import Made, StereoRig
 from kbmaps import ChainParameters, ChainTolerances
 
 DESK_ARM = Path(__file__).parents[2] / "examples" / "desk_arm" / "robot.toml"
@@ -238,6 +243,47 @@ def test_json_has_every_figure(pairs_file, capsys) -> None:
     called(pairs_file, "--json")
     found = msgspec.json.decode(capsys.readouterr().out, type=CalibrationReport)
     assert (found.pairs, len(found.camera_rpy_deg), len(found.zeros)) == (100, 3, 4)
+
+
+CAMERAS = """
+[vision.cameras]
+calibration = "cameras.toml"
+[vision.cameras.two]
+left = "/dev/v4l/by-id/usb-A-video-index0"
+right = "/dev/v4l/by-id/usb-B-video-index0"
+image_size_px = [640, 480]
+"""
+
+
+def test_the_output_says_that_intervals_contain_the_cameras_calibration(pairs_file, capsys) -> None:
+    robot = pairs_file.with_name("robot.toml")
+    robot.write_text(robot.read_text() + CAMERAS)
+    called(pairs_file)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "The intervals leave out how well the cameras are calibrated" in said
+    assert "cameras.toml: there is no such file" in said
+    lens = Lens("pinhole", (600.0, 600.0), (319.5, 239.5), (0.0,) * 5)
+    made = Made("", "", 20, 0, 0.0, 0.0, 0.0)
+    rig = StereoRig(lens, lens, np.zeros(3), np.array([-0.1, 0.0, 0.0]), (640, 480), ("", ""), 1e-8 * np.eye(24), made)
+    write_rig(rig, robot.with_name("cameras.toml"))
+    called(pairs_file)
+    said = " ".join(capsys.readouterr().out.split())
+    assert "The intervals contain the cameras' calibration, which leaves " in said
+    assert "give a robot.toml without `calibration` in [vision.cameras]" in said
+
+
+@pytest.mark.parametrize(
+    ("taken", "elsewhere"),
+    [
+        (SourceOptions(), True),
+        (SourceOptions(video="/camera"), False),
+        (SourceOptions(video="/camera", markers=Path("tracker.csv")), True),
+    ],
+)
+def test_positions_that_a_bag_brings_are_not_of_these_cameras(tmp_path, taken, elsewhere) -> None:
+    (tmp_path / "metadata.yaml").touch()
+    assert seen_elsewhere(tmp_path, taken) is elsewhere
+    assert not seen_elsewhere(tmp_path / "pairs.csv", taken)
 
 
 def test_a_store_of_other_joints_is_refused() -> None:

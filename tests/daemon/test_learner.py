@@ -140,21 +140,59 @@ image_size_px = [640, 480]
 """
 
 
-def test_predictions_contain_what_calibration_and_tag_leave(tmp_path: Path) -> None:
+def calibrated(tmp_path: Path, *, k1: float = 0.0) -> None:
+    """Write the camera's calibration."""
     made = Made("", "", 20, 0, 0.0, 0.0, 0.0)
-    lens = Lens("pinhole", (600.0, 600.0), (319.5, 239.5), (0.0,) * 5)
+    lens = Lens("pinhole", (600.0, 600.0), (319.5, 239.5), (k1, 0.0, 0.0, 0.0, 0.0))
     write_rig(OneEyeRig(lens, (640, 480), ("",), 1e-12 * np.eye(9), made), tmp_path / "cameras.toml")
-    answers = []
-    for text in (TAG_CAMERA, TAG_CAMERA.replace("0.0005", "0.0")):
-        config = Config.load(write_small_arm(tmp_path, text), {})
-        wire = Wire([pair(seq) for seq in range(1, 6)])
-        learner = Learner(config, DirectSolver(), cast(ZenohSession, wire), Still())
-        learner._declare()
-        learner._feed.step(0.0)
-        answers.append((wire.status(), decode(wire.ask(KEYS.predict, {"q": [0.1, 0.2]}), PredictReply)))
-    (status, reply), (_, sure) = answers
+
+
+def answers_of(tmp_path: Path, text: str) -> tuple[LearnerStatus, PredictReply]:
+    """Return the state and a prediction of a learner of five pairs."""
+    config = Config.load(write_small_arm(tmp_path, text), {})
+    wire = Wire([pair(seq) for seq in range(1, 6)])
+    learner = Learner(config, DirectSolver(), cast(ZenohSession, wire), Still())
+    learner._declare()
+    learner._feed.step(0.0)
+    return wire.status(), decode(wire.ask(KEYS.predict, {"q": [0.1, 0.2]}), PredictReply)
+
+
+def test_predictions_contain_what_calibration_and_tag_leave(tmp_path: Path) -> None:
+    calibrated(tmp_path)
+    (status, reply), (_, sure) = (
+        answers_of(tmp_path, text) for text in (TAG_CAMERA, TAG_CAMERA.replace("0.0005", "0.0"))
+    )
     x = np.array(reply.x)
     # A size that is 1 % off is 1 % of all distances, within the view.
     assert np.hypot(sure.sigma[0][2], 0.01 * x[0, 2]) == pytest.approx(reply.sigma[0][2], rel=1e-3)
     assert status.common_error_m is not None
     assert 0.5 < status.common_error_m / (0.01 * float(np.linalg.norm(x))) < 1.2
+
+
+@pytest.mark.parametrize(
+    ("damaged", "said"),
+    [
+        (lambda _: None, "cameras.toml: there is no such file"),
+        (lambda folder: (folder / "cameras.toml").write_text("format = 1"), "cameras.toml, line 1: of another format"),
+        (lambda folder: calibrated(folder, k1=-50.0), "folds over within the image"),
+    ],
+    ids=["missing", "damaged", "folded"],
+)
+def test_a_learner_goes_on_without_the_cameras_calibration(tmp_path: Path, damaged, said) -> None:
+    damaged(tmp_path)
+    status, reply = answers_of(tmp_path, TAG_CAMERA)
+    assert (status.pairs, status.common_error_m, reply.pairs) == (5, None, 5)
+    assert any("leaves out how well the cameras are calibrated" in each and said in each for each in status.health)
+
+
+MOCAP = """[[marker_source]]
+kind = "udp"
+port = 5005
+"""
+
+
+def test_positions_of_another_source_do_not_share_the_cameras_error(tmp_path: Path) -> None:
+    calibrated(tmp_path)
+    status, _ = answers_of(tmp_path, TAG_CAMERA + MOCAP)
+    assert status.common_error_m is None
+    assert not any("calibrated" in each for each in status.health)

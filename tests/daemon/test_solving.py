@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -129,6 +130,18 @@ def test_a_solver_that_reads_nothing_blocks_nobody(monkeypatch) -> None:
         process.solve()
         with pytest.raises(SolverLostError, match="started again"):
             list(iter(process.poll, ()))
+
+
+def test_a_look_for_solutions_does_not_wait_for_a_reader(monkeypatch) -> None:
+    monkeypatch.setattr(solver_process, "module_command", lambda _: ("sleep", "60"))
+    monkeypatch.setattr(solver_process, "READS_WITHIN_S", 0.0)
+    with solver_process.SolverProcess() as process:
+        process.start(TASK)
+        process.learn(np.zeros((10_000, 3)), np.zeros((10_000, 3)))
+        monkeypatch.setattr(solver_process, "READS_WITHIN_S", 20.0)
+        begin = time.monotonic()
+        assert process.poll() is None
+        assert time.monotonic() - begin < 10.0
 
 
 def test_a_solver_is_kept_where_its_clock_is_unknown(monkeypatch) -> None:

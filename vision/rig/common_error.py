@@ -37,6 +37,10 @@ class CommonError:
     rig: Rig
     size_sigma: float = 0.0
 
+    def require_usable(self) -> None:
+        """Raise CalibrationError if the eyes share no view, or a lens folds over within its image."""
+        _ = self._frame
+
     def errors(self, x: FloatArray) -> FloatArray:
         """Return the errors (n, 3, k) [m] at positions x (n, 3) [m], at 1 sigma of each of k independent unknowns."""
         x = self._within_view(x)

@@ -26,13 +26,19 @@ from bodyschema.cli.commands.options import (
     robot_file,
     say,
 )
-from bodyschema.interfaces.errors import RequestError
+from bodyschema.interfaces.errors import BodyschemaError, RequestError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from bodyschema.calibration.report import CalibrationReport
     from bodyschema.calibration.rigid_chain import Calibration, Trusted
     from bodyschema.daemon.config import Config
+    from bodyschema.interfaces.records import FloatArray
     from bodyschema.recordings.recording import Recording
+    from bodyschema.robot.description import RobotDescription
+
+    CommonErrors = Callable[[FloatArray], FloatArray]
 
 CAMERA_FRAME = "calibrated_camera"
 
@@ -71,18 +77,22 @@ class FitOptions:
             raise RequestError("--trust-urdf has no offsets to find. Give it, or --only offsets")
         return "urdf" if self.trust_urdf else "nothing" if self.only is None else "links"
 
-    def fitted(self, config: Config, recording: Recording) -> tuple[Calibration, Calibration | None]:
-        """Return the calibration, and that with everything free where the URDF is trusted."""
-        from bodyschema.calibration.rigid_chain import Calibration
-        from bodyschema.daemon.wiring.cameras import common_error
+    def fitted(
+        self, robot: RobotDescription, recording: Recording, common: CommonErrors | None
+    ) -> tuple[Calibration, Calibration | None]:
+        """Return the calibration, and that with everything free where the URDF is trusted.
 
-        cameras = common_error(config)
-        common = None if cameras is None else cameras.errors
+        Args:
+            robot: the nominal model.
+            recording: what to learn.
+            common: returns the errors that all positions share, as for `Calibration.of`; None: none are known.
+        """
+        from bodyschema.calibration.rigid_chain import Calibration
 
         def of(trusted: Trusted) -> Calibration:
             zeros_rad = math.radians(self.zeros_deg)
             return Calibration.of(
-                config.robot, recording, sigma_m=self.sigma_m, zeros_rad=zeros_rad, trusted=trusted, common=common
+                robot, recording, sigma_m=self.sigma_m, zeros_rad=zeros_rad, trusted=trusted, common=common
             )
 
         trusted = self.trusted()
@@ -206,21 +216,49 @@ def arm(
     )
     if seen.misread:
         seen.require(source, force=force)
-    found, free = fit.fitted(config, recording)
+    common, unknown = _common_errors(config, source, taken)
+    found, free = fit.fitted(description, recording, common)
     report = CalibrationReport.of(found, seen, source.name, first, camera_frame, free)
     if report.other_tool_from is None:
         seen.require(source, force=force)
     if out is not None or servos.write:
         _require_writable(report, force=force)
     told = [] if out is None else _written(config, found, report, out, replace=force)
-    lines = plan.written(found)
+    of_cameras, lines = [*unknown, *_contained(found)], plan.written(found)
     offsets = {zero.joint: math.radians(zero.zero) for zero in report.zeros if zero.half_width is not None}
     changed = servos.lines(config, offsets, source)
     if as_json:
         print_json(report)
-        sys.stderr.writelines(f"{line}\n" for line in changed)
+        sys.stderr.writelines(f"{line}\n" for line in [*of_cameras, *changed])
     else:
-        _show(report, [*lines, *changed], told)
+        _show(report, [*of_cameras, *lines, *changed], told)
+
+
+def _common_errors(config: Config, source: Path, taken: SourceOptions) -> tuple[CommonErrors | None, list[str]]:
+    """Return the errors that all positions share, and why they are left out although robot.toml names a calibration."""
+    from bodyschema.cli.recordings.foreign import seen_elsewhere
+
+    if config.tables.vision.cameras is None or seen_elsewhere(source, taken):
+        return None, []
+    from bodyschema.daemon.wiring.cameras import common_error
+
+    try:
+        cameras = common_error(config)
+    except BodyschemaError as fault:
+        return None, [f"The intervals leave out how well the cameras are calibrated: {fault}"]
+    return None if cameras is None else cameras.errors, []
+
+
+def _contained(found: Calibration) -> list[str]:
+    """Return what the intervals contain of the cameras' error, and how to leave it out."""
+    if found.common is None:
+        return []
+    rms_m = math.sqrt(float((found.common**2).sum(axis=(1, 2)).mean()))
+    return [
+        f"The intervals contain the cameras' calibration, which leaves {1e3 * rms_m:.2g} mm (1-sigma) in all positions "
+        "alike; distances and expected errors are without its estimated part. Where another instrument measured the "
+        "positions, give a robot.toml without `calibration` in [vision.cameras]."
+    ]
 
 
 def _require_one_target(servos: LeRobotOptions, out: Path | None) -> None:
