@@ -51,7 +51,7 @@ MOST_BYTES = 200 * 2**20  # of memory that reading a small file may take
 quick = settings(
     max_examples=20,
     deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
     phases=[Phase.explicit, Phase.reuse, Phase.generate],  # the bytes found are enough; shrinking them takes minutes
 )
 long = settings(quick, max_examples=5000)
