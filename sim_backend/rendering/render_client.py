@@ -107,6 +107,7 @@ class RenderProcess:
             raise self._lost() from error
 
     def _lost(self) -> SourceLost:
+        self._end()  # its pipes close a moment before it has ended, and who opens again asks whether it has
         return SourceLost(
             f"the renderer's process {self.process.pid} has ended (exit code {self.process.poll()}); "
             "its message stands on standard error; open the simulation again"

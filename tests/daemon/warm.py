@@ -82,6 +82,8 @@ class Child:
         os.close(self._fate)
 
     def wait(self, timeout: float | None = None) -> int:
+        if self.returncode is not None:  # the server may not have closed its end yet
+            return self.returncode
         if not (self._heard or select.select([self._fate], [], [], timeout)[0]):
             raise subprocess.TimeoutExpired(self.args, timeout or 0.0)
         with self._lock:  # two threads may wait
