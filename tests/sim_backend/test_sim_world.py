@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import subprocess
 import threading
 from dataclasses import replace
 from datetime import datetime
@@ -206,6 +207,13 @@ def test_a_dead_renderer_is_a_lost_source_until_the_camera_is_opened_again(runni
         frames(world, 10)
     with world.camera:
         assert None not in frames(world, 3)
+
+
+def test_a_lost_renderer_has_ended_when_it_is_told(monkeypatch):
+    start = "bodyschema.sim_backend.rendering.render_client._start"
+    monkeypatch.setattr(start, lambda *_: subprocess.Popen(["sleep", "0.2"]))
+    with pytest.raises(SourceLost, match="exit code 0"), SimWorld(shipped(), SimConfig(seed=3)):
+        pass
 
 
 def test_a_robot_with_one_eye_is_rendered_with_one_image_that_shows_the_marker():
