@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -68,8 +68,14 @@ def encoders(folder: Path) -> Iterator[tuple[PtyShell, Callable[[], SerialLineJo
         yield shell, lambda: SerialLineJoints(config, NAMES, SystemClock(), limits=LIMITS)
 
 
-pytestmark = pytest.mark.usefixtures("patient_host")
+pytestmark = pytest.mark.usefixtures("patient_host", "silence_is_no_loss")
 EACH = pytest.mark.parametrize("make", [dynamixel, feetech, encoders])
+
+
+@pytest.fixture
+def silence_is_no_loss(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bench and driver share this process: on a busy machine the bench itself may be silent for a while."""
+    monkeypatch.setattr("bodyschema.drivers.servos.joints.LOST_AFTER_S", LIMIT_S)
 
 
 def wait_for_reading(source: Any) -> JointReading:
@@ -80,11 +86,24 @@ def wait_for_reading(source: Any) -> JointReading:
     raise AssertionError("no reading came")
 
 
+@contextmanager
+def patiently(source: Any) -> Iterator[Any]:
+    """Open `source`, also where a busy machine lets the bench answer the first attempts too late."""
+    deadline = time.monotonic() + LIMIT_S
+    with ExitStack() as stack:
+        opened = None
+        while opened is None:
+            try:
+                opened = stack.enter_context(source)
+            except SourceLost:
+                if time.monotonic() > deadline:
+                    raise
+        yield opened
+
+
 @EACH
-def test_readings_are_right_with_wire_time(make: Make, tmp_path, monkeypatch) -> None:
-    # Emulator and driver share this process: on a busy machine the emulator itself may be silent for a while.
-    monkeypatch.setattr("bodyschema.drivers.servos.joints.LOST_AFTER_S", LIMIT_S)
-    with make(tmp_path) as (_, driver), driver() as joints:
+def test_readings_are_right_with_wire_time(make: Make, tmp_path) -> None:
+    with make(tmp_path) as (_, driver), patiently(driver()) as joints:
         readings = [wait_for_reading(joints) for _ in range(50)]
     off = [np.abs(reading.q - [swing(id)(reading.t) for id in IDS]).max() for reading in readings]
     assert np.median(off) < 0.02  # on a busy machine the time of a single one may be off
@@ -92,7 +111,7 @@ def test_readings_are_right_with_wire_time(make: Make, tmp_path, monkeypatch) ->
 
 @EACH
 def test_nobody_else_of_us_opens_the_port(make: Make, tmp_path) -> None:
-    with make(tmp_path) as (_, driver), driver() as joints:
+    with make(tmp_path) as (_, driver), patiently(driver()) as joints:
         wait_for_reading(joints)
         with pytest.raises(SourceError, match="is in use by another program"):
             driver().__enter__()
@@ -102,17 +121,20 @@ def test_nobody_else_of_us_opens_the_port(make: Make, tmp_path) -> None:
 def test_an_unplugged_port_is_told_once_and_back_after_the_replug(make: Make, tmp_path, caplog) -> None:
     with make(tmp_path) as (shell, driver):
         joints = driver()
-        with caplog.at_level(logging.WARNING), ReconnectingSource(joints, "the encoders", SystemClock()) as source:
+        reconnecting = ReconnectingSource(joints, "the encoders", SystemClock())
+        with caplog.at_level(logging.WARNING), patiently(reconnecting) as source:
             before = wait_for_reading(source)
+            caplog.clear()  # on a busy machine the bench may have been silent before
+            losses = source.losses
             shell.unplug()
             for _ in range(20):
                 source.read(0.05)
+            told, losses = list(caplog.messages), source.losses - losses
             assert source.trouble is not None
             shell.plug_in()
             after = wait_for_reading(source)
-    assert len(caplog.messages) == 1
-    assert "is gone" in caplog.messages[0]
-    assert source.losses == 1
+    assert len(told) == losses == 1
+    assert "is gone" in told[0]
     assert joints.epoch > 1  # on a busy machine the first attempt may find nobody
     assert after.t > before.t
 
