@@ -20,7 +20,7 @@ from kbmaps import RigidChain
 from .frames import order_of_axes, reordered_quaternions, turned_frame
 from .limits import reach_m, spread_m
 from .reading import Reading
-from .rows import all_shifted, partly_shifted
+from .rows import all_shifted, partly_carried, partly_shifted
 from .search import ROWS, ReadingFit, ReadingSearch, nameable
 from .size import of_another_size, size_of
 from .verdict import FEWEST_ROWS, THRESHOLDS, Plausibility, mm
@@ -113,9 +113,12 @@ class _Check:
             if shifted is not None:
                 return shifted
         if not (self._fits_clearly_better and self._is_nameable(self.best)):
-            shifted = partly_shifted(search, q, x, fits=self._before < THRESHOLDS.named * self.spread)
-            if shifted is not None:
-                return shifted
+            fits = self._before < THRESHOLDS.named * self.spread
+            wrong = (partly_carried(search, self.robot.joints) if fits else None) or partly_shifted(
+                search, q, x, fits=fits
+            )
+            if wrong is not None:
+                return wrong
         size = size_of(search.chain, search.q, search.x, search.apart, search.exact_m)
         return of_another_size(size, spread_m(search.x), self._before, best) or Plausibility()
 

@@ -24,7 +24,7 @@ NEAR_RAD = math.radians(12.0)
 class Reading:
     """One way to read the columns; all defaults except the order leave them as they are.
 
-    A joint is its column times its sign, plus its quarter turns.
+    A joint is its column times its sign, plus its quarter turns, plus what its column lacks of the joint before.
 
     Attributes:
         order: index of the column of each joint.
@@ -34,6 +34,8 @@ class Reading:
         unit: of the positions.
         degrees: the angles are in degrees.
         millimetres: the readings of prismatic joints are in millimetres.
+        carried: 1 or -1 for a joint whose column lacks the angle of the joint before, or has it twice; else 0. So do
+            arms whose elbow counts from the horizontal, as behind a parallelogram. Empty where no joint does.
     """
 
     order: tuple[int, ...]
@@ -43,6 +45,7 @@ class Reading:
     unit: str = METRES
     degrees: bool = False
     millimetres: bool = False
+    carried: tuple[int, ...] = ()
 
     @classmethod
     def plain(cls, joints: int) -> Reading:
@@ -57,7 +60,11 @@ class Reading:
     def angles(self, q: FloatArray, slides: NDArray[np.bool_]) -> FloatArray:
         """Return joint angles (n, d) [rad, m] of the columns q (n, d)."""
         units = np.where(slides, 1e-3 if self.millimetres else 1.0, math.radians(1.0) if self.degrees else 1.0)
-        return (q[:, self.order] * units) * np.array(self.signs) + QUARTER * np.array(self.quarters)
+        angles = (q[:, self.order] * units) * np.array(self.signs) + QUARTER * np.array(self.quarters)
+        for joint, times in enumerate(self.carried):
+            if times:
+                angles[:, joint] += times * angles[:, joint - 1]
+        return angles
 
     def positions(self, x: FloatArray) -> FloatArray:
         """Return positions (n, 3) [m] of the columns x (n, 3)."""
@@ -86,6 +93,11 @@ class Reading:
         yield replace(self, degrees=not self.degrees)
         if any(slides):
             yield replace(self, millimetres=not self.millimetres)
+
+    def carrying(self, joint: int) -> Iterator[Reading]:
+        """Yield the readings in which the column of a joint lacks the angle of the joint before, or has it twice."""
+        for times in (1, -1):
+            yield replace(self, carried=tuple(times * (k == joint) for k in range(len(self.order))))
 
     def doubles(self, slides: Sequence[bool]) -> Iterator[Reading]:
         """Yield all readings with two more signs, or two more quarter turns: one alone may not improve the fit."""
@@ -117,7 +129,7 @@ class Reading:
         return (
             max(moved - 1, 0)
             + (turned if turned < len(self.signs) else 1)
-            + sum(map(bool, self.quarters))
+            + sum(map(bool, (*self.quarters, *self.carried)))
             + sum((self.mirrored, self.unit != METRES, self.degrees, self.millimetres))
         )
 
@@ -171,6 +183,13 @@ class Reading:
                 f"{_listed(other)} {verb} the other way",
                 f"multiply the {column} {_listed(other)} by -1, or set `direction` in robot.toml",
             )
+        for before, joint, times in zip(joints, joints[1:], self.carried[1:], strict=False):
+            if times:
+                yield (
+                    f"{joint} counts together with {before}, as where it is counted from the horizontal",
+                    f"{'add' if times > 0 else 'subtract'} the angle of {before} {'to' if times > 0 else 'from'} the "
+                    f"column {joint}",
+                )
         for joint, quarters, zero in zip(joints, self.quarters, zeros, strict=True):
             if quarters:
                 # An offset near a quarter turn counts as one, the rest as tolerance.

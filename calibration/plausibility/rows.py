@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,6 +83,30 @@ def partly_shifted(search: ReadingSearch, q: FloatArray, x: FloatArray, *, fits:
         "it seems that angles and positions are shifted against each other in "
         f"{100.0 * max(angles, positions):.0f} % of the rows: {fit}",
         remedy,
+        misread=True,
+    )
+
+
+def partly_carried(search: ReadingSearch, names: Sequence[str]) -> Plausibility | None:
+    """Return a refusal if a joint counts together with the one before, which moves in few rows; else None.
+
+    Where joints move one after the other, the other rows place the arm, and these rows look like outliers.
+    """
+    readings, slides = search.carrying(), search.chain.prismatic
+    if not readings:
+        return None
+    angles = [search.q, *(reading.angles(search.q, slides) for reading in readings)]
+    own, *read = (search.distances(q, search.x, [(q, search.x)])[0] for q in angles)
+    shares = [float((_SETTINGS.shifted_better * one < own).mean()) for one in read]
+    worse = [float((_SETTINGS.shifted_better * own < one).mean()) for one in read]
+    best = int(np.argmax(np.subtract(shares, worse)))
+    if shares[best] - worse[best] < _SETTINGS.shifted:
+        return None
+    nothing = np.zeros(len(names))
+    return Plausibility(
+        f"it seems that {readings[best].looks(names, nothing)}: {100.0 * shares[best]:.0f} % of the rows then fit at "
+        f"least {_SETTINGS.shifted_better:g} times better",
+        readings[best].remedy(names, nothing),
         misread=True,
     )
 

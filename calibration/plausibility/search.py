@@ -54,6 +54,8 @@ class _Settings:
     # ... and named where the known marker comes out so many times nearer to its place: with 3, 2 of 32 markers that
     # were 50 mm off in each direction (1-sigma) came out so by chance.
     nearer: float = 5.0
+    # Axes are parallel if the cosine between them is above this: 2.6°.
+    parallel: float = 0.999
     # Maximum number of other, equally good readings that are listed.
     listed: int = 2
 
@@ -107,7 +109,7 @@ class ReadingSearch:
         """Return the columns as they are, the simplest reading among the best, and others nearly as simple."""
         as_it_is = Reading.plain(self.chain.joints)
         slides: list[bool] = self.chain.prismatic.tolist()
-        self._try([as_it_is, *as_it_is.neighbours(slides)])
+        self._try([as_it_is, *as_it_is.neighbours(slides), *self.carrying()])
         if self._best()[0] != as_it_is:
             # With a marker far from nominal, the fit of the right reading may have ended in a local minimum.
             self._fit([as_it_is] * 6, tools=TOOL_M * np.concatenate([np.eye(3), -np.eye(3)]))
@@ -145,6 +147,15 @@ class ReadingSearch:
         )
         others = [reading for reading in good[1:] if reading.changes <= good[0].changes + 1]
         return as_it_is, good[0], others[: _SETTINGS.listed]
+
+    def carrying(self) -> list[Reading]:
+        """Return the columns as they are, but for a joint that counts together with a parallel one before it."""
+        axes, turns = self.chain.axes, self.chain.fixed[1:-1, :3, :3]
+        along = np.einsum("ki,kij,kj->k", axes[:-1], turns, axes[1:])
+        rigid = self.chain.prismatic[:-1] | self.chain.prismatic[1:]
+        parallel = np.flatnonzero(~rigid & (np.abs(along) > _SETTINGS.parallel)) + 1
+        plain = Reading.plain(self.chain.joints)
+        return [reading for joint in parallel.tolist() for reading in plain.carrying(joint)]
 
     def _aligned_tool(self) -> FloatArray:
         """Return the marker's offset (1, 3) [m] with nominal joint offsets: its fit starts from many places."""

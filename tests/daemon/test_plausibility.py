@@ -236,6 +236,25 @@ def test_a_doubt_about_the_size_hides_no_other_fault() -> None:
     assert "1.03 times as large" in found.warnings[0]
 
 
+@pytest.mark.parametrize(("times", "said"), [(1, "Subtract the angle of q2 from"), (-1, "Add the angle of q2 to")])
+def test_an_elbow_counted_from_the_horizontal_is_named(times, said) -> None:
+    good = pairs(joints=4)
+    good.q[:, 2] += times * good.q[:, 1]
+    seen = good.seen()
+    assert "q3 counts together with q2" in str(seen.refusal)
+    assert seen.remedy.startswith(said)
+
+
+def test_a_joint_moved_alone_shows_another_that_counts_with_it() -> None:
+    q = np.tile([0.3, -0.8, 1.2, 0.4], (48, 1))
+    q[range(48), np.arange(48) // 12] += np.tile(np.linspace(-1.2, 1.2, 12), 4)
+    parameters = ChainParameters(arm(4))
+    read = q.copy()
+    read[:, 2] -= q[:, 1] + 0.8
+    seen = Pairs(read, parameters.positions(np.zeros(parameters.size), q)).seen()
+    assert "q3 counts together with q2" in str(seen.refusal)
+
+
 def test_degrees_are_named_however_small() -> None:
     right = pairs(joints=4)
     assert "the angles are in degrees" in (replace(right, q=np.degrees(right.q)).seen().refusal or "")
