@@ -142,6 +142,27 @@ def test_too_few_pairs_are_told() -> None:
         planted(1, pairs=7).calibrated()
 
 
+def test_camera_and_tool_alone_need_fewer_pairs() -> None:
+    found = planted(0, pairs=7).calibrated(trusted="urdf")
+    with pytest.raises(CalibrationError, match="5 pairs are too few to calibrate 4 joints; record at least 6"):
+        planted(0, pairs=5).calibrated(trusted="urdf")
+    assert found.learner.inliers.all()
+
+
+def test_from_afar_the_first_zero_stays_a_turn_of_the_instrument() -> None:
+    arm = planted(0)
+    far = dataclasses.replace(arm.recording, x=arm.recording.x + np.array([0.0, 0.0, 10.0]))
+    found = dataclasses.replace(arm, recording=far).calibrated()
+    assert found.figures.shown.tolist() == [False, True, True, False]
+    assert found.figures.half_widths[:3].max() < 0.1
+
+
+def test_many_outliers_are_mentioned_with_their_rows() -> None:
+    assert "20 % of the pairs do not fit" in said(planted(0, outliers=20))
+    assert "(the longest run: number 1 to 20)" in said(planted(0, outliers=20))
+    assert "do not fit" not in said(planted(0, outliers=5))
+
+
 def test_a_marker_that_never_moved_is_told() -> None:
     arm = planted(1)
     still = Recording(joints=arm.robot.joints, q=arm.recording.q, x=np.ones((100, 3)))
