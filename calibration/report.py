@@ -25,6 +25,9 @@ class _Settings:
     # Minimum number of pairs on either side of a change, and the share of all squared residuals that it must explain.
     fewest: int = 6
     explained: float = 0.5
+    # With fewer rows than the first a change must explain the second: 0.55 came out of 20 rows of one real tool.
+    few: int = 40
+    explained_of_few: float = 0.8
     # Residuals beyond this multiple of the median get less weight, so that single outliers are no change.
     far: float = 5.0
     # Excludes splits that the data cannot determine, e.g. where all poses are alike.
@@ -59,7 +62,7 @@ def tool_jump(learner: RigidLearner, recording: Recording) -> ToolJump | None:
     explained, shifts = _splits(learner, recording)
     allowed = slice(_Settings.fewest - 1, len(recording) - _Settings.fewest)
     best = _Settings.fewest - 1 + int(explained[allowed].argmax())
-    if explained[best] < _Settings.explained:
+    if explained[best] < (_Settings.explained_of_few if len(recording) < _Settings.few else _Settings.explained):
         return None
     return ToolJump(best + 2, float(np.linalg.norm(shifts[best])))
 

@@ -434,9 +434,20 @@ def test_one_tool_is_not_taken_for_two(seed: int) -> None:
     assert report_on(planted(seed, pairs=24 + 30 * seed, outliers=2 * seed)).other_tool_from is None
 
 
+def few_of(arm: Planted, rows: np.ndarray) -> CalibrationReport:
+    recording = Recording(joints=arm.robot.joints, q=arm.recording.q[rows], x=arm.recording.x[rows])
+    return report_on(dataclasses.replace(arm, recording=recording))
+
+
+def test_few_rows_show_another_tool_only_if_it_explains_nearly_all() -> None:
+    rows = np.r_[10:20, 20:30]
+    assert few_of(retooled(5, 20, 0.05), rows).other_tool_from == 11
+    assert few_of(retooled(5, 20, 0.002), rows).other_tool_from is None
+
+
 def test_pairs_of_two_tools_are_told_with_what_to_do() -> None:
     text = said(planted(1), other_tool_from=601, other_tool_mm=248.0)
-    assert "From number 601 on the marker sits about 248 mm elsewhere on the hand" in text
+    assert "From number 601 on the marker sits about 248 mm elsewhere on gripper" in text
     assert "--first 601, or --last 600" in text
 
 
