@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -231,13 +232,22 @@ class ReadingSearch:
         ]
 
     def undirected(self, names: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the joints whose sign makes no difference."""
-        plain = Reading.plain(len(names))
-        fits = (
-            (name, self.fits.get(reading))
-            for name, reading in zip(names, plain.neighbours(self.chain.prismatic.tolist()), strict=False)
+        """Return the joints whose sign makes no difference, in no row: some joints may move in few rows alone."""
+        plain, slides = Reading.plain(len(names)), self.chain.prismatic
+        readings = list(itertools.islice(plain.neighbours(slides.tolist()), len(names)))
+        alike = [self._as_good(self.fits[one], self.fits[plain]) if one in self.fits else False for one in readings]
+        if not any(alike):
+            return ()
+        own, *others = (
+            self._whole_error(one) if like else np.inf
+            for one, like in zip([plain, *readings], [True, *alike], strict=True)
         )
-        return tuple(name for name, fit in fits if fit is not None and self._as_good(fit, self.fits[plain]))
+        return tuple(name for name, error in zip(names, others, strict=True) if error < THRESHOLDS.much_better * own)
+
+    def _whole_error(self, reading: Reading) -> float:
+        """Return the RMS distance [m] of all rows, outliers included."""
+        q, x = reading.angles(self.q, self.chain.prismatic), reading.positions(self.x)
+        return max(float(np.sqrt(np.square(self.distances(q, x, [(q, x)])).mean())), self.exact_m)
 
     def _best(self) -> list[Reading]:
         """Return all readings, the best first."""

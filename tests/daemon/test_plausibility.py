@@ -249,10 +249,18 @@ def test_a_joint_moved_alone_shows_another_that_counts_with_it() -> None:
     q = np.tile([0.3, -0.8, 1.2, 0.4], (48, 1))
     q[range(48), np.arange(48) // 12] += np.tile(np.linspace(-1.2, 1.2, 12), 4)
     parameters = ChainParameters(arm(4))
-    read = q.copy()
+    x, read = parameters.positions(np.zeros(parameters.size), q), q.copy()
     read[:, 2] -= q[:, 1] + 0.8
-    seen = Pairs(read, parameters.positions(np.zeros(parameters.size), q)).seen()
+    seen = Pairs(read, x).seen()
     assert "q3 counts together with q2" in str(seen.refusal)
+
+
+def test_a_joint_that_moves_in_few_rows_has_a_direction() -> None:
+    q, rng = np.zeros((48, 4)), np.random.default_rng(0)
+    q[range(48), np.repeat([0, 1, 2, 3], [14, 14, 6, 14])] += np.linspace(-1.2, 1.2, 48)[rng.permutation(48)]
+    parameters = ChainParameters(arm(4))
+    x = parameters.positions(np.zeros(parameters.size), q) + 0.001 * rng.normal(size=(48, 3))
+    assert "q3" not in Pairs(q, x).seen().undirected
 
 
 def test_degrees_are_named_however_small() -> None:
