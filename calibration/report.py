@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from bodyschema.calibration.plausibility.check import Plausibility
+from bodyschema.calibration.plausibility.verdict import Plausibility
 from bodyschema.calibration.rigid_chain import Calibration, Trusted
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.solvers.tolerance_selection import WORKMANSHIP
@@ -25,6 +25,9 @@ class _Settings:
     # Minimum number of pairs on either side of a change, and the share of all squared residuals that it must explain.
     fewest: int = 6
     explained: float = 0.5
+    # With fewer rows than the first a change must explain the second: 0.55 came out of 20 rows of one real tool.
+    few: int = 40
+    explained_of_few: float = 0.8
     # Residuals beyond this multiple of the median get less weight, so that single outliers are no change.
     far: float = 5.0
     # Excludes splits that the data cannot determine, e.g. where all poses are alike.
@@ -59,7 +62,7 @@ def tool_jump(learner: RigidLearner, recording: Recording) -> ToolJump | None:
     explained, shifts = _splits(learner, recording)
     allowed = slice(_Settings.fewest - 1, len(recording) - _Settings.fewest)
     best = _Settings.fewest - 1 + int(explained[allowed].argmax())
-    if explained[best] < _Settings.explained:
+    if explained[best] < (_Settings.explained_of_few if len(recording) < _Settings.few else _Settings.explained):
         return None
     return ToolJump(best + 2, float(np.linalg.norm(shifts[best])))
 
@@ -107,6 +110,8 @@ STILL_RAD, STILL_M = math.radians(10.0), 0.02
 # Multiples of its tolerance beyond which a joint offset is reported, and beyond which it is not written. One in 370
 # exceeds the first if the tolerance is right; the second allows for a tolerance guessed at half its true value.
 FAR_OFF, TOO_FAR_OFF = 3.0, 5.0
+# Share of outliers above which they are mentioned: trackers and tags get less wrong.
+MOST_OUTLIERS = 0.1
 _DEG = math.degrees(1.0)
 _UNITS = (1e3, 1e3, 1e3, _DEG, _DEG, _DEG, 1e3, 1e3, 1e3)
 
@@ -227,7 +232,7 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
         zeros = _zeros(calibration, named.values[9:], named.half_widths[9:])
         made_badly = _badly_made(calibration)
         beyond = [*_far_off(calibration, zeros, TOO_FAR_OFF), *made_badly]
-        doubts = [*seen.sentences]
+        doubts = [*seen.sentences, *_many_left_out(calibration, first)]
         if jump is None:  # the figures of two tools are of neither
             doubts += [*_far_off(calibration, zeros, FAR_OFF), *made_badly]
         values, halves = named.values, named.half_widths
@@ -298,6 +303,27 @@ def _far_off(calibration: Calibration, zeros: list[Zero], times: float) -> list[
                 f"(1-sigma) were allowed for: its zero is wrong, or the URDF is of another arm.{more}"
             )
     return said
+
+
+def _many_left_out(calibration: Calibration, first: int) -> list[str]:
+    """Return a message if more pairs are outliers than an instrument gets wrong, or rows in a run; else an empty list.
+
+    Args:
+        calibration: the calibration.
+        first: number of its first row.
+    """
+    off = np.flatnonzero(~calibration.learner.inliers)
+    if len(off) <= MOST_OUTLIERS * len(calibration.recording):
+        return []
+    runs = np.split(off, np.flatnonzero(np.diff(off) > 1) + 1)
+    longest = max(runs, key=len) + first
+    distance_mm = 1e3 * float(np.median(np.linalg.norm(calibration.residuals[off], axis=1)))
+    where = "" if len(longest) == 1 else f" (the longest run: number {longest[0]} to {longest[-1]})"
+    return [
+        f"{100.0 * len(off) / len(calibration.recording):.0f} % of the pairs do not fit and were left out: they are "
+        f"off by {distance_mm:.3g} mm (median){where}. So many are seldom errors of the instrument: ask what was "
+        "different there, such as a joint that carries another one along, or a marker or an instrument that was moved."
+    ]
 
 
 def _badly_made(calibration: Calibration) -> list[str]:

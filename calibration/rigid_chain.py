@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -115,7 +116,7 @@ class Calibration:
         Raises:
             CalibrationError: there are too few pairs, or they do not fit the robot at all.
         """
-        needed = 2 * len(robot.joints)
+        needed = fewest_pairs(len(robot.joints), trusted)
         if len(recording) < needed:
             raise CalibrationError(
                 f"{len(recording)} pairs are too few to calibrate {len(robot.joints)} joints; record at least {needed}"
@@ -125,7 +126,8 @@ class Calibration:
             turned = recording.orientation
             turns = None if turned is None else rotation_matrices("orientation", turned)
             placed = align(robot.chain, recording.q, recording.x, turns=turns, **known)
-            choices = _tolerances(robot, zeros_rad, trusted)
+            distance_m = float(np.linalg.norm(recording.x, axis=1).max())
+            choices = _tolerances(robot, distance_m, zeros_rad, trusted)
             # Measured positions would share their noise with the rows.
             shared = None if common is None else common(placed.chain.positions(recording.q))
             learners, shares = _learners(placed.chain, choices, recording, sigma_m, shared)
@@ -261,10 +263,23 @@ def _of_the_arm(learner: RigidLearner, recording: Recording, rows: IntArray, com
     return unexplained_variance(residuals, recording.cov[good] + ROUNDING_M**2 * np.eye(3), freedom)
 
 
-def _tolerances(robot: RobotDescription, zeros_rad: float, trusted: Trusted) -> list[ChainTolerances]:
+def fewest_pairs(joints: int, trusted: Trusted) -> int:
+    """Return the number of pairs needed: two for each joint, or where the URDF is trusted, twice the unknowns."""
+    unknowns = 9 + (joints if trusted == "links" else 0)
+    return 2 * joints if trusted == "nothing" else min(2 * joints, math.ceil(2 * unknowns / 3))
+
+
+def _tolerances(
+    robot: RobotDescription, distance_m: float, zeros_rad: float, trusted: Trusted
+) -> list[ChainTolerances]:
+    """Return tolerances for each workmanship; the arm is `distance_m` from the origin of the measurement frame.
+
+    The frame's pose is a turn about this origin and a shift: from afar, a small turn of the arm is a long shift.
+    """
     links = WORKMANSHIP if trusted == "nothing" else ((0.0, 0.0),)
     free_zeros = trusted != "urdf"
     pose_known, marker_known = robot.camera.pose_known, robot.robot.marker_known
+    fitted_place_m = max(_Settings.fitted_place_m, _Settings.fitted_turn_rad * distance_m)
     return [
         ChainTolerances(
             axes=axes,
@@ -273,7 +288,7 @@ def _tolerances(robot: RobotDescription, zeros_rad: float, trusted: Trusted) -> 
             slide_zeros=_Settings.slide_zeros_m if free_zeros else 0.0,
             tool=_Settings.known_place_m if marker_known else _Settings.fitted_place_m,
             base_rotation=_Settings.known_turn_rad if pose_known else _Settings.fitted_turn_rad,
-            base_translation=_Settings.known_place_m if pose_known else _Settings.fitted_place_m,
+            base_translation=_Settings.known_place_m if pose_known else fitted_place_m,
         )
         for axes, points in links
     ]

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray
-from kbmaps import RigidChain, rotation_matrices
 
 from .limits import UNITS_PER_METRE
 
@@ -19,24 +18,13 @@ METRES = "metres"
 QUARTER = math.pi / 2.0
 # A joint offset this near to a quarter turn counts as one: assembled arms are off by less.
 NEAR_RAD = math.radians(12.0)
-# Orders of a quaternion in the columns qx, qy, qz, qw.
-AS_IT_IS = ""
-_W_FIRST = "hold a quaternion with w first"
-_CONJUGATE = "hold the conjugate of the marker's orientation, that of the measurement frame in the marker"
-_REORDER = "name the columns qw, qx, qy, qz"
-_NEGATE = "multiply qx, qy and qz by -1"
-REMEDIES = {
-    _W_FIRST: _REORDER,
-    _CONJUGATE: _NEGATE,
-    f"{_W_FIRST}, and {_CONJUGATE}": f"{_REORDER}, and {_NEGATE}",
-}
 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
     """One way to read the columns; all defaults except the order leave them as they are.
 
-    A joint is its column times its sign, plus its quarter turns.
+    A joint is its column times its sign, plus its quarter turns, plus what its column lacks of the joint before.
 
     Attributes:
         order: index of the column of each joint.
@@ -46,6 +34,8 @@ class Reading:
         unit: of the positions.
         degrees: the angles are in degrees.
         millimetres: the readings of prismatic joints are in millimetres.
+        carried: 1 or -1 for a joint whose column lacks the angle of the joint before, or has it twice; else 0. So do
+            arms whose elbow counts from the horizontal, as behind a parallelogram. Empty where no joint does.
     """
 
     order: tuple[int, ...]
@@ -55,6 +45,7 @@ class Reading:
     unit: str = METRES
     degrees: bool = False
     millimetres: bool = False
+    carried: tuple[int, ...] = ()
 
     @classmethod
     def plain(cls, joints: int) -> Reading:
@@ -69,7 +60,11 @@ class Reading:
     def angles(self, q: FloatArray, slides: NDArray[np.bool_]) -> FloatArray:
         """Return joint angles (n, d) [rad, m] of the columns q (n, d)."""
         units = np.where(slides, 1e-3 if self.millimetres else 1.0, math.radians(1.0) if self.degrees else 1.0)
-        return (q[:, self.order] * units) * np.array(self.signs) + QUARTER * np.array(self.quarters)
+        angles = (q[:, self.order] * units) * np.array(self.signs) + QUARTER * np.array(self.quarters)
+        for joint, times in enumerate(self.carried):
+            if times:
+                angles[:, joint] += times * angles[:, joint - 1]
+        return angles
 
     def positions(self, x: FloatArray) -> FloatArray:
         """Return positions (n, 3) [m] of the columns x (n, 3)."""
@@ -98,6 +93,11 @@ class Reading:
         yield replace(self, degrees=not self.degrees)
         if any(slides):
             yield replace(self, millimetres=not self.millimetres)
+
+    def carrying(self, joint: int) -> Iterator[Reading]:
+        """Yield the readings in which the column of a joint lacks the angle of the joint before, or has it twice."""
+        for times in (1, -1):
+            yield replace(self, carried=tuple(times * (k == joint) for k in range(len(self.order))))
 
     def doubles(self, slides: Sequence[bool]) -> Iterator[Reading]:
         """Yield all readings with two more signs, or two more quarter turns: one alone may not improve the fit."""
@@ -129,7 +129,7 @@ class Reading:
         return (
             max(moved - 1, 0)
             + (turned if turned < len(self.signs) else 1)
-            + sum(map(bool, self.quarters))
+            + sum(map(bool, (*self.quarters, *self.carried)))
             + sum((self.mirrored, self.unit != METRES, self.degrees, self.millimetres))
         )
 
@@ -183,6 +183,13 @@ class Reading:
                 f"{_listed(other)} {verb} the other way",
                 f"multiply the {column} {_listed(other)} by -1, or set `direction` in robot.toml",
             )
+        for before, joint, times in zip(joints, joints[1:], self.carried[1:], strict=False):
+            if times:
+                yield (
+                    f"{joint} counts together with {before}, as where it is counted from the horizontal",
+                    f"{'add' if times > 0 else 'subtract'} the angle of {before} {'to' if times > 0 else 'from'} the "
+                    f"column {joint}",
+                )
         for joint, quarters, zero in zip(joints, self.quarters, zeros, strict=True):
             if quarters:
                 # An offset near a quarter turn counts as one, the rest as tolerance.
@@ -211,24 +218,3 @@ def _replaced(values: tuple[int, ...], changes: dict[int, int]) -> tuple[int, ..
 
 def _listed(names: Sequence[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
-
-
-def errors_rad(chain: RigidChain, q: FloatArray, rotation: FloatArray, turns: FloatArray) -> dict[str, float]:
-    """Return the median angle [rad] between the arm's hand and quaternions (n, 4), for each way to read them.
-
-    Args:
-        chain: the nominal chain.
-        q: joint values (n, d) [rad, m], offsets included.
-        rotation: of the nominal measurement frame in the real one (3, 3).
-        turns: the columns qx, qy, qz, qw.
-    """
-    plain, first, conjugate = turns, np.roll(turns, -1, axis=1), np.array([-1.0, -1.0, -1.0, 1.0])
-    readings = zip((AS_IT_IS, *REMEDIES), (plain, first, plain * conjugate, first * conjugate), strict=True)
-    hand = rotation @ chain.orientation(q)
-    return {name: _scatter(hand.swapaxes(1, 2) @ rotation_matrices("orientation", read)) for name, read in readings}
-
-
-def _scatter(turns: FloatArray) -> float:
-    """Return the median angle [rad] of rotations (n, 3, 3) from the one among them that is nearest to the others."""
-    cosines = (np.einsum("aij,bij->ab", turns, turns) - 1.0) / 2.0
-    return math.acos(float(np.clip(np.median(cosines, axis=1).max(), -1.0, 1.0)))

@@ -72,8 +72,9 @@ def sentences(report: CalibrationReport) -> list[str]:
 def two_tools(report: CalibrationReport) -> str:
     """Return advice for a recording made with two different tools."""
     return (
-        f"From number {report.other_tool_from} on the marker sits about {report.other_tool_mm:.0f} mm elsewhere on the "
-        "hand: these are pairs of two tools, and no figure is right for both. Calibrate them separately: "
+        f"From number {report.other_tool_from} on the marker sits about {report.other_tool_mm:.0f} mm elsewhere on "
+        f"{report.marker_link}: these are pairs of two tools, and no figure is right for both. Calibrate them "
+        "separately: "
         f"--first {report.other_tool_from}, or --last {(report.other_tool_from or 0) - 1}."
     )
 

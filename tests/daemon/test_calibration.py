@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from fitted_once import fitted_once as fitted_once
 
-from bodyschema.calibration.plausibility.check import Plausibility
+from bodyschema.calibration.plausibility.verdict import Plausibility
 from bodyschema.calibration.report import CalibrationReport
 from bodyschema.calibration.rigid_chain import Calibration, CalibrationError
 from bodyschema.cli.commands.options import SourceOptions
@@ -140,6 +140,27 @@ def test_outliers_are_counted_and_left_out() -> None:
 def test_too_few_pairs_are_told() -> None:
     with pytest.raises(CalibrationError, match="7 pairs are too few to calibrate 4 joints; record at least 8"):
         planted(1, pairs=7).calibrated()
+
+
+def test_camera_and_tool_alone_need_fewer_pairs() -> None:
+    found = planted(0, pairs=7).calibrated(trusted="urdf")
+    with pytest.raises(CalibrationError, match="5 pairs are too few to calibrate 4 joints; record at least 6"):
+        planted(0, pairs=5).calibrated(trusted="urdf")
+    assert found.learner.inliers.all()
+
+
+def test_from_afar_the_first_zero_stays_a_turn_of_the_instrument() -> None:
+    arm = planted(0)
+    far = dataclasses.replace(arm.recording, x=arm.recording.x + np.array([0.0, 0.0, 10.0]))
+    found = dataclasses.replace(arm, recording=far).calibrated()
+    assert found.figures.shown.tolist() == [False, True, True, False]
+    assert found.figures.half_widths[:3].max() < 0.1
+
+
+def test_many_outliers_are_mentioned_with_their_rows() -> None:
+    assert "20 % of the pairs do not fit" in said(planted(0, outliers=20))
+    assert "(the longest run: number 1 to 20)" in said(planted(0, outliers=20))
+    assert "do not fit" not in said(planted(0, outliers=5))
 
 
 def test_a_marker_that_never_moved_is_told() -> None:
@@ -413,9 +434,20 @@ def test_one_tool_is_not_taken_for_two(seed: int) -> None:
     assert report_on(planted(seed, pairs=24 + 30 * seed, outliers=2 * seed)).other_tool_from is None
 
 
+def few_of(arm: Planted, rows: np.ndarray) -> CalibrationReport:
+    recording = Recording(joints=arm.robot.joints, q=arm.recording.q[rows], x=arm.recording.x[rows])
+    return report_on(dataclasses.replace(arm, recording=recording))
+
+
+def test_few_rows_show_another_tool_only_if_it_explains_nearly_all() -> None:
+    rows = np.r_[10:20, 20:30]
+    assert few_of(retooled(5, 20, 0.05), rows).other_tool_from == 11
+    assert few_of(retooled(5, 20, 0.002), rows).other_tool_from is None
+
+
 def test_pairs_of_two_tools_are_told_with_what_to_do() -> None:
     text = said(planted(1), other_tool_from=601, other_tool_mm=248.0)
-    assert "From number 601 on the marker sits about 248 mm elsewhere on the hand" in text
+    assert "From number 601 on the marker sits about 248 mm elsewhere on gripper" in text
     assert "--first 601, or --last 600" in text
 
 

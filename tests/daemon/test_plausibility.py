@@ -16,9 +16,10 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from bodyschema.calibration.plausibility.check import Plausibility, plausibility
+from bodyschema.calibration.plausibility.check import plausibility
 from bodyschema.calibration.plausibility.limits import UNITS_PER_METRE, require_units
 from bodyschema.calibration.plausibility.reading import Reading
+from bodyschema.calibration.plausibility.verdict import Plausibility
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.learner.findings import Findings
 from bodyschema.interfaces.clock import SystemClock
@@ -233,6 +234,33 @@ def test_a_doubt_about_the_size_hides_no_other_fault() -> None:
     found = Pairs(right.q, 1.03 * arm().positions(right.q)).seen(orientation=shown)
     assert "w first" in (found.refusal or "")
     assert "1.03 times as large" in found.warnings[0]
+
+
+@pytest.mark.parametrize(("times", "said"), [(1, "Subtract the angle of q2 from"), (-1, "Add the angle of q2 to")])
+def test_an_elbow_counted_from_the_horizontal_is_named(times, said) -> None:
+    good = pairs(joints=4)
+    good.q[:, 2] += times * good.q[:, 1]
+    seen = good.seen()
+    assert "q3 counts together with q2" in str(seen.refusal)
+    assert seen.remedy.startswith(said)
+
+
+def test_a_joint_moved_alone_shows_another_that_counts_with_it() -> None:
+    q = np.tile([0.3, -0.8, 1.2, 0.4], (48, 1))
+    q[range(48), np.arange(48) // 12] += np.tile(np.linspace(-1.2, 1.2, 12), 4)
+    parameters = ChainParameters(arm(4))
+    x, read = parameters.positions(np.zeros(parameters.size), q), q.copy()
+    read[:, 2] -= q[:, 1] + 0.8
+    seen = Pairs(read, x).seen()
+    assert "q3 counts together with q2" in str(seen.refusal)
+
+
+def test_a_joint_that_moves_in_few_rows_has_a_direction() -> None:
+    q, rng = np.zeros((48, 4)), np.random.default_rng(0)
+    q[range(48), np.repeat([0, 1, 2, 3], [14, 14, 6, 14])] += np.linspace(-1.2, 1.2, 48)[rng.permutation(48)]
+    parameters = ChainParameters(arm(4))
+    x = parameters.positions(np.zeros(parameters.size), q) + 0.001 * rng.normal(size=(48, 3))
+    assert "q3" not in Pairs(q, x).seen().undirected
 
 
 def test_degrees_are_named_however_small() -> None:

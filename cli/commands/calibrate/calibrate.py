@@ -80,14 +80,14 @@ class FitOptions:
     def fitted(
         self, robot: RobotDescription, recording: Recording, common: CommonErrors | None
     ) -> tuple[Calibration, Calibration | None]:
-        """Return the calibration, and that with everything free where the URDF is trusted.
+        """Return the calibration, and that with everything free where the URDF is trusted and the pairs suffice.
 
         Args:
             robot: the nominal model.
             recording: what to learn.
             common: returns the errors that all positions share, as for `Calibration.of`; None: none are known.
         """
-        from bodyschema.calibration.rigid_chain import Calibration
+        from bodyschema.calibration.rigid_chain import Calibration, fewest_pairs
 
         def of(trusted: Trusted) -> Calibration:
             zeros_rad = math.radians(self.zeros_deg)
@@ -96,7 +96,8 @@ class FitOptions:
             )
 
         trusted = self.trusted()
-        return of(trusted), None if trusted == "nothing" else of("nothing")
+        enough = len(recording) >= fewest_pairs(len(robot.joints), "nothing")
+        return of(trusted), of("nothing") if trusted != "nothing" and enough else None
 
 
 AS_USUAL = FitOptions()
