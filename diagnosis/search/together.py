@@ -500,7 +500,7 @@ def together(start: Fit, hypotheses: Sequence[Effect], tell: Callable[[str], Non
         best = max(known, key=lambda place: place.here.worth)
         if worth < best.here.worth - _COMES_NEAR:
             place, one = best, best.with_all_zeros
-            if max(best.here.scales.lengths, best.here.scales.angles) <= 1.0 or place.name_of(one) in looked_at:
+            if best.here.scales.angles <= 1.0 or place.name_of(one) in looked_at:
                 break
         known.append(_Place(place.refitted(one), hypotheses, known))
         tell(f"{len(known)} fitted")
