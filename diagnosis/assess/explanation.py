@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -50,6 +50,7 @@ class Explanation:
         worth: log-evidence of the whole, comparable only with that of other explanations [nats].
         size: RMS change by the unnamed causes beyond the named ones, in units of the stated noise.
         promise: first-order gain of the best single unnamed cause beside the named ones [nats].
+        counted: effective number of independent rows per row (0 to 1].
     """
 
     fit: Fit
@@ -57,6 +58,7 @@ class Explanation:
     worth: float
     size: float = 0.0
     promise: float = -np.inf
+    counted: float = 1.0
 
     @property
     def beside(self) -> Fit:
@@ -79,13 +81,31 @@ def explain(
 ) -> Explanation:
     """Keep the causes found, unless fewer of them with unnamed causes are clearly more probable.
 
+    Functions of time and of the joints of a walk follow noise that is alike in neighbouring rows. So where it still is
+    beside unnamed causes, rows count for as many as are independent.
+
     Args:
         found: the fit with all named causes of the search.
         tried: the fits along the search, the first without any cause.
     """
     path = list(tried)
+    best = _compared(found, path, unknowns, search, 1.0)
+    independence = best.beside.independence
+    if best.apart is not None and independence < 1.0:
+        best = _compared(found, path, unknowns, search, independence)
+    if best.apart is not None:
+        tell("something that none of the effects explains")
+    return best
+
+
+def _compared(found: Fit, path: Sequence[Fit], unknowns: Unknowns, search: Search, counted: float) -> Explanation:
+    """Return the most probable explanation.
+
+    Args:
+        counted: effective number of independent rows per row.
+    """
     whole = _length(found, found.run.measured - path[0].run.measured)
-    best = _with_unknown(found, unknowns, search)
+    best = _with_unknown(found, unknowns, search, counted)
     inexact = max(_OF_THE_CAUSES * whole, _OF_THE_WAY * _length(found, changed_by_the_way(found)))
     if is_at_limit(found.background.scales):
         # Causes of an arm that no workshop made have not been found, so what is left is not their shape.
@@ -96,7 +116,7 @@ def explain(
     is_rest = best.size < _REST * whole
     margin = _MARGIN if is_rest else 0.0
     # Upper bound of an unnamed cause's gain: to first order it explains no more beside fewer causes.
-    hope = found.log_likelihood + best.promise if best.apart is None else np.inf
+    hope = counted * found.log_likelihood + best.promise if best.apart is None else np.inf
     looked_at = {(named(found.causes), found.background.scales)}
     for fit in [*path[:_FIRST], *path[_FIRST:][-_LAST:]]:
         looked = named(fit.causes), fit.background.scales
@@ -104,9 +124,10 @@ def explain(
             continue
         looked_at.add(looked)
         narrower = found.background.volume(found.noise.sigma) - fit.background.volume(found.noise.sigma)
-        if hope + narrower - cost_of_names(fit.causes, search) < best.worth - (_AS_GOOD if best.unknown else 0.0):
+        least = best.worth - (_AS_GOOD if best.unknown else 0.0)
+        if hope + counted * narrower - cost_of_names(fit.causes, search) < least:
             continue
-        other = _with_unknown(fit, unknowns, search, best.worth - (_AS_GOOD if best.unknown else 0.0))
+        other = _with_unknown(fit, unknowns, search, counted, least)
         if other.apart is not None and not fit.causes and other.worth > best.worth - _NEAR:
             # The scales of a fit without causes are those of an arm without unnamed causes, or a guess.
             other = _rescaled(other, other.apart, unknowns, search)
@@ -117,7 +138,6 @@ def explain(
             best = other
     if best.apart is not None:
         best = _rescaled(best, best.apart, unknowns, search)
-        tell("something that none of the effects explains")
         best = _pruned(best, unknowns, search, rest=is_rest and best.fit is found)
     return best
 
@@ -171,7 +191,7 @@ def _missed(fit: Fit, blocks: Blocks) -> FloatArray:
 def _rescaled(best: Explanation, apart: Apart, unknowns: Unknowns, search: Search) -> Explanation:
     """Refit with the tolerance scales found beside the unnamed causes, where that is more probable."""
     scales = tolerated(apart.fit).scales
-    again = _with_unknown(best.fit.tolerating(scales), unknowns, search)
+    again = _with_unknown(best.fit.tolerating(scales), unknowns, search, best.counted)
     before = best.fit.background.scales
     gained = again.worth - best.worth - scales.doubt + (0.0 if before is None else before.doubt)
     return again if again.unknown and gained > 0.0 else best
@@ -199,27 +219,28 @@ def _length(fit: Fit, change: FloatArray) -> float:
     return float(np.sqrt(np.square(fit.observations.whitened(change[:, :, None])).mean()))
 
 
-def _with_unknown(fit: Fit, unknowns: Unknowns, search: Search, least: float = -np.inf) -> Explanation:
+def _with_unknown(fit: Fit, unknowns: Unknowns, search: Search, counted: float, least: float = -np.inf) -> Explanation:
     """Add worthwhile unnamed causes one by one; stop where the total will hardly reach `least` [nats]."""
     apart: Apart | None = None
     promise, names = -np.inf, cost_of_names(fit.causes, search)
     while not fit.is_exact and (apart is None or len(apart.chosen) < _MOST_UNKNOWNS):
         here, chosen = (fit, ()) if apart is None else (apart.fit, apart.chosen)
-        near = unknowns.nearest(here, chosen)
+        near = unknowns.nearest(here, chosen, counted)
         way, more = near[0]
         promise = more if apart is None else promise
         spent = 0.0 if apart is None else unknowns.cost(apart)
+        worth = counted * here.log_likelihood - names - spent
         # Each remaining unnamed cause is worth hardly more than this one.
-        if here.log_likelihood - names - spent + _SLACK * (_MOST_UNKNOWNS - len(chosen)) * max(more, 0.0) < least:
+        if worth + _SLACK * (_MOST_UNKNOWNS - len(chosen)) * max(more, 0.0) < least:
             break
         if more < NAMED or (more < _BEYOND_DOUBT and unknowns.agreed(here, chosen, way) < 0.0):
             break
         tried = [unknowns.apart(fit, (*chosen, way), apart) for way, _ in near]
-        apart = max(tried, key=lambda one: one.fit.log_likelihood - unknowns.cost(one))
+        apart = max(tried, key=lambda one: counted * one.fit.log_likelihood - unknowns.cost(one))
     if apart is None:
-        return Explanation(fit, None, fit.log_likelihood - names, promise=promise)
-    worth = apart.fit.log_likelihood - names - unknowns.cost(apart)
-    return Explanation(fit, apart, worth, _length(fit, apart.predicted - fit.predicted), promise)
+        return Explanation(fit, None, counted * fit.log_likelihood - names, promise=promise, counted=counted)
+    worth = counted * apart.fit.log_likelihood - names - unknowns.cost(apart)
+    return Explanation(fit, apart, worth, _length(fit, apart.predicted - fit.predicted), promise, counted)
 
 
 def cost_of_names(causes: Iterable[Effect], search: Search) -> float:
@@ -242,4 +263,4 @@ def without_one(
     explanation: Explanation, cause: Effect, unknowns: Unknowns, search: Search, least: float = -np.inf
 ) -> Explanation:
     """Return the explanation without one of its causes; it is given up where it will hardly reach `least` [nats]."""
-    return _with_unknown(explanation.fit.without(cause), unknowns, search, least)
+    return _with_unknown(explanation.fit.without(cause), unknowns, search, explanation.counted, least)

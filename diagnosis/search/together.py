@@ -497,8 +497,11 @@ def together(start: Fit, hypotheses: Sequence[Effect], tell: Callable[[str], Non
             (one.worth, place, one) for place in known for one in place.reached if place.name_of(one) not in looked_at
         ]
         worth, place, one = max(proposals, key=lambda proposal: proposal[0], default=(-np.inf, known[0], known[0].here))
-        if worth < max(place.here.worth for place in known) - _COMES_NEAR:
-            break
+        best = max(known, key=lambda place: place.here.worth)
+        if worth < best.here.worth - _COMES_NEAR:
+            place, one = best, best.with_all_zeros
+            if best.here.scales.angles <= 1.0 or place.name_of(one) in looked_at:
+                break
         known.append(_Place(place.refitted(one), hypotheses, known))
         tell(f"{len(known)} fitted")
     return max(known, key=lambda place: place.here.worth).fit
@@ -575,6 +578,16 @@ class _Place:
     def name_of(self, one: Together) -> frozenset[Key]:
         """Return the keys of the causes of a set, without their parameters."""
         return frozenset(self._sets.effects[k].key for k in one.chosen)
+
+    @property
+    def with_all_zeros(self) -> Together:
+        """The set with all joint offsets in addition.
+
+        Beside tolerances that stand for them they seem to be worth nothing to first order: an offset moves the marker
+        along an arc.
+        """
+        zeros = [k for k, effect in enumerate(self._sets.effects) if effect.kind.is_zero]
+        return self._sets.of(tuple(dict.fromkeys((*self.here.chosen, *zeros))))
 
     def numbers_of(self, one: Together) -> list[Effect]:
         """Return the causes of a set, those of which some numbers may be free once for each."""

@@ -174,7 +174,9 @@ class Unknowns:
         self._families = families(start.run)
         self._prepared: dict[int, Way] = {}
         # By the noise of a fit, which copies of the fit share.
-        self._near: WeakKeyDictionary[Noise, dict[tuple[Way, ...], list[tuple[Way, float]]]] = WeakKeyDictionary()
+        self._near: WeakKeyDictionary[Noise, dict[tuple[float | Way, ...], list[tuple[Way, float]]]] = (
+            WeakKeyDictionary()
+        )
         self._apart: WeakKeyDictionary[Noise, dict[tuple[Way, ...], Apart]] = WeakKeyDictionary()
 
     def _way(self, k: int) -> Way:
@@ -208,16 +210,20 @@ class Unknowns:
         left = fit.evident.ravel()
         return basis, left - basis @ (basis.T @ left)
 
-    def nearest(self, fit: Fit, others: Sequence[Way] = ()) -> list[tuple[Way, float]]:
-        """Return the families that may be best beside a fit and others, with their first-order worth [nats]."""
-        known = self._near.setdefault(fit.noise, {})
-        if tuple(others) not in known:
-            known[tuple(others)] = self._ranked(fit, others)
-        return known[tuple(others)]
+    def nearest(self, fit: Fit, others: Sequence[Way] = (), counted: float = 1.0) -> list[tuple[Way, float]]:
+        """Return the families that may be best beside a fit and others, with their first-order worth [nats].
 
-    def _ranked(self, fit: Fit, others: Sequence[Way]) -> list[tuple[Way, float]]:
+        Args:
+            counted: effective number of independent rows per row.
+        """
+        known = self._near.setdefault(fit.noise, {})
+        if (counted, *others) not in known:
+            known[counted, *others] = self._ranked(fit, others, counted)
+        return known[counted, *others]
+
+    def _ranked(self, fit: Fit, others: Sequence[Way], counted: float) -> list[tuple[Way, float]]:
         basis, left = self.beside(fit, others)
-        rss, rows = float(left @ left), float(fit.noise.weights.sum())
+        rss, rows = float(left @ left), counted * float(fit.noise.weights.sum())
         directions, shares = fit.absorbed
         twice = np.column_stack([directions * np.sqrt(shares), fit.unshared(np.column_stack([basis, left]))])
         seen = twice.reshape(*fit.left.shape, -1) * fit.root_weights[:, :, None]

@@ -15,6 +15,7 @@ from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.fit.worth import NAMED
+from bodyschema.diagnosis.search.search import Search
 from bodyschema.diagnosis.unnamed.families import families
 from bodyschema.diagnosis.unnamed.unknown import Unknowns, Way
 from bodyschema.effects import Effect, Simulation
@@ -33,7 +34,7 @@ class Believing:
 def explained_beside(fits: list[Fit], worths: list[float], monkeypatch: pytest.MonkeyPatch) -> Explanation:
     """Return the explanation chosen from fits of these worths: the last has no direction, the others share one."""
     way = SimpleNamespace(family=SimpleNamespace(what="something", is_specific=False))
-    apart = cast(Any, SimpleNamespace(chosen=(way,)))
+    apart = cast(Any, SimpleNamespace(chosen=(way,), fit=fits[0]))
     known = {
         fit: Explanation(fit, None if fit is fits[-1] else apart, worth, size=1e6, promise=1e6)
         for fit, worth in zip(fits, worths, strict=True)
@@ -78,3 +79,18 @@ def test_what_few_rows_tell_of_a_way_is_no_reason_to_doubt_it() -> None:
     unknowns = Unknowns(start)
     (family,) = (one for one in families(start.run) if (one.joint, one.drivers) == (shoulder, (shoulder, elbow)))
     assert unknowns.predicts(unknowns.apart(start, (Way.of(family, start),)), start)
+
+
+def test_noise_that_is_alike_in_neighbouring_rows_puts_no_unnamed_error_in_the_place_of_a_cause() -> None:
+    robot = desk_arm()
+    simulation, motion = Simulation(robot), walk(robot, 1, rows=600)
+    cause = Effect.at(robot, "joint_eccentricity", ELBOW, values=[0.02, 0.01])
+    noise = SIGMA_M * np.random.default_rng([1, 1]).normal(size=(600, 3))
+    for row in range(1, 600):
+        noise[row] = 0.7 * noise[row - 1] + np.sqrt(1.0 - 0.7**2) * noise[row]
+    recording = measured(robot, motion, Simulation(robot, (cause,)).positions(motion) + noise)
+    start = aligned(Observations.of(recording, simulation), simulation)
+    found = start.with_causes([cause])
+    chosen = explain(found, [start, found], Unknowns(start), Search([cause], lambda _: None), lambda _: None)
+    assert chosen.fit.causes
+    assert not chosen.unknown
