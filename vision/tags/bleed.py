@@ -20,12 +20,10 @@ from .edge import SQUARE, leave, sampled
 
 # Most samples along a row of modules; else one a pixel.
 _MOST = 80
-# Neighbouring samples share pixels: factor of the standard deviation of independent ones.
-_SHARED = 2.0
 # Share of the samples that the pattern has to explain; the usual bleeding, in parts of the blur, where it does not.
 _FITS, _UNSEEN = 0.9, 0.3
-# Relative error: the modules inside are not lit exactly as the tag's edges are.
-_DIFFERENT = 0.15
+# Relative error on nine photographed grids (RMS): modules inside are not drawn and lit exactly as the edges are.
+_DIFFERENT = 0.25
 
 
 def bleed(grey: ImageArray, corners_px: FloatArray, blur_px: float, modules: FloatArray) -> tuple[float, float]:
@@ -75,9 +73,12 @@ def bleed(grey: ImageArray, corners_px: FloatArray, blur_px: float, modules: Flo
     except np.linalg.LinAlgError:  # too few modules, or too sharp, to tell shift and blur apart
         return unseen
     found = cov @ (design @ (levels * kept))
-    spread = float(np.square((levels - found @ design)[kept]).mean())
     moved = float(found[7] / found[3])
-    by_chance = spread * float(cov[7, 7] / found[3] ** 2) * _SHARED**2
+    # What a module pulls at the shift: its samples share pixels, and print and light.
+    pulls = (cov[7] @ design * kept * (levels - found @ design)).reshape(across.shape)
+    rows, columns = (np.flatnonzero(np.diff(np.floor(at), prepend=-1.0)) for at in (y, x))
+    pulls = np.add.reduceat(np.add.reduceat(pulls, rows, axis=0), columns, axis=1)
+    by_chance = float(np.square(pulls).sum() / found[3] ** 2) * pulls.size / (pulls.size - len(design))
     if not math.isfinite(moved) or not by_chance > 0.0:
         return unseen
     # Many cameras do not bleed at all. How likely that is follows from two densities of what was found: by chance
@@ -85,7 +86,9 @@ def bleed(grey: ImageArray, corners_px: FloatArray, blur_px: float, modules: Flo
     usual = unseen[1] + by_chance
     odds = math.sqrt(by_chance / usual) * math.exp(min(0.5 * moved * moved * (1.0 / by_chance - 1.0 / usual), 500.0))
     bleeds = odds / (1.0 + odds)
-    variance = bleeds * (by_chance + (_DIFFERENT * moved) ** 2) + bleeds * (1.0 - bleeds) * moved * moved
+    share = unseen[1] / usual
+    moved *= share
+    variance = bleeds * (share * by_chance + (_DIFFERENT * moved) ** 2) + bleeds * (1.0 - bleeds) * moved * moved
     return bleeds * moved, variance
 
 

@@ -34,7 +34,7 @@ _FEWEST_POINTS, _MOST_POINTS = 6, 80
 # The sharpest edge (1-sigma) [px].
 SHARPEST_PX = 0.45
 # Variance that interpolation between pixels adds to a blur [px²].
-_INTERPOLATION = 1.0 / 6.0
+INTERPOLATION = 1.0 / 6.0
 # Fourth cumulant along an axis of a square pixel and of the interpolation between them [px⁴]: no such blur reaches as
 # far as a Gaussian.
 PIXEL_CUMULANT = -1.0 / 40.0
@@ -310,7 +310,7 @@ def sampled(grey: ImageArray, places: FloatArray) -> FloatArray:
 def _ideal(places: FloatArray, origins: FloatArray, normals: FloatArray, blur_px: float) -> FloatArray:
     """Return the shares of white of edges through `origins` at places (2, 4, n, m), interpolated from pixels."""
     # Interpolation adds to the pixels' own blur.
-    normals = normals / math.sqrt(max(blur_px**2, SHARPEST_PX**2) - _INTERPOLATION)
+    normals = normals / math.sqrt(max(blur_px**2, SHARPEST_PX**2) - INTERPOLATION)
     whole = np.floor(places)
     u, v = normals.T[:, :, None, None]
     level = whole[0] * u + whole[1] * v - (origins * normals).sum(axis=1)[:, None, None]

@@ -17,7 +17,7 @@ from bodyschema.interfaces.records import FloatArray, ImageArray, Reason, frozen
 from .bleed import bleed
 from .config import TagConfig
 from .dictionary import tag_modules
-from .edge import LONGEST_REACH_PX, MODULES, SHARPEST_PX, Edges, Light, find_edges
+from .edge import INTERPOLATION, LONGEST_REACH_PX, MODULES, SHARPEST_PX, Edges, Light, find_edges
 
 # Most rounds with rough corners, and half of all; converged when no corner would move by more than this [px].
 _ROUNDS, _SETTLED_PX = 4, 0.003
@@ -27,8 +27,8 @@ _ROUGH_SHARE = 0.3
 _USUAL_BLUR_PX, _USUAL_SIGMA_PX = 0.85, 0.1
 # A blur that is a larger share of a module is the cause where corners are not sure.
 _MOST_BLUR = 0.5
-# Prior factor by which interpolation correlates neighbouring points' errors, and its weight in waves along the edges.
-_SMOOTHED, _SMOOTHED_WAVES = 1.5, 10
+# Weight in waves along the edges of the power that interpolation alone gives them.
+_SMOOTHED_WAVES = 10
 # Slow waves have half-periods of at least this many points; least upper bound of their indices.
 _SLOW, _LEAST_QUICKEST = 4, 4
 # Standard deviations of chance that a random walk along the edges has to exceed.
@@ -132,7 +132,10 @@ def _likeness(edges: Edges) -> FloatArray:
     power = np.concatenate([np.square(w @ points) for w, points in zip(waves, edges.residuals, strict=True)])
     index = np.concatenate([np.arange(2.0, 2.0 + len(w)) for w in waves])
     # The prior counts as waves that are quick enough to show no walk.
-    power = np.append(power, _SMOOTHED)
+    apart = np.linalg.norm(edges.spots[:, 1] - edges.spots[:, 0], axis=1) / [len(r) - 1 for r in edges.residuals]
+    # White noise, smoothed as by a Gaussian of interpolation's variance; far points share none.
+    smoothed = max(math.sqrt(4.0 * math.pi * INTERPOLATION) * float(np.mean(1.0 / apart)), 1.0)
+    power = np.append(power, smoothed)
     design = np.stack([np.ones_like(power), np.append(index**-2.0, 0.0)])
     count = np.append(np.ones_like(index), _SMOOTHED_WAVES)
     even = np.append(index**-1.0, 1.0) * count
@@ -140,7 +143,7 @@ def _likeness(edges: Edges) -> FloatArray:
     cov = np.linalg.inv(design * count @ design.T)
     level = cov @ (design * count) @ power
     noise, steep = max(float(level[0]), 0.0), max(float(level[1]), 1e-9)
-    chance = math.sqrt(2.0 * float(cov[1, 1])) * max(noise, _SMOOTHED)
+    chance = math.sqrt(2.0 * float(cov[1, 1])) * max(noise, smoothed)
     # Walks that chance may show are left out, larger ones are taken for a little smaller (James and Stein).
     walk = steep * max(1.0 - (_CHANCE * chance / steep) ** 2, 0.0)
     return (noise if walk else alone) + walk * np.array([4.0, 1.0])
