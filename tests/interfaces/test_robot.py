@@ -124,13 +124,13 @@ def test_a_byte_order_mark_is_no_mistake(tmp_path) -> None:
 
 
 def test_a_urdf_that_is_not_there_is_told_with_the_key_to_mend(tmp_path) -> None:
-    with pytest.raises(RobotError, match=r"arm.urdf: cannot read the URDF: No such file.*Fix \[robot\] urdf"):
+    with pytest.raises(RobotError, match=r"arm.urdf: cannot read.*No such file.*by robot.urdf in robot.toml, line 3$"):
         load(tmp_path, urdf=None)
 
 
 def test_a_folder_in_the_place_of_the_urdf_is_told(tmp_path) -> None:
     (tmp_path / "arm.urdf").mkdir()
-    with pytest.raises(RobotError, match=r"arm.urdf: cannot read the URDF: Is a directory.*Fix \[robot\] urdf"):
+    with pytest.raises(RobotError, match=r"cannot read the URDF: Is a directory.*by robot.urdf in robot.toml, line 3$"):
         load(tmp_path, urdf=None)
 
 
