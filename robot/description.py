@@ -148,7 +148,7 @@ class RobotDescription:
         with blamed_on("robot", "joints"):
             if len(set(robot.joints)) != len(robot.joints):
                 raise RobotError("joints names a joint twice", remedy="Name each once")
-        tree = UrdfTree.load(file.parent / robot.urdf)
+        tree = _tree(file, robot, text)
         limits = []
         for name in robot.joints:
             with blamed_on("robot", "joints", naming=name):
@@ -192,6 +192,17 @@ class RobotDescription:
     def joints(self) -> tuple[str, ...]:
         """Names of the joints in the order of q."""
         return self.robot.joints
+
+
+def _tree(file: Path, robot: RobotSection, text: str) -> UrdfTree:
+    """Read the URDF; an error names the line of robot.toml that names the file, too."""
+    try:
+        return UrdfTree.load(file.parent / robot.urdf)
+    except RobotError as error:
+        line = line_of(text, ("robot", "urdf"))
+        named = f"It is named by robot.urdf in {file.name}{'' if line is None else f', line {line}'}"
+        remedy = f"{error.remedy}. {named}" if error.remedy else named
+        raise RobotError(error.what, file=error.file, line=error.line, remedy=remedy) from error
 
 
 def _chain(tree: UrdfTree, robot: RobotSection, camera: CameraSection) -> RigidChain:

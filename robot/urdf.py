@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from bodyschema.interfaces.errors import RobotError
-from bodyschema.interfaces.records import FloatArray, frozen_array
+from bodyschema.interfaces.records import LARGEST_Q, FloatArray, frozen_array
 from kbmaps import RigidChain
 from kbmaps.rotations import exponentials
 
@@ -319,6 +319,9 @@ def _limits(joint: Any, kind: str, file: Path) -> tuple[float, float]:
     if kind == "prismatic" and max(abs(lower), abs(upper)) > LARGEST_PLACE_M:
         what = f"<limit> of {_owner(limit)} lets it slide {max(abs(lower), abs(upper)):.3g} m away"
         raise _wrong(limit, file, what, "Give metres")
+    if kind != "prismatic" and max(abs(lower), abs(upper)) > LARGEST_Q:
+        what = f"<limit> of {_owner(limit)} lets it turn by {max(abs(lower), abs(upper)):.3g} rad"
+        raise _wrong(limit, file, what, 'Give radians, or write type="continuous"')
     return float(lower), float(upper)
 
 
@@ -326,7 +329,11 @@ def _origin(element: Any, file: Path) -> FloatArray:
     """Return the pose (4, 4) of the <origin> in `element`, the identity where there is none."""
     origin = element.find("origin")
     T = np.eye(4)
-    T[:3, :3] = rotation_of(_numbers(origin, "rpy", (0.0, 0.0, 0.0), file))
+    rpy = _numbers(origin, "rpy", (0.0, 0.0, 0.0), file)
+    if np.abs(rpy).max() > LARGEST_Q:  # nothing is left of its part of a turn
+        what = f"the <origin> of {_owner(origin)} is turned by {np.abs(rpy).max():.3g} rad"
+        raise _wrong(origin, file, what, "Give radians")
+    T[:3, :3] = rotation_of(rpy)
     T[:3, 3] = _numbers(origin, "xyz", (0.0, 0.0, 0.0), file)
     if np.abs(T[:3, 3]).max() > LARGEST_PLACE_M:
         what = f"the <origin> of {_owner(origin)} is {np.abs(T[:3, 3]).max():.3g} m away"

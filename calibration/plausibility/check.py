@@ -181,6 +181,11 @@ class _Check:
         frame = order_of_axes(fit.rotation, mirrored=True) if mirrored else ""
         fits = f"the pairs then fit to {mm(after)}, and as they are to {mm(self._before)}"
         text = f"{reading.looks(names, fit.zeros)}{frame}: {fits}"
+        if after > self._before:
+            text = (
+                f"{text}, but with links that are off by as much as those of arms this is more probable. Check it on "
+                "the arm before you use the model"
+            )
         either = "; or ".join(other.looks(names, self.search.fits[other].zeros) for other in self.others)
         either = f". These pairs fit as well if {either}" if either else ""
         if self._before > THRESHOLDS.much_better * fit.error:

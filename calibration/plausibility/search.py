@@ -257,17 +257,25 @@ class ReadingSearch:
         """Return the most probable reading with links of some tolerance, and the errors of better fits that it refutes.
 
         With nominal links a wrong reading may fit better: its marker and joint offsets make up for errors of the links.
-        They do so only where the columns as they are place the arm.
+        They do so only where the columns as they are place the arm. These may be the wrong reading that fits better.
         """
-        rivals = self._distinct([])
+        rivals, spread = self._distinct([]), spread_m(self.x)
         own = self.fits.get(as_it_is)
-        if rivals[0] == as_it_is or own is None or own.error >= THRESHOLDS.named * spread_m(self.x):
+        if own is None or own.error >= THRESHOLDS.named * spread:
             return rivals[0], []
+        nearest = rivals[0]
+        if nearest == as_it_is:
+            rivals = [each for each in rivals if nameable(each, self.fits[each], spread)]
         rivals += [as_it_is] if as_it_is not in rivals else []
+        if rivals == [as_it_is]:
+            return as_it_is, []
         slides = self.chain.prismatic
         read = [(each.angles(self.q, slides), each.positions(self.x), each.scale) for each in rivals]
         changes = np.array([reading.changes for reading in rivals])
-        best = rivals[int((evidences(self.chain, read, self.apart) - _SETTINGS.a_change * changes).argmax())]
+        probable = evidences(self.chain, read, self.apart) - _SETTINGS.a_change * changes
+        # Where the columns as they are fit best, another reading has to be certain twice.
+        probable[rivals.index(as_it_is)] += 2.0 * _SETTINGS.certain if nearest == as_it_is else 0.0
+        best = rivals[int(probable.argmax())]
         nats, error = self.fits[best].nats, self.fits[best].error
         fits = [self.fits[reading] for reading in rivals]
         return best, [fit.error for fit in fits if fit.nats < nats and not self._alike(error, [fit.error])]

@@ -24,7 +24,7 @@ from bodyschema.daemon.learner.solver_pool import SolverPool
 from bodyschema.daemon.learner.solver_process import SolverLostError, SolverProcess
 from bodyschema.daemon.service.notify import Notifier
 from bodyschema.daemon.service.service import Service
-from bodyschema.daemon.service.signals import SignalFlags
+from bodyschema.daemon.service.signals import SignalFlags, tell_parent_serving
 from bodyschema.daemon.transport.access import Names, Subjects, access_control
 from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.identity import SECURE
@@ -128,6 +128,7 @@ def run_learners(configs: Sequence[Config], clock: Clock, wishes: SignalFlags, n
             stack.enter_context(learner.serving())
             log.info("the learner of %s answers on %s", config.robot.name, config.tables.zenoh.learner)
         service.ready()
+        tell_parent_serving()
         attend(
             learners, [bus.publisher(Keys(c.robot.name).status("learner")) for c in configs], wishes, service, failed
         )

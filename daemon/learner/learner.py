@@ -45,7 +45,11 @@ AS_OFTEN_AS_ONE = 10
 # Name of the loop that must keep running.
 LISTENING = "learning"
 LOOPS = (LISTENING, "background", "status")
-TABLES = ("robot", "camera", "zenoh", "daemon", "drivers", "learner", "effects", "background", "unexplained")
+COMMON_ERROR = ("vision.marker", "vision.tag", "vision.cameras", "vision.further_cameras", "marker_source")
+TABLES = (
+    *("robot", "camera", "zenoh", "daemon", "drivers", "learner", "effects", "background", "unexplained"),
+    *COMMON_ERROR,
+)
 CHANGEABLE = {("learner", "checkpoint_every_s")}
 
 

@@ -125,7 +125,10 @@ def session_of(config: Config, wall: Clock) -> Session:
     )
 
 
-TABLES = ("robot", "camera", "zenoh", "daemon", "drivers", "vision", "sim", "effects", "background", "unexplained")
+TABLES = (
+    *("robot", "camera", "zenoh", "daemon", "drivers", "vision", "marker_source"),
+    *("sim", "effects", "background", "unexplained"),
+)
 CHANGEABLE = {("daemon", key) for key in DaemonConfig.__struct_fields__ if key != "state_dir"}
 
 

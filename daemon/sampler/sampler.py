@@ -23,6 +23,7 @@ from bodyschema.daemon.sampler.devices import (
 from bodyschema.daemon.sampler.reconnect import ResilientWriter
 from bodyschema.daemon.sampler.sources import answer_simulation
 from bodyschema.daemon.service.service import Service, with_health
+from bodyschema.daemon.service.signals import tell_parent_serving
 from bodyschema.daemon.transport.bus import Request, ZenohSession
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.status import SamplerStatus
@@ -154,6 +155,7 @@ class Sampler:
             self._serve()
             name, endpoint = self._config.robot.name, self._config.tables.zenoh.sampler
             log.info("the sampler of %s answers on %s; %d pairs are in %s", name, endpoint, self._seq, self._store.file)
+            tell_parent_serving()
             try:
                 self._sample()
                 self._serve_history()

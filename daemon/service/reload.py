@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any
 
 import msgspec
@@ -45,7 +46,7 @@ def reload(config: Config, tables: Collection[str], changeable: Collection[Key])
 
     Args:
         config: the configuration in force; settings overridden on the command line stay overridden.
-        tables: those that the process uses.
+        tables: those that the process uses, and single keys, as in `vision.marker`.
         changeable: table and key of settings that may change while it runs.
 
     Raises:
@@ -67,16 +68,16 @@ def reload(config: Config, tables: Collection[str], changeable: Collection[Key])
                 before: msgspec.Struct = taken.get(table) or getattr(config.tables, table)
                 taken[table] = msgspec.structs.replace(before, **{key: now[key]})
             else:
-                waiting.append(f"{table}.{key}")
+                waiting.append(f"{table}.{key}".rstrip("."))
     if not _same_arm(config, found):
         waiting.append("the URDF")
     return Reload(config.with_tables(msgspec.structs.replace(config.tables, **taken)), changed, waiting)
 
 
 def _table(config: Config, name: str) -> dict[str, Any]:
-    """Return the settings of a table, defaults included."""
+    """Return the settings of a table, defaults included; of a key, its value."""
     described = {"robot": config.robot.robot, "camera": config.robot.camera}
-    table = described.get(name, getattr(config.tables, name))
+    table = described[name] if name in described else attrgetter(name)(config.tables)
     if isinstance(table, msgspec.Struct):
         return msgspec.structs.asdict(table)
     return {"": table}

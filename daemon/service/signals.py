@@ -6,9 +6,11 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 PARENT = "_BODYSCHEMA_PARENT"
+# A pipe to the parent, which waits for a line.
+SERVING = "_BODYSCHEMA_SERVING"
 # prctl(2): the signal that the kernel sends when the parent dies.
 PR_SET_PDEATHSIG = 1
 
@@ -28,6 +30,14 @@ def end_with_parent() -> None:
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
     if os.getppid() != int(parent):  # the parent died before the kernel was told
         sys.exit(1)
+
+
+def tell_parent_serving() -> None:
+    """Report to a parent that asked for it by `SERVING` that this process has started, and works."""
+    pipe = os.environ.pop(SERVING, None)
+    if pipe is not None:
+        with suppress(OSError), open(int(pipe), "wb", buffering=0) as parent:
+            parent.write(b"\n")
 
 
 class SignalFlags:

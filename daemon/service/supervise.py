@@ -9,29 +9,29 @@ import subprocess
 import time
 from collections.abc import Sequence
 
-from bodyschema.daemon.service.signals import with_parent
+from bodyschema.daemon.service.signals import SERVING, with_parent
 from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.waits import FIRST_WAIT_S, LONGEST_WAIT_S, POLL_S
 
 log = logging.getLogger(__name__)
 
-SETTLED_AFTER_S = 30.0  # longer than any start, also on a busy machine
 END_LIMIT_S = 10.0
 
 
 class Child:
     """A process that is kept running.
 
-    If a process refuses to start (it ends with an error code of its own before ever running for `SETTLED_AFTER_S`), a
+    If a process refuses to start (it ends with an error code of its own before it ever reported that it works), a
     person is needed, and this is an error. A process that was killed, or ends later, is restarted, with growing waits
-    until it settles.
+    until it runs for longer than they grow to.
     """
 
     def __init__(self, name: str, command: Sequence[str]) -> None:
         self.name = name
         self._command = command
         self._process: subprocess.Popen[bytes] | None = None
-        self._settled = False
+        self._served = False
+        self._pipe = -1
         self._started_at = 0.0
         self._start_at = 0.0
         self._wait_s = FIRST_WAIT_S
@@ -45,16 +45,15 @@ class Child:
         now = time.monotonic()
         if self._process is None:
             if now >= self._start_at:
-                environment = os.environ | with_parent()
-                self._process = subprocess.Popen(self._command, stdin=subprocess.DEVNULL, env=environment)
+                self._process, self._pipe = self._started()
                 self._started_at = now
             return
-        lasted_s = now - self._started_at
-        if lasted_s > SETTLED_AFTER_S:
-            self._settled, self._wait_s = True, FIRST_WAIT_S
+        if now - self._started_at > LONGEST_WAIT_S:
+            self._wait_s = FIRST_WAIT_S
         code = self._process.poll()
         if code is not None:
-            self._process = None
+            self._served = self._served or _has_line(self._pipe)
+            self._forget()
             self._ended(code, now)
 
     def end(self) -> None:
@@ -72,15 +71,37 @@ class Child:
             log.error("the %s did not end in %g s and was killed", self.name, END_LIMIT_S)
             self._process.kill()
             self._process.wait()
+        self._forget()
+
+    def _started(self) -> tuple[subprocess.Popen[bytes], int]:
+        """Start the process; return it, and the pipe in which it reports that it works."""
+        reading, writing = os.pipe()
+        os.set_blocking(reading, False)
+        environment = os.environ | with_parent() | {SERVING: str(writing)}
+        try:
+            process = subprocess.Popen(self._command, stdin=subprocess.DEVNULL, env=environment, pass_fds=[writing])
+        finally:
+            os.close(writing)
+        return process, reading
+
+    def _forget(self) -> None:
+        os.close(self._pipe)
         self._process = None
 
     def _ended(self, code: int, now: float) -> None:
-        if code > 0 and not self._settled:
+        if code > 0 and not self._served:
             raise BodyschemaError(f"the {self.name} could not start (exit code {code}); its message is above")
         how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
         log.error("the %s %s; starting it again in %g s", self.name, how, self._wait_s)
         self._start_at = now + self._wait_s
         self._wait_s = min(2 * self._wait_s, LONGEST_WAIT_S)
+
+
+def _has_line(pipe: int) -> bool:
+    try:
+        return bool(os.read(pipe, 1))
+    except BlockingIOError:  # a child of the process keeps it open
+        return False
 
 
 class Supervisor:

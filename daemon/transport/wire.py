@@ -367,7 +367,7 @@ def joint_angles(request: JointsRequest, joints: tuple[str, ...]) -> FloatArray:
     import numpy as np
 
     q = np.array(joint_rows(request, joints), dtype=np.float64)
-    _require_angles(q, joints, lambda row: f"row {row} of q")
+    _require_angles(q, joints, lambda row: _row_named(request, row))
     return q
 
 
@@ -379,8 +379,7 @@ def joint_rows(request: JointsRequest, joints: tuple[str, ...]) -> list[list[flo
     """
     if not request.q:
         raise RequestError("q is empty; send one vector of joint angles or a list of them")
-    one_vector = not any(isinstance(entry, list) for entry in request.q)
-    rows = [request.q] if one_vector else request.q
+    rows = [request.q] if _is_one_vector(request) else request.q
     if len(rows) > LARGEST_BATCH:
         raise RequestError(f"q has {len(rows)} rows; send at most {LARGEST_BATCH} at once")
     checked: list[list[float]] = []
@@ -388,10 +387,19 @@ def joint_rows(request: JointsRequest, joints: tuple[str, ...]) -> list[list[flo
         if not isinstance(row, list) or len(row) != len(joints):
             length = len(row) if isinstance(row, list) else 1
             raise RequestError(
-                f"row {number} of q has {length} numbers; this robot has {len(joints)} joints: {', '.join(joints)}"
+                f"{_row_named(request, number)} has {length} numbers; this robot has {len(joints)} joints: "
+                f"{', '.join(joints)}"
             )
         checked.append(cast("list[float]", row))
     return checked
+
+
+def _is_one_vector(request: JointsRequest) -> bool:
+    return not any(isinstance(entry, list) for entry in request.q)
+
+
+def _row_named(request: JointsRequest, row: int) -> str:
+    return "q" if _is_one_vector(request) else f"row {row} of q"
 
 
 def _require_angles(q: FloatArray, joints: tuple[str, ...], named: Callable[[int], str]) -> None:

@@ -20,7 +20,8 @@ int main(int argc, char** argv) {
     for (std::string word; words >> word;) {
       char* end;
       readings.push_back(std::strtod(word.c_str(), &end));
-      if (*end || word.find_first_of("xX(") != word.npos)  // 0x10, nan(1)
+      const bool all = end == word.c_str() + word.size();
+      if (!all || word.find_first_of("xX(") != word.npos)  // 0x10, nan(1)
         throw std::invalid_argument("not a number: " + word);
     }
     if (readings.empty()) continue;

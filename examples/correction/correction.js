@@ -62,6 +62,8 @@ if (require.main === module) {
     if (!/^[+-]?((\d+\.?\d*|\.\d+)(e[+-]?\d+)?|nan|inf|infinity)$/i.test(word)) throw Error("not a number: " + word);
     return Number(word);
   };
-  for (const line of fs.readFileSync(0, "utf8").split("\n").filter((each) => each.trim()))
-    console.log(Object.values(correction.read(line.match(/[^\s,]+/g).map(number))).flat().join(" "));
+  for (const line of fs.readFileSync(0, "utf8").split("\n")) {
+    const words = line.match(/[^ \t\r\v\f,]+/g);
+    if (words) console.log(Object.values(correction.read(words.map(number))).flat().join(" "));
+  }
 }

@@ -78,7 +78,7 @@ STEPS = ADD, ADD_THREE, WAVE, MEMORY, TORQUE, SIDE, INWARDS, MOTION + ROW, None,
 if __name__ == "__main__":
     with open(sys.argv[1], encoding="utf-8") as stream:
         correction = Correction(stream.read())
-    for line in filter(str.strip, sys.stdin):
-        if "_" in line or not line.isascii():  # Python alone reads 1_000, and digits of other scripts
+    for line in (each for each in sys.stdin if each.strip(" \t\r\n\v\f,")):
+        if set("_\x1c\x1d\x1e\x1f") & set(line) or not line.isascii():  # Python alone reads 1_000, and other scripts
             raise ValueError(f"not numbers: {line}")
         print(*(x for part in correction.read(map(float, line.replace(",", " ").split())) for x in part))

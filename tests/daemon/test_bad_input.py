@@ -187,8 +187,8 @@ def test_a_sampler_of_an_unreadable_recording_leaves_no_store(robot) -> None:
 @pytest.mark.parametrize(
     ("values", "stdin", "said"),
     [
-        (["0.1"], "", "row 0 of q has 1 numbers; this robot has 2 joints: waist, shoulder"),
-        (["0.1", "nan"], "", "row 0 of q is not finite at joint 'shoulder'"),
+        (["0.1"], "", "q has 1 numbers; this robot has 2 joints: waist, shoulder"),
+        (["0.1", "nan"], "", "q is not finite at joint 'shoulder'"),
         ([], "", "no joint angles, and standard input is empty; give 2 (waist, shoulder)"),
         ([], "0.1 0.2", "standard input is not a JSON list of 2 numbers (waist, shoulder), or a list of such lists"),
         ([], "[[0.1, 0.2], [0.3]]", "row 1 of q has 1 numbers; this robot has 2 joints: waist, shoulder"),

@@ -29,9 +29,22 @@ from bodyschema.learning.nominal import NominalModel
 from bodyschema.learning.online_learner import OnlineLearner
 from bodyschema.learning.solvers.solver import DirectSolver
 from bodyschema.recordings.recording import Recording
+from bodyschema.robot.description import RobotDescription
 from kbmaps import ChainParameters, ChainTolerances, RigidChain
 
 REAL_DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+SO101 = Path(__file__).resolve().parents[2] / "examples" / "so101"
+SO101_ROBOT = """[robot]
+name = "so101"
+urdf = "so101.urdf"
+joints = ["shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll"]
+marker_link = "gripper_frame_link"
+marker_xyz = [0.012, -0.015, 0.008]
+[camera]
+parent_link = "base_link"
+xyz = [0.55, -0.45, 0.40]
+rpy = [-1.9, 0.1, 0.7]
+"""
 JOINTS = tuple(f"q{k}" for k in range(1, 7))
 
 
@@ -523,3 +536,20 @@ def test_the_live_learner_waits_for_as_many_pairs_as_decide() -> None:
     assert findings.doubts == ()
     findings.renew()
     assert "q3 counts the other way" in findings.doubts[0]
+
+
+def test_a_sign_that_fits_better_by_chance_is_mentioned(tmp_path: Path) -> None:
+    for file in ("so101.urdf", "poses.csv"):
+        (tmp_path / file).write_bytes((SO101 / file).read_bytes())
+    (tmp_path / "robot.toml").write_text(SO101_ROBOT)
+    known = RobotDescription.load(tmp_path / "robot.toml")
+    parameters, rng = ChainParameters(known.chain), np.random.default_rng(3)
+    made = ChainTolerances(axes=0.01, points=0.003, zeros=0.05, tool=0.02, base_rotation=0.0, base_translation=0.0)
+    change = rng.normal(size=parameters.size) * parameters.standard_deviations(made)
+    columns = np.genfromtxt(tmp_path / "poses.csv", delimiter=",", names=True)
+    q = np.stack([columns[joint] for joint in known.joints], axis=1)[:100] * (1.0, 1.0, 1.0, 0.7, 0.25)
+    x = parameters.positions(change, q) + rng.normal(0.0, 5e-4, (len(q), 3))
+    found = plausibility(known, q * (1.0, 1.0, 1.0, 1.0, -1.0), x)
+    assert found.refusal is None
+    assert "perhaps wrist_roll counts the other way" in found.warnings[0]
+    assert "more probable. Check it on the arm" in found.warnings[0]

@@ -98,11 +98,22 @@ def test_a_child_that_refuses_to_start_ends_the_others(tmp_path) -> None:
     assert all(map(gone, started(tmp_path / "pids")))
 
 
-def test_a_child_that_fails_after_it_had_settled_is_started_again(tmp_path, monkeypatch, supervise) -> None:
-    monkeypatch.setattr("bodyschema.daemon.service.supervise.SETTLED_AFTER_S", 0.0)
-    code = WAITING.replace("signal.pause()", "sys.stdin.read(); __import__('time').sleep(0.3); raise SystemExit(1)")
-    supervise(child(code, tmp_path / "pids"))
+SERVING_THEN_FAILING = (
+    "from bodyschema.daemon.service.signals import tell_parent_serving; tell_parent_serving(); "
+    + WAITING.replace("signal.pause()", "raise SystemExit(1)")
+)
+
+
+def test_a_child_that_fails_after_it_served_is_started_again(tmp_path, supervise) -> None:
+    supervise(child(SERVING_THEN_FAILING, tmp_path / "pids"))
     wait_until(lambda: len(started(tmp_path / "pids")) == 2)
+
+
+def test_a_child_that_refuses_after_minutes_ends_the_others(monkeypatch) -> None:
+    minutes = iter(range(0, 6000, 60))
+    monkeypatch.setattr("bodyschema.daemon.service.supervise.time.monotonic", lambda: float(next(minutes)))
+    with pytest.raises(BodyschemaError, match=r"could not start \(exit code 1\)"):
+        Supervisor([child("raise SystemExit(1)")]).run()
 
 
 def test_the_command_run_ends_both_processes_on_sigterm(tmp_path, free_endpoint) -> None:

@@ -146,11 +146,11 @@ def test_one_vector_is_a_batch_of_one() -> None:
     [
         ([], "q is empty"),
         ([[]], "row 0 of q has 0 numbers; this robot has 3 joints: waist, shoulder, elbow"),
-        ([1.0, 2.0], "row 0 of q has 2 numbers"),
+        ([1.0, 2.0], "^q has 2 numbers"),
         ([[1, 2, 3], [1, 2]], "row 1 of q has 2 numbers"),
         ([[1, 2, 3], 4.0], "row 1 of q has 1 numbers"),
         ([[0, 0, 0], [0, float("nan"), 0]], "row 1 of q is not finite at joint 'shoulder'"),
-        ([0, 1e308, 0], "row 0 of q is 1e\\+308 at joint 'shoulder'; angles are in radians"),
+        ([0, 1e308, 0], "^q is 1e\\+308 at joint 'shoulder'; angles are in radians"),
         ([[0.0] * 3] * (LARGEST_BATCH + 1), f"send at most {LARGEST_BATCH} at once"),
     ],
 )

@@ -124,13 +124,13 @@ def test_a_byte_order_mark_is_no_mistake(tmp_path) -> None:
 
 
 def test_a_urdf_that_is_not_there_is_told_with_the_key_to_mend(tmp_path) -> None:
-    with pytest.raises(RobotError, match=r"arm.urdf: cannot read the URDF: No such file.*Fix \[robot\] urdf"):
+    with pytest.raises(RobotError, match=r"arm.urdf: cannot read.*No such file.*by robot.urdf in robot.toml, line 3$"):
         load(tmp_path, urdf=None)
 
 
 def test_a_folder_in_the_place_of_the_urdf_is_told(tmp_path) -> None:
     (tmp_path / "arm.urdf").mkdir()
-    with pytest.raises(RobotError, match=r"arm.urdf: cannot read the URDF: Is a directory.*Fix \[robot\] urdf"):
+    with pytest.raises(RobotError, match=r"cannot read the URDF: Is a directory.*by robot.urdf in robot.toml, line 3$"):
         load(tmp_path, urdf=None)
 
 
@@ -157,6 +157,8 @@ def test_a_folder_in_the_place_of_the_urdf_is_told(tmp_path) -> None:
         ('<parent link="base"/>', "", ", line 3: joint 'waist' names no parent link. Write <parent link=\"...\"/>"),
         ('<link name="base"/>', "<link/>", ", line 2: a <link> has no name"),
         ('name="tip"/>', 'name="hand"/>', ", line 2: two links have the same name, 'hand'"),
+        ('upper="3"', 'upper="1e308"', ", line 5: <limit> of joint 'waist' lets it turn by 1e+308 rad. Give radians"),
+        ('xyz="0.3 0 0"', 'xyz="0.3 0 0" rpy="0 1e9 0"', "of joint 'shoulder' is turned by 1e+09 rad. Give radians"),
         ('lower="-3"', 'lower="4"', "joint 'waist' has its lower limit above its upper one. Swap them"),
         ('<axis xyz="0 0 1"/>', '<mimic joint="shoulder"/>', "joint 'waist' mimics another joint. Replace it"),
     ],

@@ -29,7 +29,8 @@ MORE_MISTAKES = [
     (
         'urdf = "desk_arm.urdf"',
         'urdf = "desk_arm.xacro"',
-        "desk_arm.xacro: cannot read the URDF: No such file or directory. Fix [robot] urdf, or --urdf",
+        "desk_arm.xacro: cannot read the URDF: No such file or directory. Fix [robot] urdf, or --urdf. "
+        "It is named by robot.urdf in robot.toml, line 4",
     ),
     (
         'marker_link = "gripper"',
