@@ -18,7 +18,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import get_lapack_funcs
+from scipy.linalg import get_blas_funcs, get_lapack_funcs
 
 from bodyschema.diagnosis.fit.background import MOST, SPREAD, Scales
 from bodyschema.diagnosis.fit.fit import Fit, solved
@@ -55,7 +55,8 @@ _FOLLOWED = 0.1
 
 _LOG_SMALLEST, _LOG_MOST, _SCALES = math.log(_SMALLEST), math.log(MOST), len(Scales())
 
-dpotrf, dpotri, dpotrs, dtrtri = get_lapack_funcs(("potrf", "potri", "potrs", "trtri"), dtype=np.float64)
+dpotrf, dpotri, dpotrs = get_lapack_funcs(("potrf", "potri", "potrs"), dtype=np.float64)
+(dtrsm,) = get_blas_funcs(("trsm",), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -334,9 +335,11 @@ class Sets:
         logs = np.log(near.scales if near else Scales())
         sigma = near.sigma if near else self._noise
         members, spent = (group == np.arange(_SCALES)[:, None]).astype(np.float64), np.zeros(_SCALES)
+        unit = np.eye(len(columns), order="F")
         for done in range(_ROUNDS if near is None else _ROUNDS_NEAR):
             factor, variances, amounts = self._solved(inner, toward, group, logs, sigma)
-            told = 1.0 - np.square(np.tril(dtrtri(factor, lower=True)[0])).sum(axis=0) / variances
+            inverse = dtrsm(1.0, factor, unit, lower=True)
+            told = 1.0 - np.einsum("ij,ij->j", inverse, inverse) / variances
             # Update from a scale's tolerances and its prior (MacKay 1992, equation 4.10).
             spent, squares = members @ told, members @ (np.square(amounts) / variances)
             steps = (squares - spent - logs / SPREAD**2) / (2.0 * np.maximum(spent, 0.5) + 1.0 / SPREAD**2)
