@@ -62,7 +62,7 @@ class Blocks:
         """Return sums (blocks, ...) of values (n, ...)."""
         columns = values.reshape(len(values), -1).T
         sums = [np.bincount(self.of_row, column, self.count) for column in columns]
-        return np.stack(sums, axis=1).reshape(self.count, *values.shape[1:])
+        return np.array(sums, dtype=np.float64).T.reshape(self.count, *values.shape[1:])
 
 
 def held_out_errors(fit: Fit, blocks: Blocks) -> FloatArray:
