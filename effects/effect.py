@@ -139,7 +139,9 @@ class Effect:
 
     def with_values(self, values: FloatArray) -> Effect:
         """Return the same effect with other values (p,)."""
-        return replace(self, values=frozen_array(values))
+        # Several times as fast as `replace`.
+        frozen = frozen_array(values)
+        return Effect(self.kind, self.where, self.source, frozen, self.prismatic, self.ordinal, self.free)
 
     def freeing(self, free: tuple[int, ...] | None) -> Effect:
         """Return the same effect with these amounts free, all for None, and the others nominal."""

@@ -13,10 +13,9 @@ from bodyschema.diagnosis.fit.background import Background
 from bodyschema.diagnosis.fit.fit import Fit, amount_columns, solved
 from bodyschema.diagnosis.search.held_out import Blocks, held_out_errors
 from bodyschema.diagnosis.unnamed.smooth import SmoothModel
-from bodyschema.effects import Motion
+from bodyschema.effects import Effect, Motion, Simulated
+from bodyschema.effects.motion import crossed
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.robot.urdf import inverse
-from kbmaps.rotations import rotation_vectors
 
 # Number of long blocks of time, each of which is left out once. In short ones a walk stays near where it was.
 _PARTS = 10
@@ -24,8 +23,6 @@ _PARTS = 10
 _SURELY = 0.95
 # Number of new poses.
 _POSES = 400
-# Part of 1-sigma by which a numerical derivative steps: errors beyond first order stay under 1e-3 of it.
-_SMALL = 1e-3
 
 
 def stored(candidates: Sequence[Fit], markers: NDArray[np.bool_]) -> Fit:
@@ -86,7 +83,8 @@ class _Elsewhere:
             change = solved(normal - rows.T @ rows, gradient - rows.T @ fit.left[own].ravel())
             errors[own] -= here[own] @ change
             changes.append(change)
-        moved = _columns(fit, _new_poses(fit.observations.motion)) @ np.transpose(changes - np.mean(changes, axis=0))
+        elsewhere = _columns(fit, fit.settled_simulation.run(_new_poses(fit.observations.motion)))
+        moved = elsewhere @ np.transpose(changes - np.mean(changes, axis=0))
         variance = (1.0 - 1.0 / len(changes)) * float(np.square(moved).sum(axis=(1, 2)).mean())
         return cls(fit, _sums(errors, markers), variance)
 
@@ -107,25 +105,34 @@ def predicted_pose_covariance(fit: Fit) -> FloatArray | None:
         return None
     motion = fit.observations.motion
     motion = motion.some(np.arange(0, len(motion), -(-len(motion) // _POSES)))
-    here, covariance = _marker_poses(fit, np.zeros(len(fit.covariance)), motion), np.zeros((6, 6))
-    shares, directions = np.linalg.eigh(fit.covariance)
-    for step in (directions * np.sqrt(np.maximum(shares, 0.0))).T:
-        poses = _marker_poses(fit, _SMALL * step, motion)
-        turned = rotation_vectors(poses[:, :3, :3] @ here[:, :3, :3].swapaxes(1, 2))
-        moved = np.concatenate([poses[:, :3, 3] - here[:, :3, 3], turned], axis=1) / _SMALL
-        covariance += moved.T @ moved / len(moved)
-    return covariance
+    simulation = fit.settled_simulation
+    own = [effect for effect in simulation.effects if _is_of_pose(effect)]
+    arm = replace(simulation, effects=tuple(own), residual=None)
+    # The marker, and points 1 m from it along the axes of its link, which turn about it.
+    beside = [Effect.at(arm.robot, "tool_offset", values=axis) for axis in np.eye(3)]
+    marker, *points = (arm.with_effects([*own, *more]).run(motion) for more in ([], *([one] for one in beside)))
+    moved = _pose_columns(fit, marker)
+    turned = 0.5 * sum(
+        crossed((point.measured - marker.measured)[:, :, None], _pose_columns(fit, point) - moved) for point in points
+    )
+    columns = np.concatenate([moved, turned], axis=1)
+    return np.tensordot(columns @ fit.covariance, columns, axes=((0, 2), (0, 2))) / len(motion)
 
 
-def _marker_poses(fit: Fit, step: FloatArray, motion: Motion) -> FloatArray:
-    """Return the marker's poses (n, 4, 4) in the measurement frame after a step of the fit."""
-    simulation, tolerated = fit.moved(step)
-    if fit.background.scales is not None:
-        simulation = simulation.with_background(fit.background.with_amounts(tolerated))
-    run = simulation.run(motion)
-    poses = inverse(simulation.camera_pose) @ run.frames[:, -1]
-    poses[:, :3, 3] = run.x_placed
-    return poses
+def _is_of_pose(effect: Effect) -> bool:
+    """Return True if an effect moves the arm, the marker or the camera as it was set up, not what is reported."""
+    if effect.kind.stage == "camera":
+        return effect.pose is not None and not effect.kind.begins
+    return not effect.kind.drifts
+
+
+def _pose_columns(fit: Fit, run: Simulated) -> FloatArray:
+    """Return derivatives (n, 3, p) [m] of a run, in the order of `Fit.covariance`; of what it lacks they are 0."""
+    columns = [_columns(fit, run), *(run.by_shape(effect) for effect in fit.causes if effect.shapes)]
+    numbers = [(effect, len(effect.amounts)) for effect in fit.simulation.effects]
+    numbers += [(effect, len(effect.shapes)) for effect in fit.causes]
+    counted = np.concatenate([np.full(count, _is_of_pose(effect)) for effect, count in numbers])
+    return np.concatenate(columns, axis=2) * np.insert(counted, fit.amounts, np.ones(len(fit.tolerated), dtype=bool))
 
 
 def _long_blocks(rows: int) -> Blocks:
@@ -146,8 +153,7 @@ def _new_poses(motion: Motion) -> Motion:
     return replace(motion, q=q, t=None if motion.t is None else motion.t[rows], segment=motion.segment[rows])
 
 
-def _columns(fit: Fit, motion: Motion) -> FloatArray:
-    """Return derivatives (n, 3, p) [m] of the predictions on another motion, in the order of `run_columns`."""
-    run = fit.settled().simulation.run(motion)
+def _columns(fit: Fit, run: Simulated) -> FloatArray:
+    """Return derivatives (n, 3, p) [m] of a run on another motion, in the order of `run_columns`."""
     background = Background(run, fit.observations.whitening, fit.background.scales)
     return np.concatenate([amount_columns(run, fit.simulation.effects), background.columns], axis=2)

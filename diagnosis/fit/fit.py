@@ -210,7 +210,7 @@ class Fit:
         return self.background.white * np.repeat(self.root_weights, 3, axis=0)
 
     @property
-    def _amounts(self) -> int:
+    def amounts(self) -> int:
         """Number of amounts of all effects."""
         return sum(len(effect.amounts) for effect in self.simulation.effects)
 
@@ -272,7 +272,7 @@ class Fit:
     def orthogonal(self) -> FloatArray:
         """Orthonormal basis (n, 3, r) of the directions that the amounts of effects can change, `unshared`."""
         n = len(self.left)
-        flat = self.unshared(self.effect_columns.reshape(3 * n, self._amounts))
+        flat = self.unshared(self.effect_columns.reshape(3 * n, self.amounts))
         scales = np.linalg.norm(flat, axis=0)
         q, r = np.linalg.qr(flat / np.where(scales > 0.0, scales, 1.0))
         left, values, _ = np.linalg.svd(r)
@@ -326,7 +326,7 @@ class Fit:
         own = [effect.values[effect.amounts] for effect in self.simulation.effects]
         now = np.concatenate([*own, self.tolerated])
         now = np.append(now, np.zeros(len(precision) - len(now)))
-        first = self._amounts
+        first = self.amounts
         groups = np.full(len(precision), -1)
         groups[first : first + len(self.tolerated)] = self.background.group
         units = 1.0 / np.sqrt(np.diag(products) + precision)
@@ -437,7 +437,7 @@ class Fit:
 
     def places(self, cause: Effect) -> list[int]:
         """Return the indices in `covariance` of a cause's amounts, then of its periods and time constants."""
-        amounts, shapes = 0, self._amounts + len(self.tolerated)
+        amounts, shapes = 0, self.amounts + len(self.tolerated)
         for index, effect in enumerate(self.simulation.effects):
             own = effect.shapes if index >= self.nuisances else []
             if effect is cause:
@@ -448,7 +448,7 @@ class Fit:
     def moved(self, step: FloatArray) -> tuple[Simulation, FloatArray]:
         """Return the simulation and the tolerances after a step (p + s,)."""
         effects, first = [], 0
-        shape = self._amounts + len(self.tolerated)
+        shape = self.amounts + len(self.tolerated)
         for index, effect in enumerate(self.simulation.effects):
             values = effect.values.copy()
             values[effect.amounts] += step[first : first + len(effect.amounts)]
@@ -471,7 +471,7 @@ class Fit:
 
     def over(self, observations: Observations) -> Fit:
         """Refit to observations of another motion of the same arm."""
-        return improved(self._about(self._settled_simulation, self.background.scales, observations))
+        return improved(self._about(self.settled_simulation, self.background.scales, observations))
 
     def _about(self, simulation: Simulation, scales: Scales | None, observations: Observations | None = None) -> Fit:
         """Evaluate a simulation with tolerances that are linearised about it, without fitting it."""
@@ -492,7 +492,7 @@ class Fit:
         Args:
             also: further tolerances; those among the causes are no longer findings.
         """
-        simulation = self._settled_simulation
+        simulation = self.settled_simulation
         if also:
             stays = [effect for effect in simulation.effects if effect not in also]
             moved = [effect.one_more(-2 - k) for k, effect in enumerate(also)]
@@ -503,10 +503,11 @@ class Fit:
         """Return the same fit with its tolerances moved into the simulation."""
         if self.background.scales is None:
             return self
-        return self._about(self._settled_simulation, self.background.scales)
+        return self._about(self.settled_simulation, self.background.scales)
 
     @property
-    def _settled_simulation(self) -> Simulation:
+    def settled_simulation(self) -> Simulation:
+        """The simulation with the tolerances moved into it."""
         if self.background.scales is None:
             return self.simulation
         return self.simulation.with_background(self.background.with_amounts(self.tolerated))
@@ -520,7 +521,7 @@ class Fit:
         """
         if self.background.scales is None:
             return self.simulation
-        return improved(self._about(self._settled_simulation, None)).simulation
+        return improved(self._about(self.settled_simulation, None)).simulation
 
     def untolerated(self) -> Fit:
         """Refit without any tolerance."""

@@ -92,12 +92,12 @@ class Tangent:
 
 
 def solved(normal: FloatArray, gradient: FloatArray) -> FloatArray:
-    """Return the solution (p,) of normal equations, with columns scaled to equal length; the shortest of many."""
+    """Return the solution (p, ...) of normal equations, with columns scaled to equal length; the shortest of many."""
     if not len(gradient):
         return gradient
     scales = np.sqrt(np.maximum(np.diag(normal), 1e-300))
-    scaled, wanted = normal / np.outer(scales, scales), gradient / scales
+    scaled, wanted = normal / np.outer(scales, scales), (gradient.T / scales).T
     factor, failed = dpotrf(scaled, lower=True)
     if not failed and np.square(np.diag(factor)).min(initial=1.0) > _COLLINEAR:
-        return dpotrs(factor, wanted, lower=True)[0] / scales
-    return np.linalg.lstsq(scaled, wanted, rcond=1e-12)[0] / scales
+        return (dpotrs(factor, wanted, lower=True)[0].T / scales).T
+    return (np.linalg.lstsq(scaled, wanted, rcond=1e-12)[0].T / scales).T

@@ -7,7 +7,8 @@ of the other blocks and g the gradient of the block's own likelihood, the amount
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.special import fdtrc
@@ -15,7 +16,6 @@ from scipy.special import fdtrc
 from bodyschema.diagnosis.fit.fit import LARGEST, Fit, solved
 from bodyschema.diagnosis.fit.observations import IntArray
 from bodyschema.diagnosis.fit.scatter import instruments
-from bodyschema.effects import Effect
 from bodyschema.interfaces.records import FloatArray
 
 from .scan import Candidate
@@ -60,9 +60,9 @@ class Blocks:
 
     def sums(self, values: FloatArray) -> FloatArray:
         """Return sums (blocks, ...) of values (n, ...)."""
-        sums = np.zeros((self.count, *values.shape[1:]))
-        np.add.at(sums, self.of_row, values)
-        return sums
+        columns = values.reshape(len(values), -1).T
+        sums = [np.bincount(self.of_row, column, self.count) for column in columns]
+        return np.array(sums, dtype=np.float64).T.reshape(self.count, *values.shape[1:])
 
 
 def held_out_errors(fit: Fit, blocks: Blocks) -> FloatArray:
@@ -71,7 +71,7 @@ def held_out_errors(fit: Fit, blocks: Blocks) -> FloatArray:
     if not len(fit.precision):
         return errors
     precision = np.diag(fit.precision) * fit.noise.sigma**2
-    run_columns, products = fit.run_columns, _Folds.of(fit, fit.columns, blocks).products
+    run_columns, products = fit.run_columns, _Products.of(fit, fit.columns, blocks)
     inners, towards = products.inner.sum(axis=0), products.toward.sum(axis=0)
     for fold, (inner, toward) in enumerate(zip(products.inner, products.toward, strict=True)):
         own = blocks.fold == fold
@@ -118,23 +118,24 @@ class Added:
 
 def added(fit: Fit, candidates: Sequence[Candidate], blocks: Blocks) -> list[Added]:
     """Return the first-order gain of each candidate on top of a fit."""
-    folds = _Folds.of(fit, fit.columns, blocks)
-    before = folds.products.missed(fit.precision)
-    return [_added(fit, candidate.effect, folds, before, blocks) for candidate in candidates]
-
-
-def _added(fit: Fit, effect: Effect, folds: _Folds, before: float, blocks: Blocks) -> Added:
-    own = instruments(fit, effect)
-    usual = np.array([effect.parameters[j].usual for j in effect.amounts])
-    precision = [fit.precision, 1.0 / np.square(LARGEST * usual)]
-    after = folds.beside(own).missed(np.concatenate(precision))
-    gain = 1.0 - after / before if before > 0.0 else 0.0
-    return Added(100.0 * gain, block_p_value(fit, own, blocks))
+    effects = [candidate.effect for candidate in candidates]
+    fresh = np.concatenate([np.empty((*fit.left.shape, 0)), *(instruments(fit, one) for one in effects)], axis=2)
+    ends = np.cumsum([0, *(len(one.amounts) for one in effects)])
+    groups = [np.arange(first, end) for first, end in pairwise(ends)]
+    usual = [LARGEST * one.parameters[j].usual for one in effects for j in one.amounts]
+    products = _Products.of(fit, np.concatenate([fit.columns, fresh], axis=2), blocks)
+    precision = np.append(fit.precision, 1.0 / np.square(np.array(usual)))
+    before, *after = products.missed(precision, len(fit.precision), [np.arange(0), *groups]).tolist()
+    beside = _beside(fit, fresh)
+    return [
+        Added(100.0 * (1.0 - missed / before if before > 0.0 else 0.0), _p_value(fit, beside[:, :, own], blocks))
+        for missed, own in zip(after, groups, strict=True)
+    ]
 
 
 def held_out_square(fit: Fit, columns: FloatArray, precision: FloatArray, blocks: Blocks) -> float:
     """Return the sum of squared held-out residuals of a fit after adding columns (n, 3, p)."""
-    return _Folds.of(fit, columns, blocks).products.missed(precision)
+    return float(_Products.of(fit, columns, blocks).missed(precision, len(precision), [np.arange(0)])[0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,67 +153,61 @@ class _Products:
     square: float
     variance: float
 
-    def missed(self, precision: FloatArray) -> float:
-        """Return the sum of squared held-out residuals, with prior precision (p,) of the amounts."""
-        square = self.square
-        if not len(precision):
-            return square
-        inners, towards = self.inner.sum(axis=0), self.toward.sum(axis=0)
-        for inner, toward in zip(self.inner, self.toward, strict=True):
-            step = solved(inners - inner + np.diag(precision) * self.variance, towards - toward)
-            square += float(step @ inner @ step - 2.0 * step @ toward)
-        return square
-
-
-@dataclass(frozen=True, eq=False)
-class _Folds:
-    """Columns and residuals of a fit, fold by fold.
-
-    Attributes:
-        rows: for each fold, its row numbers, the columns there (3 m, p), and the residuals (3 m,).
-        products: their products.
-    """
-
-    rows: tuple[tuple[IntArray, FloatArray, FloatArray], ...]
-    products: _Products
-
     @classmethod
-    def of(cls, fit: Fit, columns: FloatArray, blocks: Blocks) -> _Folds:
-        """Split columns (n, 3, p) and the residuals of a fit into folds."""
+    def of(cls, fit: Fit, columns: FloatArray, blocks: Blocks) -> _Products:
+        """Form the products of columns (n, 3, p)."""
         rows = []
         for fold in range(_FOLDS):
             own = np.flatnonzero(blocks.fold == fold)
-            rows.append((own, columns[own].reshape(3 * len(own), columns.shape[2]), fit.left[own].ravel()))
-        inner, toward = np.array([c.T @ c for _, c, _ in rows]), np.array([c.T @ left for _, c, left in rows])
-        square = float(np.square(fit.left).sum())
-        return cls(tuple(rows), _Products(inner, toward, square, fit.noise.sigma**2))
+            rows.append((columns[own].reshape(3 * len(own), columns.shape[2]), fit.left[own].ravel()))
+        inner, toward = np.array([c.T @ c for c, _ in rows]), np.array([c.T @ left for c, left in rows])
+        return cls(inner, toward, float(np.square(fit.left).sum()), fit.noise.sigma**2)
 
-    def beside(self, more: FloatArray) -> _Products:
-        """Return the products with more columns (n, 3, k) appended."""
-        p, k = self.products.inner.shape[1], more.shape[2]
-        inner, toward = np.empty((_FOLDS, p + k, p + k)), np.empty((_FOLDS, p + k))
-        inner[:, :p, :p], toward[:, :p] = self.products.inner, self.products.toward
-        for fold, (own, columns, left) in enumerate(self.rows):
-            fresh = more[own].reshape(3 * len(own), k)
-            inner[fold, p:, p:], toward[fold, p:] = fresh.T @ fresh, fresh.T @ left
-            inner[fold, :p, p:] = columns.T @ fresh
-            inner[fold, p:, :p] = inner[fold, :p, p:].T
-        return replace(self.products, inner=inner, toward=toward)
+    def missed(self, precision: FloatArray, first: int, groups: Sequence[IntArray]) -> FloatArray:
+        """Return sums (m,) of squared held-out residuals with the first columns and each of some groups of the others.
+
+        Args:
+            precision: prior precision of all amounts (p,).
+            groups: indices (k,) among the columns after the first ones.
+        """
+        squares = np.full(len(groups), self.square)
+        inners, towards = self.inner.sum(axis=0) + np.diag(precision) * self.variance, self.toward.sum(axis=0)
+        for inner, toward in zip(self.inner, self.toward, strict=True):
+            normal, wanted = inners - inner, towards - toward
+            across = normal[:first, first:]
+            # What the first columns follow of each of the others, and their own amounts.
+            followed = solved(normal[:first, :first], np.column_stack([across, wanted[:first]]))
+            others, alone = followed[:, :-1], followed[:, -1]
+            left, sought = normal[first:, first:] - across.T @ others, wanted[first:] - across.T @ alone
+            for k, own in enumerate(groups):
+                more = solved(left[np.ix_(own, own)], sought[own])
+                places = np.append(np.arange(first), first + own)
+                step = np.append(alone - others[:, own] @ more, more)
+                squares[k] += step @ (inner[np.ix_(places, places)] @ step - 2.0 * toward[places])
+        return squares
 
 
 def block_p_value(fit: Fit, columns: FloatArray, blocks: Blocks) -> float:
     """Return the p-value that columns (n, 3, k) explain nothing of the residuals, from the agreement of blocks.
 
     The noise of the scores comes from the blocks' own scores, with the columns fitted. So it is right where
-    neighbouring
-    rows are correlated, as when a joint stands still and is rounded in the same way again and again (Liang and Zeger
-    1986;
-    Hotelling's T² for few blocks).
+    neighbouring rows are correlated, as when a joint stands still and is rounded in the same way again and again (Liang
+    and Zeger 1986; Hotelling's T² for few blocks).
     """
-    basis, flat = fit.orthogonal.reshape(fit.left.size, -1), columns.reshape(fit.left.size, -1)
-    flat = fit.unshared(flat)
-    flat = flat - basis @ (basis.T @ flat)
-    beside, inner = flat.reshape(columns.shape), flat.T @ flat
+    return _p_value(fit, _beside(fit, columns), blocks)
+
+
+def _beside(fit: Fit, columns: FloatArray) -> FloatArray:
+    """Return what columns (n, 3, k) change beside a fit, `unshared`."""
+    flat = fit.unshared(columns.reshape(fit.left.size, -1))
+    basis = fit.orthogonal.reshape(fit.left.size, -1)
+    return (flat - basis @ (basis.T @ flat)).reshape(columns.shape)
+
+
+def _p_value(fit: Fit, beside: FloatArray, blocks: Blocks) -> float:
+    """Return the `block_p_value` of columns from what they change beside the fit (n, 3, k)."""
+    flat = beside.reshape(fit.left.size, -1)
+    inner = flat.T @ flat
     scales = np.sqrt(np.maximum(np.diag(inner), 1e-300))
     values, vectors = np.linalg.eigh(inner / np.outer(scales, scales))
     told = values > 1e-7

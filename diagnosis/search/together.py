@@ -18,7 +18,7 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import get_lapack_funcs
+from scipy.linalg import get_blas_funcs, get_lapack_funcs
 
 from bodyschema.diagnosis.fit.background import MOST, SPREAD, Scales
 from bodyschema.diagnosis.fit.fit import Fit, solved
@@ -55,7 +55,11 @@ _FOLLOWED = 0.1
 
 _LOG_SMALLEST, _LOG_MOST, _SCALES = math.log(_SMALLEST), math.log(MOST), len(Scales())
 
-dpotrf, dpotri, dpotrs, dtrtri = get_lapack_funcs(("potrf", "potri", "potrs", "trtri"), dtype=np.float64)
+dpotrf, dpotri, dpotrs = get_lapack_funcs(("potrf", "potri", "potrs"), dtype=np.float64)
+(dtrsm,) = get_blas_funcs(("trsm",), dtype=np.float64)
+
+# Factor (p, p) of a precision, prior variances (p,), and amounts (p,).
+_Solution = tuple[FloatArray, FloatArray, FloatArray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,8 +254,7 @@ class Sets:
         """Return the worth of each of some groups of numbers with scales and noise held fixed [nats]."""
         own = [np.searchsorted(here.columns, self._places_of(group)) for group in groups]
         squares, volumes = _in_groups(here.covariance, here.amounts, own)
-        fewer = np.array([self._cost(_without(here.chosen, group)) for group in groups])
-        return squares + volumes - (self._cost(here.chosen) - fewer)
+        return squares + volumes - self._costs_of(here.chosen, groups, are_in=True)
 
     def _cost(self, chosen: Sequence[int]) -> float:
         """Return the cost of naming the causes of a set [nats]."""
@@ -260,11 +263,11 @@ class Sets:
         for k in chosen:
             kind = self._kinds[k]
             if kind.in_parts:
-                numbers[self._keys[k]] += len(self._places[k])
+                numbers[self._keys[k]] += 1
                 continue
             total += self._trials[k] + (min(self._first, ANOTHER) if kind in kinds else self._first)
             kinds.add(kind)
-        return total + sum(self._first + math.log(ways_to_choose(n, self._numbers[key])) for key, n in numbers.items())
+        return total + sum(self._cost_of_numbers(key, count) for key, count in numbers.items())
 
     def _places_of(self, group: tuple[int, ...]) -> NDArray[np.intp]:
         """Return the columns of some candidates (p,)."""
@@ -298,26 +301,28 @@ class Sets:
         at[places] = np.arange(len(places))
         own = [at[self._places_of(group)] for group in open_groups]
         squares, volumes = _in_groups(inner, gradient, own)
-        worths = squares - volumes - self._costs_beside(here.chosen, open_groups)
+        worths = squares - volumes - self._costs_of(here.chosen, open_groups, are_in=False)
         best = np.argsort(worths)[::-1]
         return [open_groups[k] for k in best[here.worth + worths[best] > least - _COMES_NEAR].tolist()]
 
-    def _costs_beside(self, chosen: Sequence[int], groups: Sequence[tuple[int, ...]]) -> FloatArray:
-        """Return the cost of naming each of some groups in addition to a set [nats]."""
-        present = [self.effects[k] for k in chosen]
-        kinds = {effect.kind for effect in present if not effect.kind.in_parts}
-        numbers = Counter(effect.key for effect in present if effect.kind.in_parts)
+    def _costs_of(self, chosen: Sequence[int], groups: Sequence[tuple[int, ...]], *, are_in: bool) -> FloatArray:
+        """Return the part of each of some groups in the cost of naming a set [nats], or what it would add to it."""
+        kinds = Counter(self._kinds[k] for k in chosen if not self._kinds[k].in_parts)
+        numbers = Counter(self._keys[k] for k in chosen if self._kinds[k].in_parts)
         costs = []
         for group in groups:
-            effect = self.effects[group[0]]
-            if effect.kind.in_parts:
-                before, of = numbers[effect.key], self._numbers[effect.key]
-                known = self._first + math.log(ways_to_choose(before, of)) if before else 0.0
-                costs.append(self._first + math.log(ways_to_choose(before + len(group), of)) - known)
+            kind, key = self._kinds[group[0]], self._keys[group[0]]
+            if kind.in_parts:
+                before = numbers[key] - (len(group) if are_in else 0)
+                costs.append(self._cost_of_numbers(key, before + len(group)) - self._cost_of_numbers(key, before))
             else:
-                first = min(self._first, ANOTHER) if effect.kind in kinds else self._first
+                first = min(self._first, ANOTHER) if kinds[kind] > are_in else self._first
                 costs.append(self._trials[group[0]] + first)
         return np.array(costs)
+
+    def _cost_of_numbers(self, key: Key, count: int) -> float:
+        """Return the cost of naming some numbers of a cause [nats]."""
+        return self._first + math.log(ways_to_choose(count, self._numbers[key])) if count else 0.0
 
     def of(self, chosen: tuple[int, ...], near: Together | None = None) -> Together:
         """Fit the scales and the noise of a set of causes by maximum evidence; each set once, whatever is near."""
@@ -334,9 +339,11 @@ class Sets:
         logs = np.log(near.scales if near else Scales())
         sigma = near.sigma if near else self._noise
         members, spent = (group == np.arange(_SCALES)[:, None]).astype(np.float64), np.zeros(_SCALES)
+        unit = np.eye(len(columns), order="F")
         for done in range(_ROUNDS if near is None else _ROUNDS_NEAR):
-            factor, variances, amounts = self._solved(inner, toward, group, logs, sigma)
-            told = 1.0 - np.square(np.tril(dtrtri(factor, lower=True)[0])).sum(axis=0) / variances
+            factor, variances, amounts = solution = self._solved(inner, toward, group, logs, sigma)
+            inverse = dtrsm(1.0, factor, unit, lower=True)
+            told = 1.0 - np.einsum("ij,ij->j", inverse, inverse) / variances
             # Update from a scale's tolerances and its prior (MacKay 1992, equation 4.10).
             spent, squares = members @ told, members @ (np.square(amounts) / variances)
             steps = (squares - spent - logs / SPREAD**2) / (2.0 * np.maximum(spent, 0.5) + 1.0 / SPREAD**2)
@@ -350,26 +357,29 @@ class Sets:
                 break
             logs = moved
             sigma = max(sigma * math.exp(quieter), _QUIETEST * self._noise)
-        worth, factor, amounts = self._worth(inner, toward, group, logs, sigma)
+        else:
+            solution = self._solved(inner, toward, group, logs, sigma)
+        worth = self._evidence(solution, toward, sigma)
         scales = Scales(*np.exp(logs).tolist())
         worth -= scales.doubt + _volume(spent)
         if math.exp(logs[members.any(axis=1)].max()) < _MAY_BE_EXACT:
-            exact = self._worth(inner, toward, group, np.full(_SCALES, _LOG_SMALLEST), sigma)
-            if exact[0] > worth:
-                (worth, factor, amounts), scales = exact, Scales(*[_SMALLEST] * _SCALES)
+            exact = self._solved(inner, toward, group, np.full(_SCALES, _LOG_SMALLEST), sigma)
+            if (evidence := self._evidence(exact, toward, sigma)) > worth:
+                worth, solution, scales = evidence, exact, Scales(*[_SMALLEST] * _SCALES)
         worth -= self._cost(chosen)
+        factor, _, amounts = solution
         return Together(chosen, worth, scales, sigma, spent, amounts, factor, columns)
 
     def shown(self, here: Together) -> NDArray[np.bool_]:
         """Return True for each scale without whose tolerances the data would be much less probable (4,)."""
         inner, toward = self._inner[np.ix_(here.columns, here.columns)], self._toward[here.columns]
         group = self._group(here.columns)
-        whole = self._worth(inner, toward, group, np.log(here.scales), here.sigma)[0]
+        whole = self._worth(inner, toward, group, np.log(here.scales), here.sigma)
         without = []
         for g in range(_SCALES):
             logs = np.log(here.scales)
             logs[g] = _LOG_SMALLEST
-            without.append(self._worth(inner, toward, group, logs, here.sigma)[0])
+            without.append(self._worth(inner, toward, group, logs, here.sigma))
         return whole - np.array(without) > _SHOWN
 
     def largest(self, here: Together) -> FloatArray:
@@ -379,7 +389,7 @@ class Sets:
         for g in range(_SCALES):
             logs, best = np.log(here.scales), -np.inf
             while logs[g] < _LOG_MOST:
-                worth = self._worth(inner, toward, group, logs, here.sigma)[0]
+                worth = self._worth(inner, toward, group, logs, here.sigma)
                 best = max(best, worth)
                 if worth < best - _RULED_OUT:
                     break
@@ -393,19 +403,20 @@ class Sets:
         group[self._nuisances : self._nuisances + self._tolerances] = self._of_scale
         return group
 
-    def _worth(
-        self, inner: FloatArray, toward: FloatArray, group: np.ndarray, logs: FloatArray, sigma: float
-    ) -> tuple[float, FloatArray, FloatArray]:
-        """Return the evidence of scales and noise [nats], the factor of the precision, and the amounts (p,)."""
-        factor, variances, amounts = self._solved(inner, toward, group, logs, sigma)
+    def _worth(self, inner: FloatArray, toward: FloatArray, group: np.ndarray, logs: FloatArray, sigma: float) -> float:
+        """Return the evidence of scales and noise [nats]."""
+        return self._evidence(self._solved(inner, toward, group, logs, sigma), toward, sigma)
+
+    def _evidence(self, solution: _Solution, toward: FloatArray, sigma: float) -> float:
+        """Return the evidence of the scales and the noise of a solution [nats]."""
+        factor, variances, amounts = solution
         left = self._square - float(amounts @ toward)
         evidence = -0.5 * left / sigma**2 - self._rows * float(np.log(sigma))
-        evidence -= float(np.log(factor.diagonal()).sum()) + 0.5 * float(np.log(variances).sum())
-        return evidence, factor, amounts
+        return evidence - float(np.log(factor.diagonal()).sum()) - 0.5 * float(np.log(variances).sum())
 
     def _solved(
         self, inner: FloatArray, toward: FloatArray, group: np.ndarray, logs: FloatArray, sigma: float
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+    ) -> _Solution:
         """Return the factor of the precision, prior variances (p,) and amounts (p,), in units of `_units`."""
         # The last of the scales stands for columns that are no tolerances.
         variances = np.append(np.exp(2.0 * logs), 1.0)[group]

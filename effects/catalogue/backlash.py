@@ -101,7 +101,7 @@ def played(q: FloatArray, width: float) -> FloatArray:
     low, high, back = q - half, q + half, 1
     while back < len(q):
         earlier = low[:-back], high[:-back]
-        low[back:], high[back:] = (np.clip(one, low[back:], high[back:]) for one in earlier)
+        low[back:], high[back:] = (np.minimum(np.maximum(one, low[back:]), high[back:]) for one in earlier)
         back *= 2
     return np.clip(begun, low, high) - q
 

@@ -75,3 +75,11 @@ def test_covariance_of_predicted_poses_covers_the_truth() -> None:
 
 def test_where_nothing_was_fitted_the_covariance_of_predicted_poses_is_not_known() -> None:
     assert predicted_pose_covariance(found(RobotDescription.load(DESK_ARM), None, 0, ()).diagnosis.stored) is None
+
+
+def test_a_predicted_pose_turns_by_as_much_as_its_joint_is_unsure() -> None:
+    robot = RobotDescription.load(DESK_ARM)
+    fit = found(robot, None, 0, (Effect.at(robot, "joint_offset", robot.joints[1]),)).diagnosis.stored
+    cov = predicted_pose_covariance(fit)
+    assert cov is not None
+    np.testing.assert_allclose(np.trace(cov[3:, 3:]), fit.covariance[0, 0], rtol=1e-6)
