@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
-from bodyschema.calibration.plausibility.check import Plausibility
+from bodyschema.calibration.plausibility.verdict import Plausibility
 from bodyschema.calibration.rigid_chain import Calibration, Trusted
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.solvers.tolerance_selection import WORKMANSHIP

@@ -16,6 +16,7 @@ from kbmaps.chains.placement import Placements, place
 from kbmaps.rotations import rotation_vectors
 
 from .limits import MEASURED, SLIDES_M, TOOL_M, ZEROS_RAD, BoolArray
+from .verdict import THRESHOLDS, Plausibility, mm
 
 # The links are linearised about a fit with nominal links: two steps reach 0.1 % from a size that is 20 % off.
 _STEPS = 3
@@ -23,6 +24,20 @@ _STEPS = 3
 _NOISES = np.geomspace(0.01, 2.0, 16)
 # Rows farther off than this multiple of the median are outliers.
 _FAR = 5.0
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """When positions of another size are reported."""
+
+    # Off by this many times its own uncertainty. Right recordings of real and generated arms come to 4.0, and fit
+    # hardly better for it.
+    far: float = 5.0
+    # Smaller ones are warned of: a joint whose ratio is 2 % off looks like positions 2.4 % off.
+    other: float = 0.04
+
+
+_SETTINGS = _Settings()
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +60,33 @@ class Size:
         return abs(math.log(self.factor)) / self.log_sigma
 
 
-def size_of(chain: RigidChain, q: FloatArray, x: FloatArray, apart: list[int]) -> Size:
+def of_another_size(size: Size, spread: float, before: float, best: float) -> Plausibility | None:
+    """Return what to say of positions that are too large or too small for the arm; None if they are not.
+
+    Args:
+        size: the estimated size.
+        spread: of the positions [m].
+        before: distance of the pairs as they are [m].
+        best: the same, in the best reading of the columns.
+    """
+    far = size.sigmas > _SETTINGS.far and size.error < THRESHOLDS.named / 2 * spread
+    if not far or best < THRESHOLDS.as_good * size.error:
+        return None
+    factor, low, high = (size.factor * math.exp(k * size.log_sigma) for k in (0.0, -1.96, 1.96))
+    text = (
+        f"the positions are {factor:.3g} times as large as the arm makes them (95 %: {low:.4g} to {high:.4g}): "
+        f"divided by that, the pairs fit to {mm(size.error)}, and as they are to {mm(before)}"
+    )
+    remedy = (
+        "Compare with what was measured: the size of the printed tag or the ball in [vision], the squares of the "
+        "calibration board, the unit of the columns x, y, z. If these are right, the URDF is of an arm of another size"
+    )
+    if best > THRESHOLDS.much_better * size.error and abs(math.log(size.factor)) > _SETTINGS.other:
+        return Plausibility(f"it seems that {text}", remedy, misread=True)
+    return Plausibility(warnings=(f"perhaps {text}. {remedy}",))
+
+
+def size_of(chain: RigidChain, q: FloatArray, x: FloatArray, apart: list[int], exact_m: float) -> Size:
     """Estimate the size of positions x (n, 3) [m] at q (n, d) [rad, m].
 
     The links of an arm may be a little longer than nominal, by tolerances that the pairs show, but hardly all of them
@@ -53,6 +94,7 @@ def size_of(chain: RigidChain, q: FloatArray, x: FloatArray, apart: list[int]) -
 
     Args:
         apart: rows of poses far from each other. The errors of others are alike, and say nothing new.
+        exact_m: distances below this are not distinguished [m].
     """
     log, sigma = 0.0, math.inf
     for _ in range(_STEPS):
@@ -60,7 +102,7 @@ def size_of(chain: RigidChain, q: FloatArray, x: FloatArray, apart: list[int]) -
         step, sigma = _log_size(chain, q[apart], placed, x[apart] / math.exp(log))
         log += step
     error = float(_placed(chain, q, x / math.exp(log)).errors(MEASURED)[0])
-    return Size(math.exp(log), sigma, math.exp(log) * error)
+    return Size(math.exp(log), sigma, max(math.exp(log) * error, exact_m))
 
 
 def evidences(chain: RigidChain, readings: list[tuple[FloatArray, FloatArray, float]], apart: list[int]) -> FloatArray:

@@ -11,7 +11,9 @@ from dataclasses import replace
 import numpy as np
 
 from bodyschema.calibration.chain_figures import ChainFigures, is_told, no_surer_than_possible
-from bodyschema.calibration.plausibility.check import FEWEST_ROWS, ROWS, plausibility
+from bodyschema.calibration.plausibility.check import plausibility
+from bodyschema.calibration.plausibility.search import ROWS
+from bodyschema.calibration.plausibility.verdict import FEWEST_ROWS
 from bodyschema.daemon.transport.status import UNDECIDED, Change
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.learning.changes.record import JOINT, ChangeRecord, KindOfChange

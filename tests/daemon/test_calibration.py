@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from fitted_once import fitted_once as fitted_once
 
-from bodyschema.calibration.plausibility.check import Plausibility
+from bodyschema.calibration.plausibility.verdict import Plausibility
 from bodyschema.calibration.report import CalibrationReport
 from bodyschema.calibration.rigid_chain import Calibration, CalibrationError
 from bodyschema.cli.commands.options import SourceOptions

@@ -13,7 +13,7 @@ from fitted_once import fitted_once as fitted_once
 from scipy.spatial.transform import Rotation
 
 from bodyschema.calibration.chain_figures import HALF_WIDTH_95
-from bodyschema.calibration.plausibility.check import Plausibility
+from bodyschema.calibration.plausibility.verdict import Plausibility
 from bodyschema.calibration.report import CalibrationReport
 from bodyschema.calibration.rigid_chain import Calibration
 from bodyschema.cli.main import command_line

@@ -12,7 +12,7 @@ from test_calibration import DESK_ARM, figures_of
 
 import bodyschema.daemon.learner.findings
 from bodyschema.calibration.chain_figures import ChainFigures, is_told, no_surer_than_possible
-from bodyschema.calibration.plausibility.check import FEWEST_ROWS
+from bodyschema.calibration.plausibility.verdict import FEWEST_ROWS
 from bodyschema.daemon.learner.findings import EVERY_S, SHARE, Findings, FindingTurns, figures
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.config import LearnerConfig

@@ -16,9 +16,10 @@ import pytest
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from bodyschema.calibration.plausibility.check import Plausibility, plausibility
+from bodyschema.calibration.plausibility.check import plausibility
 from bodyschema.calibration.plausibility.limits import UNITS_PER_METRE, require_units
 from bodyschema.calibration.plausibility.reading import Reading
+from bodyschema.calibration.plausibility.verdict import Plausibility
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.learner.findings import Findings
 from bodyschema.interfaces.clock import SystemClock

@@ -1,0 +1,104 @@
+"""Check that angles and positions of a row belong together: logs joined by row number lose one or two."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bodyschema.interfaces.records import FloatArray
+
+from .limits import spread_m
+from .search import ROWS, ReadingSearch
+from .verdict import FEWEST_ROWS, THRESHOLDS, Plausibility, mm
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the check of rows."""
+
+    # A position belongs to the angles of a row this near at most.
+    near_rows: int = 3
+    # Rows are shifted if this share of them fits so many times better with angles or positions of the row as far away.
+    # Up to 0.09 do so in right recordings, 0.16 and more where a fifth of the rows of a real recording is shifted.
+    shifted: float = 0.12
+    shifted_better: float = 5.0
+
+
+_SETTINGS = _Settings()
+
+
+def all_shifted(search: ReadingSearch, q: FloatArray, x: FloatArray, before: float) -> Plausibility | None:
+    """Return a refusal if each position belongs to the angles of a row nearby; else None.
+
+    Args:
+        search: the search over other readings, which found none.
+        q, x: all pairs (n, d) [rad, m] and (n, 3) [m].
+        before: distance of the pairs as they are [m].
+    """
+    shifts, rows = _rows_nearby(len(q))
+    errors = search.errors(np.stack([q[rows + shift] for shift in shifts]), np.stack([x[rows]] * len(shifts)))
+    best = int(errors.argmin())
+    after, shift = float(errors[best]), shifts[best]
+    if after > THRESHOLDS.named / 2 * spread_m(x) or before < THRESHOLDS.much_better * after:
+        return None
+    row, remedy = _moved(shift)
+    return Plausibility(
+        f"it seems that angles and positions are shifted against each other: with the angles of {row}, the pairs fit "
+        f"to {mm(after)}, and as they are to {mm(before)}",
+        remedy,
+        misread=True,
+    )
+
+
+def partly_shifted(search: ReadingSearch, q: FloatArray, x: FloatArray, *, fits: bool) -> Plausibility | None:
+    """Return a refusal if in many rows, and not in most, angles or positions belong to a row nearby; else None.
+
+    Args:
+        search: the search over other readings.
+        q, x: all pairs (n, d) [rad, m] and (n, 3) [m].
+        fits: the pairs place the arm. Else every row may be wrong, and the arm is also placed by shifted rows.
+    """
+    if len(q) < FEWEST_ROWS:
+        return None
+    shifts, rows = _rows_nearby(len(q))
+    own_q, own_x = q[rows], x[rows]
+    of_angles = [(q[rows + shift], own_x) for shift in shifts]
+    pairs = [(own_q, own_x), *of_angles, *((own_q, x[rows + shift]) for shift in shifts)]
+    placed_by = [(own_q, own_x), *([] if fits else of_angles)]
+    found = np.stack([search.distances(*placed, pairs) for placed in placed_by])
+    nearer = _SETTINGS.shifted_better * found.min(axis=0)[1:] < found[0, 0]
+    shares = nearer.mean(axis=1).reshape(2, -1)
+    angles, positions = shares.max(axis=1)
+    if max(angles, positions) < _SETTINGS.shifted:
+        return None
+    row, remedy = _moved(shifts[int(shares[0].argmax())])
+    fit, remedy = f"these fit the angles of {row}", f"In these rows: {remedy[0].lower()}{remedy[1:]}"
+    if positions > THRESHOLDS.much_better * angles:
+        fit = f"their angles fit the positions of {_moved(shifts[int(shares[1].argmax())])[0]}"
+        remedy = "Join the two logs by time, not by row: rows hold the angles of others"
+    return Plausibility(
+        "it seems that angles and positions are shifted against each other in "
+        f"{100.0 * max(angles, positions):.0f} % of the rows: {fit}",
+        remedy,
+        misread=True,
+    )
+
+
+def _rows_nearby(count: int) -> tuple[list[int], NDArray[np.intp]]:
+    """Return shifts, and rows of a recording of `count` that have neighbours so far away."""
+    near = _SETTINGS.near_rows
+    shifts = [shift for shift in range(-near, near + 1) if shift]
+    return shifts, np.unique(np.linspace(near, count - 1 - near, ROWS).astype(np.intp))
+
+
+def _moved(shift: int) -> tuple[str, str]:
+    """Return what row it is whose angles fit, and the remedy."""
+    count, where = abs(shift), "later" if shift > 0 else "earlier"
+    rows = f"{count} row{'s' if count > 1 else ''}"
+    return (
+        f"{rows} {where}",
+        f"Move the columns of the joints by {rows} {'up' if shift > 0 else 'down'}, or the positions the other way; or "
+        "join the two logs by time, not by row",
+    )

@@ -1,0 +1,341 @@
+"""Search for the reading of the columns with which the pairs fit the nominal links."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from bodyschema.interfaces.records import FloatArray
+from kbmaps import ChainParameters, DegenerateDataError, RigidChain, align
+from kbmaps.chains.placement import place
+from kbmaps.rotations import rotation_vectors
+
+from .limits import A_RADIAN_M, KNOWN_TOOL_M, MEASURED, SLIDES_M, TOOL_M, ZEROS_RAD, spread_m
+from .reading import QUARTER, Reading
+from .size import evidences
+from .verdict import THRESHOLDS
+
+# Number of rows to be read in other ways, evenly spread. Twice as many cost twice the time and change no verdict of the
+# tests.
+ROWS = 80
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the search for another reading of the columns."""
+
+    # Width and depth of the search over readings: offsets of up to four joints by a quarter turn are found.
+    width: int = 4
+    depth: int = 5
+    # Readings whose errors differ by less count as one: offsets of the first and of the last joint make no difference.
+    same: float = 0.005
+    # The search ends at a fit with these shares of the positions' spread: of the columns as they are, and read
+    # otherwise.
+    enough_as_it_is: float = 0.03
+    enough: float = 0.01
+    # A reading is more probable by this much [nats], less a penalty for each change of the reading.
+    certain: float = 10.0
+    a_change: float = 3.0
+    # Rows on the way from one pose to another say together what one says: errors of links change slowly along a path.
+    # They count as one within this distance, of the joint that moved farthest.
+    apart_rad: float = math.radians(10.0)
+    # A joint offset above this is mentioned: that of one in 300 generated arms with offsets of up to 10°.
+    far_zero_rad: float = math.radians(20.0)
+    # ... unless the pairs fit about as well with half of it.
+    near_zero_rad: float = far_zero_rad / 2.0
+    # Share of its tolerance that is left to a joint offset that is held.
+    held: float = 1e-3
+    # A zero of the last joint this far off is not fitted where the marker is known: its quarter turns are tried
+    # instead.
+    last_zero_rad: float = math.radians(3.0)
+    # ... and named where the known marker comes out so many times nearer to its place: with 3, 2 of 32 markers that
+    # were 50 mm off in each direction (1-sigma) came out so by chance.
+    nearer: float = 5.0
+    # Maximum number of other, equally good readings that are listed.
+    listed: int = 2
+
+
+_SETTINGS = _Settings()
+
+
+@dataclass(frozen=True, slots=True)
+class ReadingFit:
+    """Quality of a reading's fit.
+
+    Attributes:
+        error: RMS distance of the nearest pairs, in the recording's own unit.
+        nats: minus the log-likelihood, what zeros and marker cost included.
+        zeros: added to the joints (d,) beside the quarter turns [rad, m].
+        tool_m: how far from its place the marker is [m].
+        rotation: of the nominal measurement frame in the real one (3, 3).
+    """
+
+    error: float
+    nats: float
+    zeros: FloatArray
+    tool_m: float
+    rotation: FloatArray
+
+
+class ReadingSearch:
+    """Search over readings of the same pairs, with their fits.
+
+    Args:
+        chain: the nominal chain.
+        q, x: rows to be read, (n, d) [rad, m] and (n, 3) [m].
+        exact_m: distances below this are not distinguished [m].
+        pose_known: the camera pose is known.
+
+    Attributes:
+        fits: the best fit of each reading so far.
+        apart: rows of poses far from each other.
+    """
+
+    def __init__(self, chain: RigidChain, q: FloatArray, x: FloatArray, exact_m: float, pose_known: bool) -> None:
+        self.chain, self.q, self.x, self.exact_m, self._pose_known = chain, q, x, exact_m, pose_known
+        self._parameters = ChainParameters(chain)
+        self._std = np.where(chain.prismatic, SLIDES_M, ZEROS_RAD)
+        self.apart = _poses_apart(q / np.where(chain.prismatic, A_RADIAN_M, 1.0))
+        self._poses = len(self.apart)
+        self._tried: set[Reading] = set()
+        self.fits: dict[Reading, ReadingFit] = {}
+
+    def verdict(self) -> tuple[Reading, Reading, list[Reading]]:
+        """Return the columns as they are, the simplest reading among the best, and others nearly as simple."""
+        as_it_is = Reading.plain(self.chain.joints)
+        slides: list[bool] = self.chain.prismatic.tolist()
+        self._try([as_it_is, *as_it_is.neighbours(slides)])
+        if self._best()[0] != as_it_is:
+            # With a marker far from nominal, the fit of the right reading may have ended in a local minimum.
+            self._fit([as_it_is] * 6, tools=TOOL_M * np.concatenate([np.eye(3), -np.eye(3)]))
+        expanded, spread = [as_it_is], spread_m(self.x)
+        for depth in range(1, _SETTINGS.depth):
+            best = self._best()[0]
+            left = self.fits[best].error / spread
+            if best in expanded and (
+                left < _SETTINGS.enough or (best == as_it_is and (left < _SETTINGS.enough_as_it_is or depth > 1))
+            ):
+                break
+            new = self._distinct(expanded)
+            expanded += new
+            if depth == 1:
+                self._try(as_it_is.doubles(slides))
+            self._try(other for reading in new for other in reading.neighbours(slides))
+        best = self._best()[0]
+        if self.fits[best].error > (_SETTINGS.enough_as_it_is if best == as_it_is else _SETTINGS.enough) * spread:
+            self._try(as_it_is.mixed(slides))
+        best = self._best()[0]
+        if not nameable(best, self.fits[best], spread):
+            self._fit([as_it_is], tools=self._aligned_tool())
+            self._try(as_it_is.mixed_exchanges(slides))
+            self._try(other for reading in self._distinct(expanded) for other in reading.neighbours(slides))
+        if as_it_is not in self.fits:
+            self._fit([as_it_is], held=True)
+        best, refuted = self._most_probable(as_it_is)
+        good = sorted(
+            (
+                reading
+                for reading, fit in self.fits.items()
+                if self._as_good(fit, self.fits[best]) and not self._alike(fit.error, refuted)
+            ),
+            key=lambda reading: (reading.changes, reading.quarters != as_it_is.quarters, self.fits[reading].nats),
+        )
+        others = [reading for reading in good[1:] if reading.changes <= good[0].changes + 1]
+        return as_it_is, good[0], others[: _SETTINGS.listed]
+
+    def _aligned_tool(self) -> FloatArray:
+        """Return the marker's offset (1, 3) [m] with nominal joint offsets: its fit starts from many places."""
+        try:
+            return align(self.chain, self.q, self.x, pose_known=False, marker_known=False).marker_shift[None]
+        except DegenerateDataError:
+            return np.zeros((1, 3))
+
+    def has_far_zero(self, joint: int, fit: ReadingFit) -> bool:
+        """Return True if a joint's zero is far off in `fit`, and the unchanged columns fit clearly worse with less."""
+        if self.chain.prismatic[joint] or abs(fit.zeros[joint]) <= _SETTINGS.far_zero_rad:
+            return False
+        q, here = self.q.copy(), np.arange(self.chain.joints) == joint
+        q[:, joint] += math.copysign(_SETTINGS.near_zero_rad, fit.zeros[joint])
+        held = place(
+            self.chain,
+            q[None],
+            self.x[None],
+            zeros_std=np.where(here, _SETTINGS.held, 1.0) * self._std,
+            tool_std=TOOL_M,
+        )
+        ratio = max(float(held.errors(MEASURED)[0]), self.exact_m) / fit.error
+        return ratio > THRESHOLDS.much_better and 3.0 * MEASURED * self._poses * math.log(ratio) > _SETTINGS.certain
+
+    def errors(self, q: FloatArray, x: FloatArray) -> FloatArray:
+        """Return the distances (s,) [m] of sets of pairs q (s, n, d) and x (s, n, 3), with the columns as they are."""
+        placed = place(self.chain, q, x, zeros_std=self._std, tool_std=TOOL_M)
+        return np.maximum(placed.errors(MEASURED), self.exact_m)
+
+    def distances(self, q: FloatArray, x: FloatArray, pairs: list[tuple[FloatArray, FloatArray]]) -> FloatArray:
+        """Return the distances (s, n) [m] of sets of pairs from the arm as pairs q (n, d) and x (n, 3) place it."""
+        placed, p = place(self.chain, q[None], x[None], zeros_std=self._std, tool_std=TOOL_M), self._parameters
+        change = np.zeros(p.size)
+        change[p.zeros], change[p.tool] = placed.zeros[0], placed.tools[0]
+        drawn = (p.positions(change, each) @ placed.rotations[0].T + placed.shifts[0] for each, _ in pairs)
+        return np.stack([np.linalg.norm(at - seen, axis=1) for at, (_, seen) in zip(drawn, pairs, strict=True)])
+
+    def with_marker_known(self, reading: Reading) -> tuple[Reading, ReadingFit] | None:
+        """Return the reading with a zero near the hand off by quarter turns, and its fit, if the known marker shows it.
+
+        With a free marker position such a turn makes no difference.
+        """
+        if self.chain.prismatic[-1]:
+            return None
+        last = np.arange(self.chain.joints) == self.chain.joints - 1
+        std = np.where(last, _SETTINGS.last_zero_rad, self._std)
+        turned = [reading.turned((turns * last).tolist()) for turns in (0, 1, -1, 2)] + self._turned_alike(reading)
+        fits = self._placed(turned, std=std, tool_m=KNOWN_TOOL_M)
+        as_given = fits.pop(reading, None)
+        best = min(fits, key=lambda each: fits[each].nats + _SETTINGS.a_change * each.changes, default=reading)
+        if best not in turned or best == reading:
+            return None
+        fit = fits[best]
+        # Without a fit the known marker itself has led from this reading to another one.
+        clearly = as_given is None or fit.nats + _SETTINGS.certain < as_given.nats
+        far = _SETTINGS.nearer * fit.tool_m < (as_given or self.fits[reading]).tool_m
+        return (best, fit) if clearly and far else None
+
+    def with_marker_nearer(self, reading: Reading) -> Reading | None:
+        """Return the reading with other quarter turns, as good a fit, that brings a far marker near to its place."""
+        best = min(self._turned_alike(reading), key=lambda each: self.fits[each].tool_m, default=reading)
+        far = self.fits[reading].tool_m > _SETTINGS.nearer * max(self.fits[best].tool_m, KNOWN_TOOL_M)
+        return best if far else None
+
+    def _turned_alike(self, reading: Reading) -> list[Reading]:
+        """Return the readings with other quarter turns that fit as well."""
+        return [
+            other
+            for other, fit in self.fits.items()
+            if other != reading
+            and replace(other, quarters=reading.quarters) == reading
+            and self._as_good(fit, self.fits[reading])
+        ]
+
+    def undirected(self, names: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the joints whose sign makes no difference."""
+        plain = Reading.plain(len(names))
+        fits = (
+            (name, self.fits.get(reading))
+            for name, reading in zip(names, plain.neighbours(self.chain.prismatic.tolist()), strict=False)
+        )
+        return tuple(name for name, fit in fits if fit is not None and self._as_good(fit, self.fits[plain]))
+
+    def _best(self) -> list[Reading]:
+        """Return all readings, the best first."""
+        return sorted(self.fits, key=lambda reading: self.fits[reading].nats + _SETTINGS.a_change * reading.changes)
+
+    def _most_probable(self, as_it_is: Reading) -> tuple[Reading, list[float]]:
+        """Return the most probable reading with links of some tolerance, and the errors of better fits that it refutes.
+
+        With nominal links a wrong reading may fit better: its marker and joint offsets make up for errors of the links.
+        They do so only where the columns as they are place the arm.
+        """
+        rivals = self._distinct([])
+        own = self.fits.get(as_it_is)
+        if rivals[0] == as_it_is or own is None or own.error >= THRESHOLDS.named * spread_m(self.x):
+            return rivals[0], []
+        rivals += [as_it_is] if as_it_is not in rivals else []
+        slides = self.chain.prismatic
+        read = [(each.angles(self.q, slides), each.positions(self.x), each.scale) for each in rivals]
+        changes = np.array([reading.changes for reading in rivals])
+        best = rivals[int((evidences(self.chain, read, self.apart) - _SETTINGS.a_change * changes).argmax())]
+        nats, error = self.fits[best].nats, self.fits[best].error
+        fits = [self.fits[reading] for reading in rivals]
+        return best, [fit.error for fit in fits if fit.nats < nats and not self._alike(error, [fit.error])]
+
+    @staticmethod
+    def _alike(error: float, others: list[float]) -> bool:
+        return any(abs(error - other) <= _SETTINGS.same * other for other in others)
+
+    def _distinct(self, expanded: list[Reading]) -> list[Reading]:
+        """Return the best readings whose fits differ from those already expanded, and from each other."""
+        seen, new = [self.fits[reading].error for reading in expanded if reading in self.fits], list[Reading]()
+        for reading in self._best():
+            error = self.fits[reading].error
+            if not self._alike(error, seen):
+                new.append(reading)
+                seen.append(error)
+            if len(new) == _SETTINGS.width:
+                break
+        return new
+
+    @staticmethod
+    def _as_good(fit: ReadingFit, best: ReadingFit) -> bool:
+        return fit.nats < best.nats + _SETTINGS.certain or fit.error < THRESHOLDS.as_good * best.error
+
+    def _try(self, readings: Iterable[Reading]) -> None:
+        """Fit readings that were not tried yet."""
+        new = [reading for reading in dict.fromkeys(readings) if reading not in self._tried]
+        self._tried.update(new)
+        if new:
+            self._fit(new)
+
+    def _fit(self, new: list[Reading], *, held: bool = False, tools: FloatArray | None = None) -> None:
+        """Fit readings, and keep the best fit of each.
+
+        Args:
+            new: the readings.
+            held: keep the joint offsets at nominal.
+            tools: marker offsets (s, 3) [m] to start from.
+        """
+        std = self._std * (_SETTINGS.held if held else 1.0)
+        for reading, fit in self._placed(new, std=std, tools=tools).items():
+            if reading not in self.fits or fit.nats < self.fits[reading].nats:
+                self.fits[reading] = fit
+
+    def _placed(
+        self, new: list[Reading], *, std: FloatArray, tool_m: float = TOOL_M, tools: FloatArray | None = None
+    ) -> dict[Reading, ReadingFit]:
+        """Return the best fit of each reading; a zero that goes to the next quarter turn makes it another reading.
+
+        Args:
+            std: how far each zero may be off (d,) [rad, m]; 1-sigma.
+            tool_m: how far the marker may be from its place [m]; 1-sigma of a coordinate.
+            tools: moves of the marker (s, 3) [m] to start from.
+        """
+        slides = self.chain.prismatic
+        q = np.stack([reading.angles(self.q, slides) for reading in new])
+        x = np.stack([reading.positions(self.x) for reading in new])
+        placed = place(self.chain, q, x, zeros_std=std, tool_std=tool_m, tools=tools)
+        quarters = np.where(slides, 0, np.rint(placed.zeros / QUARTER)).astype(np.intp)
+        zeros = placed.zeros - QUARTER * quarters
+        errors = np.maximum(placed.errors(MEASURED), self.exact_m) * [reading.scale for reading in new]
+        moved = np.linalg.norm(placed.tools, axis=1)
+        cost = 0.5 * np.square(zeros / std).sum(axis=1) + 0.5 * np.square(moved / tool_m)
+        if self._pose_known:
+            turns = np.linalg.norm(rotation_vectors(placed.rotations), axis=1)
+            cost += [
+                0.0 if r.mirrored else 0.5 * (turn / THRESHOLDS.turned_rad) ** 2
+                for r, turn in zip(new, turns, strict=True)
+            ]
+        nats = 3.0 * MEASURED * self._poses * np.log(errors) + cost
+        fits: dict[Reading, ReadingFit] = {}
+        for k, reading in enumerate(new):
+            found = reading.turned(quarters[k].tolist())
+            fit = ReadingFit(float(errors[k]), float(nats[k]), zeros[k], float(moved[k]), placed.rotations[k])
+            if found not in fits or fit.nats < fits[found].nats:
+                fits[found] = fit
+        return fits
+
+
+def _poses_apart(q: FloatArray) -> list[int]:
+    """Return poses of q (n, d) that are `apart_rad` from each other, in at least one joint."""
+    apart = np.abs(q[:, None] - q).max(axis=2) > _SETTINGS.apart_rad
+    kept: list[int] = []
+    for pose, far in enumerate(apart):
+        if far[kept].all():
+            kept.append(pose)
+    return kept
+
+
+def nameable(reading: Reading, fit: ReadingFit, spread: float) -> bool:
+    """Return True if a fit is better than that of any wrong reading with as many changes."""
+    return fit.error < THRESHOLDS.named / (1 + reading.changes) * spread
