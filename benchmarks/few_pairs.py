@@ -35,7 +35,7 @@ from kbmaps import (
     learning_bases,
 )
 from kbmaps.arrays import FloatArray
-from kbmaps.chains.carried import Predictor
+from kbmaps.kernel.kernel_learner import Predictor
 
 SIGMA = 0.01
 TEST_ROWS = 400
