@@ -30,12 +30,12 @@ from kbmaps import (
     Memory,
     Model,
     RigidChain,
+    RigidLearner,
     StepSize,
-    ToolLayer,
     learning_bases,
 )
 from kbmaps.arrays import FloatArray
-from kbmaps.chains.carried import Predictor
+from kbmaps.kernel.kernel_learner import Predictor
 
 SIGMA = 0.01
 TEST_ROWS = 400
@@ -193,10 +193,10 @@ def tool(seeds: int) -> None:
             q, test = arm.angles(counts[-1], 80, rng), arm.angles(TEST_ROWS, 80, rng)
             x = true.positions(q) + sigma * rng.normal(size=q[:, :3].shape)
             x[rng.random(len(x)) < outliers] += 0.2 * direction[::-1] / np.linalg.norm(direction)
-            layer, begin = ToolLayer(arm.drawing), 0
+            learner, begin = RigidLearner(arm.drawing, ChainTolerances(tool=1.0)), 0
             for column, end in enumerate(counts):
-                layer.learn(q[begin:end], x[begin:end])
-                errors[seed, column] = error_mm(layer, true.positions(test), test)
+                learner.learn(q[begin:end], x[begin:end])
+                errors[seed, column] = error_mm(learner, true.positions(test), test)
                 begin = end
         means = "  ".join(f"{mean:.2g}" for mean in errors.mean(axis=0))
         print(f"  sigma {1e3 * sigma:2.0f} mm, {outliers:3.0%} off by 200 mm: {means}")

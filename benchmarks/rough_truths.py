@@ -37,9 +37,9 @@ from scipy.spatial.transform import Rotation
 from benchmarks.humanoid_arm import NECK_JOINTS
 from benchmarks.recording import RECORDED, Recording
 from benchmarks.rough_arm import RoughArm, rough_arm
+from benchmarks.side_by_side import SideBySide
 from kbmaps import (
     ChainTolerances,
-    Ladder,
     Model,
     ResidualLearner,
     RigidLearner,
@@ -190,12 +190,17 @@ def residual(arm: RoughArm, _: int) -> Model:
     return ResidualLearner(arm.drawing, ROUGH)
 
 
-def ladder(arm: RoughArm, _: int) -> Model:
+def ladder(arm: RoughArm, _: int) -> SideBySide:
     reach = np.full(JOINTS, np.radians(REACH_DEG))
-    return Ladder.around(arm.drawing, ROUGH, -reach, reach)
+    return SideBySide(arm.drawing, ROUGH, -reach, reach)
 
 
-MODELS = {"rigid": rigid, "train": train, "residual": residual, "ladder": ladder}
+MODELS: dict[str, Callable[[RoughArm, int], Model | SideBySide]] = {
+    "rigid": rigid,
+    "train": train,
+    "residual": residual,
+    "ladder": ladder,
+}
 
 
 def run(truth: str, model: str, pairs: int, seed: int, told: bool) -> list[float]:

@@ -38,8 +38,8 @@ ShapeSearch = Literal["none", "moment", "cycles", "width", "shape", "load"]
 _SHAPE_STEP, _SHAPE_CHANGE = 0.3, 2.0
 # Two moments at one place are told apart; further ones are a drift.
 _MOST_MOMENTS = 2
-# Step of numerical derivatives by a camera's parameters.
-_STEP = 1e-6
+# Step of numerical derivatives [rad, m, or a parameter's unit].
+STEP = 1e-6
 
 
 class EffectType(ABC):
@@ -268,10 +268,10 @@ class CameraEffect(EffectType):
         columns = np.zeros((len(run.motion), 3, len(effect.values)))
         for k in effect.all_amounts:
             step = np.zeros(len(effect.values))
-            step[k] = _STEP
+            step[k] = STEP
             ends = (run.simulation.having(effect.with_values(effect.values + s * step)) for s in (1.0, -1.0))
             more, less = (simulation.reported(run.x_camera, run.motion) for simulation in ends)
-            columns[:, :, k] = (more - less) / (2.0 * _STEP)
+            columns[:, :, k] = (more - less) / (2.0 * STEP)
         return columns
 
 

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 # What an effect adds to correction.json: "ratios" (joint, source, factor), "waves" (joint, amplitude, frequency,
 # phase), "memories" (joint, kind, amount, scale) and "loose" (joint, half of the width, hold).
 Rows = dict[str, list[list[Any]]]
+# Number of runs whose strains are kept: the diagnosis asks again for those of its candidates.
+STRAINS_KEPT = 256
 # Share of a past move below which it is ignored.
 _FORGOTTEN = 1e-17
 

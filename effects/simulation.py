@@ -20,15 +20,13 @@ from bodyschema.robot.urdf import inverse
 from kbmaps import RigidChain
 
 from .effect import Effect, Identity
-from .effect_type import STAGES, CameraEffect, EffectType, Stage, StructureEffect, TimeEffect, ToolEffect
+from .effect_type import STAGES, STEP, CameraEffect, EffectType, Stage, StructureEffect, TimeEffect, ToolEffect
 from .encoder import Place
 from .gravity import GravityLoad
 from .moments import after, since
 from .motion import Motion
 from .optics import Optics
 
-# Step of numerical derivatives by the optics' parameters and by a point.
-_STEP = 1e-6
 # Relative step by a period or a time constant.
 _SHAPE_STEP = 1e-3
 # A spring's deflection changes its own load; each round adds the next order.
@@ -467,10 +465,10 @@ class Simulated:
         columns = []
         for parameter in effect.parameters:
             number = getattr(optics, parameter.name)
-            more, less = (replace(optics, **{parameter.name: number + step}) for step in (_STEP, -_STEP))
+            more, less = (replace(optics, **{parameter.name: number + step}) for step in (STEP, -STEP))
             change = simulation.reported(self.x_camera, self.motion, more)
             change = change - simulation.reported(self.x_camera, self.motion, less)
-            columns.append(change / (2.0 * _STEP))
+            columns.append(change / (2.0 * STEP))
         return np.stack(columns, axis=2)
 
     def seen(self, moved: FloatArray) -> FloatArray:
@@ -500,6 +498,6 @@ class Simulated:
         reported = self.simulation.reported
         changes = [
             reported(self.x_camera + step, self.motion) - reported(self.x_camera - step, self.motion)
-            for step in _STEP * np.eye(3)
+            for step in STEP * np.eye(3)
         ]
-        return np.stack(changes, axis=2) / (2.0 * _STEP)
+        return np.stack(changes, axis=2) / (2.0 * STEP)

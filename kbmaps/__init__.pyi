@@ -3,6 +3,7 @@ from kbmaps.chains.align import Alignment as Alignment
 from kbmaps.chains.align import align as align
 from kbmaps.chains.belief import ChainBelief as ChainBelief
 from kbmaps.chains.chain import RigidChain as RigidChain
+from kbmaps.chains.moved_tool import with_refitted_tool as with_refitted_tool
 from kbmaps.chains.oriented import OrientedChain as OrientedChain
 from kbmaps.chains.oriented import fitted_orientation as fitted_orientation
 from kbmaps.chains.parameters import ChainParameters as ChainParameters
@@ -12,8 +13,6 @@ from kbmaps.chains.report import Interval as Interval
 from kbmaps.chains.rigid_learner import RigidLearner as RigidLearner
 from kbmaps.chains.rigid_recursive import RecursiveRigidLearner as RecursiveRigidLearner
 from kbmaps.chains.search import find_chain as find_chain
-from kbmaps.chains.tool_layer import ToolLayer as ToolLayer
-from kbmaps.chains.tool_layer import with_refitted_tool as with_refitted_tool
 from kbmaps.changes.detector import ChangeDetector as ChangeDetector
 from kbmaps.changes.detector import ChangeScore as ChangeScore
 from kbmaps.changes.kinds import ChangeKind as ChangeKind
@@ -40,10 +39,7 @@ from kbmaps.errors import ShapeError as ShapeError
 from kbmaps.errors import SingularAlphaError as SingularAlphaError
 from kbmaps.inverse.kinematics import InverseKinematics as InverseKinematics
 from kbmaps.inverse.kinematics import InverseSolution as InverseSolution
-from kbmaps.inverse.resolved_rates import resolved_rates as resolved_rates
 from kbmaps.kernel.kernel_learner import KernelLearner as KernelLearner
-from kbmaps.ladder import Ladder as Ladder
-from kbmaps.ladder import Rung as Rung
 from kbmaps.maps.basis import JointBasis as JointBasis
 from kbmaps.maps.basis import learning_bases as learning_bases
 from kbmaps.maps.block_choice import blockwise_precision as blockwise_precision

@@ -29,7 +29,7 @@ PRIOR, INSTANT, RIGID, RESIDUAL, EXACT = "prior", "nlms", "rigid", "residual", "
 _DELAYED = "delayed"
 SOLVED = (RIGID, RESIDUAL, EXACT)
 # Order of trust while errors do not decide. Pairs come along guided paths, where errors are known on the path only: a
-# model with fewer parameters is better away from it. (`Ladder.around` is for spread pairs, and has another order.)
+# model with fewer parameters is better away from it.
 TRUSTED = (RIGID, RESIDUAL, EXACT, PRIOR, INSTANT)
 
 

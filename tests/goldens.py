@@ -37,13 +37,11 @@ from bodyschema.recordings.recording import Recording
 from bodyschema.recordings.store.store import PairReader
 from kbmaps import (
     KernelLearner,
-    Ladder,
     Model,
     RecursiveRigidLearner,
     ResidualLearner,
     RigidLearner,
     TensorLearner,
-    ToolLayer,
     learning_bases,
 )
 
@@ -63,11 +61,9 @@ def models() -> Iterator[Golden]:
     bases, chain = learning_bases(-reach, reach), arm.drawing
     taught: dict[str, Model] = {
         "kernel": KernelLearner(bases, chain),
-        "tool layer": ToolLayer(chain),
         "rigid": RigidLearner(chain, ROUGH),
         "recursive rigid": RecursiveRigidLearner(chain, ROUGH),
         "residual": ResidualLearner(chain, ROUGH),
-        "ladder": Ladder.around(chain, ROUGH, -reach, reach),
         "tensor": TensorLearner.around(chain, bases),
     }
     q, asked = arm.angles(150, 60.0, rng), arm.angles(5, 70.0, rng)

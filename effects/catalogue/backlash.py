@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyschema.effects.encoder import EncoderEffect, Place, Rows
+from bodyschema.effects.effect_type import STEP
+from bodyschema.effects.encoder import STRAINS_KEPT, EncoderEffect, Place, Rows
 from bodyschema.effects.joint_errors import JointErrors
 from bodyschema.effects.motion import Motion
 from bodyschema.effects.parameter import Parameter
@@ -18,9 +19,6 @@ if TYPE_CHECKING:
     from bodyschema.effects.effect import Effect
     from bodyschema.effects.simulation import Simulated
 
-# Step of the numerical derivative by the width [rad, m].
-_WIDTH_STEP = 1e-6
-_PLAYS_KEPT = 256
 # Widths tried [rad, m].
 WIDTHS = np.geomspace(2e-4, 0.15, 14)
 
@@ -43,8 +41,8 @@ class Backlash(EncoderEffect):
         )
 
     def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
-        wider = self.correction(motion, place, values + _WIDTH_STEP)
-        return ((wider - self.correction(motion, place, values)) / _WIDTH_STEP)[:, None]
+        wider = self.correction(motion, place, values + STEP)
+        return ((wider - self.correction(motion, place, values)) / STEP)[:, None]
 
     def correction(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
         return _played(motion, place.joint, abs(float(values[0]))) * np.sign(values[0])
@@ -106,7 +104,7 @@ def played(q: FloatArray, width: float) -> FloatArray:
     return np.clip(begun, low, high) - q
 
 
-@lru_cache(maxsize=_PLAYS_KEPT)
+@lru_cache(maxsize=STRAINS_KEPT)
 def _played(motion: Motion, joint: int, width: float) -> FloatArray:
     """Return `played` of one joint; cached, since a search repeats the same widths."""
     return frozen_array(played(motion.q[:, joint], width))

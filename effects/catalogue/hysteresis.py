@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyschema.effects.encoder import EncoderEffect, Place, Rows, carried_on
+from bodyschema.effects.encoder import STRAINS_KEPT, EncoderEffect, Place, Rows, carried_on
 from bodyschema.effects.motion import Motion
 from bodyschema.effects.parameter import Parameter
 from bodyschema.interfaces.records import FloatArray, frozen_array
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from bodyschema.effects.effect import Effect
     from bodyschema.effects.simulation import Simulated
 
-_LAGS_KEPT = 256
 # Lengths tried [rad, m].
 _LENGTHS = np.geomspace(5e-4, 0.3, 14)
 # After this many lengths, only the last direction determines the strain.
@@ -92,7 +91,7 @@ class Bristle:
         return self.strained
 
 
-@lru_cache(maxsize=_LAGS_KEPT)
+@lru_cache(maxsize=STRAINS_KEPT)
 def _strained(motion: Motion, joint: int, length: float) -> FloatArray:
     """Return the strain of a joint's friction (n,), from -1 to 1; it begins in the direction of the first move.
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyschema.effects.encoder import EncoderEffect, Place, Rows, carried_on
+from bodyschema.effects.encoder import STRAINS_KEPT, EncoderEffect, Place, Rows, carried_on
 from bodyschema.effects.motion import Motion
 from bodyschema.effects.parameter import Parameter
 from bodyschema.interfaces.records import FloatArray, frozen_array
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from bodyschema.effects.effect import Effect
     from bodyschema.effects.simulation import Simulated
 
-_MEMORIES_KEPT = 256
 # Shares of a lag that remain at the next reading: those tried, the largest step, and the largest.
 _MEMORIES, _OF_A_MEMORY, _LONGEST_MEMORY = np.linspace(0.0, 0.9, 19), 0.1, 0.95
 # The joint is at rest when this share of its initial lag remains.
@@ -70,7 +69,7 @@ class Settling(EncoderEffect):
         return {"memories": [[place.joint, 2, *effect.values.tolist()]]}
 
 
-@lru_cache(maxsize=_MEMORIES_KEPT)
+@lru_cache(maxsize=STRAINS_KEPT)
 def _missing(motion: Motion, joint: int, memory: float) -> FloatArray:
     """Return the lag after the last and earlier moves (n,); cached, since a search repeats the same values."""
     moves = motion.moves[:, joint]

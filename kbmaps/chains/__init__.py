@@ -1,1 +1,1 @@
-"""Rigid chains as products of exponentials, their learners, and a tool layer for any model."""
+"""Rigid chains as products of exponentials and their learners."""

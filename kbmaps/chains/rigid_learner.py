@@ -133,13 +133,6 @@ class RigidLearner(Model):
         self._sigma, self._shape, self._common = np.empty(0), np.empty((0, 3, 3)), np.empty((0, 3, 0))
         self._fit: RigidFit | None = None
         self._widest = 0.0
-        self._twin: RigidLearner | None = None
-
-    def twin(self) -> RigidLearner:
-        """Return a learner of the same arm without pairs. While it gets the same pairs, it reuses this one's fit."""
-        twin = RigidLearner(self.nominal, self._tolerances, self._prior if self._told_prior else None)
-        twin._twin = self
-        return twin
 
     @property
     def joints(self) -> int:
@@ -362,9 +355,6 @@ class RigidLearner(Model):
         return bool((self._shape != np.eye(3)).any())
 
     def _fitted(self) -> RigidFit | None:
-        twin = self._twin
-        if self._fit is None and twin is not None and twin._fit is not None and self._same_pairs(twin):
-            self._fit, self._widest = twin._fit, twin._widest
         if self._fit is None and self.pairs:
             fit = fit_chain(self._prior, self._units(), self._start())
             _, variance = fit.belief.predict_with_variance(self._q[fit.inliers])
@@ -377,10 +367,6 @@ class RigidLearner(Model):
         some = good[:: max(len(good) // _Settings.followed, 1)]
         sigma = fit.noise * pairs.unit[some] * math.sqrt(len(some) / max(len(good), 1))
         return deviations(fit.belief, pairs.chosen(np.isin(np.arange(len(pairs)), some)), sigma)
-
-    def _same_pairs(self, other: RigidLearner) -> bool:
-        own, others = ((each._q, each._x, each._sigma, each._shape, each._common) for each in (self, other))
-        return all(np.array_equal(mine, theirs, equal_nan=True) for mine, theirs in zip(own, others, strict=True))
 
     def _start(self) -> FloatArray:
         return self._prior.mean if self._told_prior else self._place.change(self._q, self._x)

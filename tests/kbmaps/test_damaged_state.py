@@ -22,16 +22,13 @@ from kbmaps import (
     NLMS,
     ChainTolerances,
     KernelLearner,
-    Ladder,
     Memory,
     ModelFormatError,
     RecursiveRigidLearner,
     ResidualLearner,
     RigidLearner,
-    Rung,
     TensorLearner,
     TensorTrain,
-    ToolLayer,
 )
 from kbmaps.packed import MAGIC, VERSION, pack
 
@@ -59,15 +56,8 @@ def stored() -> dict[str, tuple[Any, bytes]]:
         "kernel": KernelLearner(BASES, arm.nominal, memory=Memory(8, 0.95)),
         "kernel on a map": KernelLearner(BASES, arm.nominal.to_kbmap(BASES), precision=0.1),
         "kernel, from nothing": KernelLearner(BASES),
-        "tool layer": ToolLayer(arm.nominal, outlier_sigmas=math.inf),
         "tensor": TensorLearner.around(arm.nominal, BASES),
         "tensor, from nothing": TensorLearner(BASES),
-        "ladder": Ladder(
-            {
-                "rigid": Rung(RigidLearner(arm.nominal, ROUGH)),
-                "tensor": Rung(TensorLearner(BASES), extrapolates=False),
-            }
-        ),
     }
     for model in models.values():
         model.learn(q, x)
@@ -86,7 +76,6 @@ NAMES = [
     "kernel",
     "kernel on a map",
     "kernel, from nothing",
-    "ladder",
     "nlms",
     "recursive",
     "residual",
@@ -96,7 +85,6 @@ NAMES = [
     "rigid, known",
     "tensor",
     "tensor, from nothing",
-    "tool layer",
     "train",
 ]
 
@@ -180,12 +168,6 @@ def test_arrays_that_are_missing_or_do_not_fit_are_refused(name, damage):
         rest = {array: values for array, values in arrays.items() if array != spoilt}
         parts = rest if wrong is None else {key: wrong if key == spoilt else arrays[key] for key in arrays}
         assert refused_or_the_same(name, closed(kind, fields, parts)), spoilt
-
-
-def test_a_ladder_of_no_models_is_refused():
-    kind, fields, arrays = opened(stored()["ladder"][1])
-    with pytest.raises(ModelFormatError):
-        Ladder.from_bytes(closed(kind, {**fields, "rungs": []}, arrays))
 
 
 def test_no_number_is_written_that_json_does_not_have():

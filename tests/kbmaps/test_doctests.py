@@ -28,7 +28,6 @@ CALLED_FIRST = [
     "learning_bases",
     "nearest_rotation",
     "prediction_errors",
-    "resolved_rates",
 ]
 
 

@@ -16,7 +16,6 @@ from kbmaps import (
     DegenerateDataError,
     InverseKinematics,
     KernelLearner,
-    Ladder,
     Memory,
     Model,
     ModelFormatError,
@@ -28,7 +27,6 @@ from kbmaps import (
     SettingError,
     ShapeError,
     TensorLearner,
-    ToolLayer,
 )
 
 KINDS = "RPR"
@@ -37,8 +35,6 @@ MODELS: dict[str, Callable[[Arm], Model]] = {
     "kernel, from nothing": lambda arm: KernelLearner(bases_for(KINDS)),
     "kernel, exact": lambda arm: KernelLearner(bases_for(KINDS), arm.nominal, precision=None),
     "kernel, with a window": lambda arm: KernelLearner(bases_for(KINDS), arm.nominal, memory=Memory(8, 0.95)),
-    "tool layer": lambda arm: ToolLayer(arm.nominal),
-    "tool layer on a map": lambda arm: ToolLayer(arm.nominal.to_kbmap(bases_for(KINDS), orientation=True)),
     "rigid": lambda arm: RigidLearner(arm.nominal, ROUGH),
     "recursive rigid": lambda arm: RecursiveRigidLearner(arm.nominal, ROUGH),
     "recursive rigid, with a folded window": lambda arm: RecursiveRigidLearner(arm.nominal, ROUGH, window=16),
@@ -47,19 +43,16 @@ MODELS: dict[str, Callable[[Arm], Model]] = {
         arm.nominal, ROUGH, bent_learner(arm).model.with_other_tool(0.1)
     ),
     "residual, of a known chain": lambda arm: ResidualLearner(arm.nominal, ROUGH, bent_learner(arm).rigid.belief),
-    "ladder": lambda arm: Ladder.around(arm.nominal, ROUGH, np.full(3, -1.4), np.full(3, 1.4)),
     "tensor": lambda arm: TensorLearner.around(arm.nominal, bases_for(KINDS)),
     "tensor, from nothing": lambda arm: TensorLearner(bases_for(KINDS)),
 }
-# Models that report support by the law of `Estimate`, and those of them that no pair shows entirely.
+# Models that report support by the law of `Estimate`.
 LAWFUL = [name for name in MODELS if not name.startswith("kernel")]
-LOCAL = [name for name in LAWFUL if not name.startswith("tool layer")]
 # Models whose state needs more pairs than a lesson of 12 to be complete.
 LONG = {
     "recursive rigid, with a folded window": 40,
     "residual": 150,
     "residual, after a tool change": 12,
-    "ladder": 40,
     "tensor, from nothing": 40,
 }
 
@@ -165,7 +158,7 @@ def test_all_learnt_pairs_are_in_support(model, arm):
     assert model.estimate(q).in_support.all()
 
 
-@pytest.mark.parametrize("name", LOCAL)
+@pytest.mark.parametrize("name", LAWFUL)
 def test_far_from_a_small_zone_nothing_is_in_support(model, arm):
     rng = np.random.default_rng(9)
     model.learn(*arm.pairs(rng, 40, 0.001, reach_deg=10.0))

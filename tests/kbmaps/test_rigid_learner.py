@@ -28,7 +28,6 @@ from kbmaps import (
     align,
 )
 from kbmaps.chains import align as align_module
-from kbmaps.chains import rigid_learner
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -427,33 +426,6 @@ def test_one_pair_that_comes_twice_and_no_pair_at_all_are_learnt():
     learner.learn(q[0], x[0], 0.001)
     learner.learn(q[0], x[0], 0.001)
     assert np.linalg.norm(learner.predict(q[0]) - x[0]) < 0.002
-
-
-@pytest.mark.parametrize("more", [0, 5])
-def test_a_twin_answers_as_a_learner_of_its_own_would(more):
-    rng = np.random.default_rng(11)
-    arm = rough_arm(rng)
-    q, x = arm.pairs(rng, 40, 0.005)
-    first, alone = RigidLearner(arm.nominal, ROUGH), RigidLearner(arm.nominal, ROUGH)
-    twin = first.twin()
-    first.learn(q[: 40 - more], x[: 40 - more])
-    first.predict(q)
-    for learner in (twin, alone):
-        learner.learn(q, x)
-    np.testing.assert_array_equal(twin.predict(q), alone.predict(q))
-
-
-def test_a_twin_fits_nothing_that_has_been_fitted(monkeypatch):
-    rng = np.random.default_rng(12)
-    arm = rough_arm(rng)
-    q, x = arm.pairs(rng, 40, 0.005)
-    first = RigidLearner(arm.nominal, ROUGH)
-    twin = first.twin()
-    for learner in (first, twin):
-        learner.learn(q, x)
-    first.predict(q)
-    monkeypatch.setattr(rigid_learner, "fit_chain", None)
-    np.testing.assert_array_equal(twin.predict(q), first.predict(q))
 
 
 def test_a_printed_report_is_a_table_in_millimetres_and_degrees():

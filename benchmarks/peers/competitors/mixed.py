@@ -1,10 +1,11 @@
-"""Our learners that mix a chain with a map, and the ladder of several."""
+"""Our learners that mix a chain with a map, and several models side by side."""
 
 from __future__ import annotations
 
 from benchmarks.peers.competitors.chains import drawing_of
 from benchmarks.peers.problem import Competitor, Fitted, Problem, any_of, needs_drawing
-from kbmaps import Ladder, ResidualLearner
+from benchmarks.side_by_side import SideBySide
+from kbmaps import ResidualLearner
 
 
 def learn_residual(problem: Problem, _: Fitted | None) -> Fitted:
@@ -15,7 +16,7 @@ def learn_residual(problem: Problem, _: Fitted | None) -> Fitted:
 
 
 def learn_ladder(problem: Problem, _: Fitted | None) -> Fitted:
-    ladder = Ladder.around(*drawing_of(problem), problem.low, problem.high)
+    ladder = SideBySide(*drawing_of(problem), problem.low, problem.high)
     ladder.learn(problem.q, problem.x, problem.sigma)
     return ladder
 
@@ -27,7 +28,7 @@ def _one_tool(problem: Problem) -> str | None:
 COMPETITORS = (
     Competitor(
         "ladder",
-        "Ladder",
+        "Models side by side",
         "ours",
         learn_ladder,
         "Chain with residual, chain and train side by side; the best on pairs before they were learnt answers.",

@@ -31,6 +31,7 @@ from bodyschema.interfaces.errors import BodyschemaError, RequestError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from bodyschema.calibration.plausibility.verdict import Plausibility
     from bodyschema.calibration.report import CalibrationReport
     from bodyschema.calibration.rigid_chain import Calibration, Trusted
     from bodyschema.daemon.config import Config
@@ -194,8 +195,6 @@ def arm(
     the servos instead, by LeRobot's own calibration file.
     """
     from bodyschema.calibration.next_poses import check_target
-    from bodyschema.calibration.plausibility.check import plausibility, told_sigma
-    from bodyschema.calibration.plausibility.limits import require_units
     from bodyschema.calibration.report import CalibrationReport
     from bodyschema.daemon.config import Config
 
@@ -207,14 +206,7 @@ def arm(
     servos.require(config)
     description, source = config.robot, source or config.store_file
     recording, first = _rows(config, source, taken, servos.lerobot, (first, last))
-    require_units(description, recording, source)
-    seen = plausibility(
-        description,
-        recording.q,
-        recording.x,
-        sigma_m=told_sigma(recording) or fit.sigma_m,
-        orientation=recording.orientation,
-    )
+    seen = _checked(description, recording, source, fit.sigma_m)
     if seen.misread:
         seen.require(source, force=force)
     common, unknown = _common_errors(config, source, taken)
@@ -233,6 +225,16 @@ def arm(
         sys.stderr.writelines(f"{line}\n" for line in [*of_cameras, *changed])
     else:
         _show(report, [*of_cameras, *lines, *changed], told)
+
+
+def _checked(robot: RobotDescription, recording: Recording, source: Path, sigma_m: float | None) -> Plausibility:
+    """Check that the recording can be of this robot; refuse units that no arm has."""
+    from bodyschema.calibration.plausibility.check import plausibility, told_sigma
+    from bodyschema.calibration.plausibility.limits import require_units
+
+    require_units(robot, recording, source)
+    sigma_m = told_sigma(recording) or sigma_m
+    return plausibility(robot, recording.q, recording.x, sigma_m=sigma_m, orientation=recording.orientation)
 
 
 def _common_errors(config: Config, source: Path, taken: SourceOptions) -> tuple[CommonErrors | None, list[str]]:
