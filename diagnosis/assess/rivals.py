@@ -9,7 +9,7 @@ import numpy as np
 
 from bodyschema.diagnosis.fit.fit import Fit, amount_columns, solved
 from bodyschema.diagnosis.fit.scatter import beyond_single_rows, limited_rows, remembers
-from bodyschema.diagnosis.fit.worth import nats
+from bodyschema.diagnosis.fit.worth import SAME, nats
 from bodyschema.diagnosis.search.held_out import Blocks
 from bodyschema.diagnosis.search.scan import Candidate
 from bodyschema.diagnosis.search.search import Search
@@ -19,8 +19,6 @@ from bodyschema.interfaces.records import FloatArray
 
 from .nameless import Nameless
 
-# Signals that differ by less than this, twice the log-likelihood that the right one is expected to gain, are one.
-SAME = 6.0
 # Predictions are the same if their expected Δχ² is smaller.
 _SAME_SHARE = 1e-3
 # Number of resamplings for probabilities; 0.3 to 3 times this changes them by less than 0.03.
@@ -114,6 +112,7 @@ def _standing(
         rival = beside.exchanged(candidate, fit.log_likelihood - _HOPELESS)
         doubt = float(np.log(max(candidate.trials / max(itself.trials, 1), 1e-3)))
         more = nats(2.0 * (rival.log_likelihood - fit.log_likelihood), candidate.dof - itself.dof) - doubt
+        more += search.for_zero(fit, itself, candidate)
         alike = remembers(cause) and remembers(candidate.effect)
         tried.append((rival, candidate.effect))
         behind.append(more + (beyond_single_rows(fit, rival) if alike else 0.0))

@@ -8,6 +8,8 @@ import numpy as np
 
 from bodyschema.effects import Effect
 
+# Signals that differ by less than this, twice the log-likelihood that the right one is expected to gain, are one.
+SAME = 6.0
 # Smallest evidence gain of a cause [nats].
 NAMED = 3.0
 # Cost of each further joint with the same kind of error, which is often set in one session [nats].

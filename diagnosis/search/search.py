@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 from scipy.special import chdtri
 
-from bodyschema.diagnosis.fit.fit import Fit, improved
+from bodyschema.diagnosis.fit.fit import Fit, amount_columns, improved, solved
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.fit.scatter import beyond_single_rows, instruments, remembers
-from bodyschema.diagnosis.fit.worth import NAMED, choices, nats, rise_for
+from bodyschema.diagnosis.fit.worth import ANOTHER, NAMED, SAME, choices, nats, rise_for
 from bodyschema.effects import Effect, Identity
 
 from .held_out import Blocks, block_p_value
@@ -52,6 +52,7 @@ class Beside:
     """A fit without one of its causes, with the candidates for its place.
 
     Attributes:
+        others: the other causes.
         itself: the cause with its best first-order fit.
         gain: its present first-order gain, Δχ².
         in_parts: the cause with the best choice of its amounts; None where there is no choice.
@@ -68,7 +69,7 @@ class Beside:
         candidates: list[Candidate],
     ) -> None:
         self._fit, self._cause = fit, cause
-        self._others = [effect for effect in fit.causes if effect is not cause]
+        self.others = [effect for effect in fit.causes if effect is not cause]
         self._tried: dict[Identity, Fit] = {}
         self.itself = itself or Candidate(cause, 0.0, 1)
         self.gain, self.in_parts, self.candidates = gain, in_parts, candidates
@@ -76,7 +77,7 @@ class Beside:
     @cached_property
     def without(self) -> Fit:
         """Return the fit without the cause."""
-        return improved(self._fit.starting(self._others))
+        return improved(self._fit.starting(self.others))
 
     @property
     def lead(self) -> float:
@@ -89,11 +90,11 @@ class Beside:
         if self._fit.loss(self._cause) > _CLEARLY * rise + _AT_LEAST:
             return False
         least = self._fit.log_likelihood - rise
-        return improved(self._fit.starting(self._others), least).log_likelihood > least
+        return improved(self._fit.starting(self.others), least).log_likelihood > least
 
     def elsewhere(self, least: float) -> Fit:
         """Refit with the best moment or period of the cause; give up where `least` is out of reach [nats]."""
-        return improved(self._fit.starting([*self._others, self.itself.effect]), least)
+        return improved(self._fit.starting([*self.others, self.itself.effect]), least)
 
     def exchanged(self, candidate: Candidate, least: float) -> Fit:
         """Refit with a candidate in the place of the cause; the best such fit is kept."""
@@ -101,7 +102,7 @@ class Beside:
         known = self._tried.get(effect.identity)
         if known is None or known.log_likelihood < least:
             expected = self._fit.log_likelihood + 0.5 * (candidate.gain - self.itself.gain)
-            start = known or self._fit.starting([*self._others, effect])
+            start = known or self._fit.starting([*self.others, effect])
             known = self._tried[effect.identity] = joined(start, effect, least, expected)
         return known
 
@@ -162,7 +163,7 @@ class Search:
         for candidate in self.shortlist(known or Scan(fit), self._open(fit)):
             if self.agreed(fit, candidate) < NAMED:
                 continue
-            doubt = self.doubt(candidate)
+            doubt = self.doubt(candidate, fit.causes)
             least = fit.log_likelihood + rise_for(most + doubt, candidate.dof)
             start = fit.starting([*fit.causes, candidate.effect])
             tried = joined(start, candidate.effect, least, fit.log_likelihood + 0.5 * candidate.gain)
@@ -174,12 +175,24 @@ class Search:
 
     def _exchanged(self, fit: Fit, beside: Beside, candidate: Candidate, least: float) -> tuple[Fit, float]:
         """Exchange a cause for a candidate, and return the evidence gain [nats]; approximate if below `least`."""
-        doubts, dof = self.doubt(beside.itself) - self.doubt(candidate), candidate.dof - beside.itself.dof
+        dof = candidate.dof - beside.itself.dof
+        doubts = self.doubt(beside.itself, beside.others) - self.doubt(candidate, beside.others)
+        doubts += self.for_zero(fit, beside.itself, candidate)
         alike = remembers(beside.itself.effect) and remembers(candidate.effect)
         least -= _OF_SINGLE_ROWS if alike else 0.0
         tried = beside.exchanged(candidate, fit.log_likelihood + rise_for(least - doubts, dof))
         worth = nats(2.0 * (tried.log_likelihood - fit.log_likelihood), dof) + doubts
         return tried, worth + (beyond_single_rows(fit, tried) if alike else 0.0)
+
+    def for_zero(self, fit: Fit, cause: Candidate, other: Candidate) -> float:
+        """Return what favours `other` in the place of a cause if one is a joint offset that the other contains [nats].
+
+        A link turned about its joint's axis, or about the one before, is that joint's offset. Its further numbers have
+        to be worth a name beside the offset.
+        """
+        if contains(fit, cause.effect, other.effect):
+            return NAMED + self.doubt(other)
+        return -NAMED - self.doubt(cause) if contains(fit, other.effect, cause.effect) else 0.0
 
     def _open(self, fit: Fit) -> list[Effect]:
         """Return the hypotheses that are not causes of a fit, with one more of each that begins at a moment."""
@@ -195,10 +208,11 @@ class Search:
                 others.append(next(one for one in more if one.identity not in taken))
         return others
 
-    def doubt(self, candidate: Candidate) -> float:
-        """Return the multiplicity penalty for the number of places searched [nats]."""
+    def doubt(self, candidate: Candidate, beside: Iterable[Effect] = ()) -> float:
+        """Return the multiplicity penalty for the number of places searched, beside other causes [nats]."""
         self._trials[candidate.effect.key] = candidate.trials
-        return float(self.multiplicity + np.log(candidate.trials))
+        is_another = candidate.effect.kind.is_zero and any(one.kind.is_zero for one in beside)
+        return float((min(self.multiplicity, ANOTHER) if is_another else self.multiplicity) + np.log(candidate.trials))
 
     def doubt_of(self, effect: Effect) -> float:
         """Return the multiplicity penalty of an effect that was a candidate [nats]."""
@@ -209,7 +223,7 @@ class Search:
         """Return the evidence gain of a cause of a fit over leaving it out [nats]."""
         beside = self.beside(fit, cause)
         gain = 2.0 * (fit.log_likelihood - beside.without.log_likelihood)
-        worth = nats(gain, beside.itself.dof) - self.doubt(beside.itself)
+        worth = nats(gain, beside.itself.dof) - self.doubt(beside.itself, beside.others)
         return min(worth, self.agreed(beside.without, beside.itself)) if remembers(cause) else worth
 
     def agreed(self, fit: Fit, candidate: Candidate) -> float:
@@ -218,10 +232,11 @@ class Search:
         columns = instruments(fit, effect)
         chance = block_p_value(fit, columns, blocks)
         gain = float(chdtri(candidate.dof, max(chance, 1e-290)))
-        worth = nats(gain, candidate.dof) - self.doubt(candidate)
+        doubt = self.doubt(candidate, fit.causes)
+        worth = nats(gain, candidate.dof) - doubt
         if blocks.count < _FEW_BLOCKS and worth < NAMED:
             # Few blocks cannot give a small p-value; a large gain counts without them.
-            plain = nats(fit.independence * candidate.gain, candidate.dof) - self.doubt(candidate)
+            plain = nats(fit.independence * candidate.gain, candidate.dof) - doubt
             worth = max(worth, plain) if plain > _BEYOND_DOUBT else worth
         return worth
 
@@ -301,7 +316,7 @@ class Search:
             if worth > _ELSEWHERE:
                 return tried
         counted = self._counted(fit, cause)
-        least = NAMED + self.doubt(beside.itself)
+        least = NAMED + self.doubt(beside.itself, beside.others)
         lost = beside.is_lost_for(least if counted == 1.0 else _rise(least, beside.itself.dof, counted))
         lost = lost or not cause.is_possible
         if lost or (remembers(cause) and self.agreed(beside.without, beside.itself) < NAMED):
@@ -347,6 +362,20 @@ def joined(start: Fit, sought: Effect, least: float, expected: float) -> Fit:
 def named(causes: Sequence[Effect]) -> Named:
     """Return the identity of a set of causes without their parameters: the count of each kind at each place."""
     return frozenset(Counter(effect.key for effect in causes).items())
+
+
+def contains(fit: Fit, link: Effect, zero: Effect) -> bool:
+    """Return True if numbers of a link, and more, can do what a joint offset does, as far as the data of a fit tell."""
+    if not (link.kind.in_parts and zero.kind.is_zero and len(link.amounts) > len(zero.amounts)):
+        return False
+    if all(cause.identity != link.identity for cause in fit.causes):
+        # A turn by some degrees is not linear about its own size.
+        link = link.with_values(np.zeros_like(link.values))
+    columns = fit.weighted(amount_columns(fit.run, [zero, link, *fit.simulation.effects[: fit.nuisances]]))
+    flat, own = columns.reshape(fit.left.size, -1), len(zero.amounts)
+    change, others = flat[:, :own] @ zero.values[zero.amounts], flat[:, own:]
+    left = change - others @ solved(others.T @ others, others.T @ change)
+    return float(left @ left) < SAME * fit.noise.sigma**2
 
 
 def are_a_description(causes: Sequence[Effect]) -> bool:

@@ -39,6 +39,8 @@ _SMALLEST, _QUIETEST = 1e-3, 1e-3
 _TRIED = 4
 # With all scales below this, also try an arm exactly as described, such as a simulated one.
 _MAY_BE_EXACT = 0.5
+# Prior width of what robot.toml does not know, about the fit, in usual sizes; the same in all fits, to compare them.
+_FREE = 100.0
 # Relative rounding of squares, and of columns that are collinear up to rounding.
 _ROUNDED_OFF, _ONE_BEYOND_ROUNDING = 1e-13, 1e-8
 # Evidence loss without a scale's tolerances from which they show in the data [nats].
@@ -122,8 +124,9 @@ class Sets:
     def __init__(self, fit: Fit, candidates: Sequence[Candidate], doubt: float) -> None:
         columns, amounts = fit.columns, fit.effect_columns.shape[2]
         causes = sum(len(effect.amounts) for effect in fit.causes)
-        own = [effect.values[effect.amounts] for effect in fit.simulation.effects]
-        now = np.concatenate([*own, fit.tolerated])
+        found = [effect.values[effect.amounts] for effect in fit.causes]
+        # What robot.toml does not know counts from where the fit has it, however far from its nominal place.
+        now = np.concatenate([np.zeros(amounts - causes), *found, fit.tolerated])
         rows = fit.left.size
         target = fit.left.ravel() + columns.reshape(rows, -1) @ now
         parts = [columns[:, :, : amounts - causes], columns[:, :, amounts:]]
@@ -133,13 +136,14 @@ class Sets:
         self._of_scale, self._noise = fit.background.group, fit.noise.sigma
         scales = np.asarray(fit.background.scales or Scales())[fit.background.group]
         flat = np.concatenate(parts, axis=2).reshape(rows, -1)
-        usual = [effect.parameters[k].usual for effect in self.effects for k in effect.amounts]
-        self._units = np.concatenate([np.ones(self._nuisances), fit.background.tolerances / scales, usual])
-        lengths = np.linalg.norm(flat[:, : self._nuisances], axis=0)
-        self._units[: self._nuisances] = 1e4 / np.where(lengths > 0.0, lengths, 1.0) * fit.noise.sigma * np.sqrt(rows)
+        unknown = _FREE * _usual(fit.simulation.effects[: fit.nuisances])
+        self._units = np.concatenate([unknown, fit.background.tolerances / scales, _usual(self.effects)])
         flat *= self._units
         self._inner, self._toward = flat.T @ flat, flat.T @ target
         self._square, self._rows = float(target @ target), 3.0 * float(fit.noise.weights.sum())
+        # Outliers of one fit may be the marker in another, with other causes: compare all rows.
+        left = float(np.square(fit.left).sum()) / fit.noise.sigma**2
+        self._outliers = fit.noise.log_likelihood + self._rows * math.log(fit.noise.sigma) + 0.5 * left
         self._kinds, self._keys = [one.kind for one in self.effects], [one.key for one in self.effects]
         self._trials = [float(np.log(candidate.trials)) for candidate in candidates]
         self._first = doubt + NAMED
@@ -159,10 +163,21 @@ class Sets:
         self._begins = {k for k, one in enumerate(self.effects) if one.kind.begins and one.identity not in known}
 
     def climbed(self, starts: Iterable[tuple[int, ...]]) -> list[Together]:
-        """Improve each start by single changes, and return the sets reached."""
+        """Improve each start by single changes, and return the sets reached, without causes that cannot be.
+
+        Without them different sets may be the same.
+        """
         seen: dict[frozenset[int], Together] = {}
-        reached = {one.chosen: one for one in (self._climbed(start, seen) for start in starts)}
-        return list(reached.values())
+        reached = (self.possible(self._climbed(start, seen)) for start in starts)
+        return list({frozenset(one.chosen): one for one in reached}.values())
+
+    def possible(self, here: Together) -> Together:
+        """Return a set without the causes whose amounts would be impossible, such as a negative backlash."""
+        absent = {cause.identity for cause in self.causes(here) if not cause.is_possible}
+        if not absent:
+            return here
+        stays = tuple(k for k in here.chosen if self.effects[k].identity not in absent)
+        return self.possible(self.of(stays, here))
 
     def starts(self, own: tuple[int, ...], *, links: bool) -> Iterator[tuple[int, ...]]:
         """Yield the starting sets: the fit's causes, none, all joint offsets, and all effects of each kind.
@@ -366,7 +381,7 @@ class Sets:
             exact = self._solved(inner, toward, group, np.full(_SCALES, _LOG_SMALLEST), sigma)
             if (evidence := self._evidence(exact, toward, sigma)) > worth:
                 worth, solution, scales = evidence, exact, Scales(*[_SMALLEST] * _SCALES)
-        worth -= self._cost(chosen)
+        worth += self._outliers - self._cost(chosen)
         factor, _, amounts = solution
         return Together(chosen, worth, scales, sigma, spent, amounts, factor, columns)
 
@@ -441,6 +456,11 @@ class Sets:
             values[effect.amounts] = here.amounts[np.searchsorted(here.columns, places)] * self._units[places]
             found[effect.identity] = replace(effect, free=free).with_values(values)
         return [cause.freeing(cause.free) for cause in found.values()]
+
+
+def _usual(effects: Sequence[Effect]) -> FloatArray:
+    """Return the usual sizes of the amounts of effects (p,)."""
+    return np.array([effect.parameters[k].usual for effect in effects for k in effect.amounts])
 
 
 def _columns(fit: Fit, effects: Sequence[Effect]) -> Iterator[FloatArray]:
@@ -598,7 +618,7 @@ class _Place:
         along an arc.
         """
         zeros = [k for k, effect in enumerate(self._sets.effects) if effect.kind.is_zero]
-        return self._sets.of(tuple(dict.fromkeys((*self.here.chosen, *zeros))))
+        return self._sets.possible(self._sets.of(tuple(dict.fromkeys((*self.here.chosen, *zeros)))))
 
     def numbers_of(self, one: Together) -> list[Effect]:
         """Return the causes of a set, those of which some numbers may be free once for each."""
@@ -606,8 +626,7 @@ class _Place:
 
     def refitted(self, one: Together) -> Fit:
         """Refit one of the sets about its own parameters."""
-        possible = [cause for cause in self._sets.causes(one) if cause.is_possible]
-        return self.fit.starting(possible).tolerating(one.scales).tolerating(one.scales)
+        return self.fit.starting(self._sets.causes(one)).tolerating(one.scales).tolerating(one.scales)
 
 
 def _beside_links(fit: Fit, absent: Sequence[Effect]) -> list[Candidate]:

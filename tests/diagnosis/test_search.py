@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from planted_cases import BASE, ELBOW, INTERVAL_S, SHOULDER, at_rest, desk_arm, start_of, surveyed_arm, walk
+from planted_cases import BASE, ELBOW, INTERVAL_S, SHOULDER, WRIST, at_rest, desk_arm, start_of, surveyed_arm, walk
 
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.worth import NAMED, nats, rise_for
-from bodyschema.diagnosis.search.scan import Scan
-from bodyschema.diagnosis.search.search import Search, simplicity
+from bodyschema.diagnosis.search.scan import Candidate, Scan
+from bodyschema.diagnosis.search.search import Search, contains, simplicity
 from bodyschema.diagnosis.search.together import together
 from bodyschema.effects import Effect
 from bodyschema.robot.description import RobotDescription
@@ -88,6 +88,36 @@ def test_an_offset_is_named_rather_than_a_link_that_can_do_the_same(robot) -> No
     hypotheses = [Effect.at(robot, "link_geometry", ELBOW), Effect.at(robot, "joint_offset", ELBOW)]
     found = Search(hypotheses, lambda _: None).run(start_of(robot, walk(robot, 2), (truth,), 2))
     assert names(found) == {("joint_offset", ELBOW)}
+
+
+@pytest.mark.parametrize("from_link", [False, True])
+def test_an_offset_is_named_though_a_link_that_contains_it_fits_slightly_better(from_link) -> None:
+    robot = surveyed_arm()
+    offset = Effect.at(robot, "joint_offset", ELBOW, values=[0.03])
+    slightly_off = Effect.at(robot, "link_geometry", ELBOW, values=[0.0, 5e-5, 0.0, 0.0, 0.0, 0.0])
+    link = Effect.at(robot, "link_geometry", ELBOW)
+    start = start_of(robot, walk(robot, 2, 150), (offset, slightly_off), 2)
+    found = Search([link, at_rest(offset)] * 12, lambda _: None).run(start.with_causes([link] * from_link))
+    assert names(found) == {("joint_offset", ELBOW)}
+
+
+@pytest.mark.parametrize(
+    ("where", "free", "contained"),
+    [(ELBOW, (3, 4), True), (ELBOW, (3, 5), False), (SHOULDER, (0, 1, 2, 3, 4, 5), False), (WRIST, (0, 4), True)],
+)
+def test_a_link_contains_the_offsets_of_the_joints_at_its_ends(where, free, contained) -> None:
+    robot = surveyed_arm()
+    offset = Effect.at(robot, "joint_offset", ELBOW, values=[0.03])
+    link = Effect.at(robot, "link_geometry", where, values=[0.02] * 6).freeing(free)
+    fit = start_of(robot, walk(robot, 2, 60), (offset,), 2).with_causes([offset])
+    assert contains(fit, link, fit.causes[0]) is contained
+
+
+def test_the_zero_of_another_joint_needs_less_evidence_than_the_first(robot) -> None:
+    first, offset = (Effect.at(robot, "joint_offset", joint, values=[0.02]) for joint in (ELBOW, SHOULDER))
+    scale = Effect.at(robot, "joint_scale", ELBOW)
+    search, candidate = Search([offset] * 100, lambda _: None), Candidate(offset, 10.0, 1)
+    assert search.doubt(candidate, [first]) < search.doubt(candidate, [scale]) == search.doubt(candidate)
 
 
 def test_a_link_gives_way_to_the_offsets_that_it_contains(robot) -> None:
