@@ -330,17 +330,18 @@ class Fit:
         groups = np.full(len(precision), -1)
         groups[first : first + len(self.tolerated)] = self.background.group
         units = 1.0 / np.sqrt(np.diag(products) + precision)
-        inner, toward = products * np.outer(units, units), (products @ now + scores) * units
+        # Relative to the fit: an instrument that stands metres away would leave nothing of the evidence but rounding.
+        inner, toward, now, prior = products * np.outer(units, units), scores * units, now / units, precision * units**2
         factors = np.ones(len(precision))
-        here = _posteriors(inner, toward, (precision * units**2)[None])
+        here = _posteriors(inner, toward, now, prior[None])
         for g, scale in enumerate(self.background.scales):
             mine = groups == g
-            spent = float(mine.sum() - (here.variances[0] * precision * units**2)[mine].sum())
+            spent = float(mine.sum() - (here.variances[0] * prior)[mine].sum())
             unsure = 1.0 / np.sqrt(2.0 * max(spent, 0.0) + 1.0 / SPREAD**2)
             logs = np.log(scale) + unsure * _NODES
             logs = logs[logs < np.log(MOST) + _STILL]
-            other = np.where(mine, np.exp(-2.0 * (logs - np.log(scale)))[:, None], 1.0) * precision * units**2
-            tried = _posteriors(inner, toward, other)
+            other = np.where(mine, np.exp(-2.0 * (logs - np.log(scale)))[:, None], 1.0) * prior
+            tried = _posteriors(inner, toward, now, other)
             evidence = tried.evidence + 0.5 * np.log(other[:, mine]).sum(axis=1) - 0.5 * np.square(logs / SPREAD)
             weights = np.exp(evidence - evidence.max())
             weights /= weights.sum()
@@ -598,20 +599,27 @@ def _best_of(fit: Fit, step: FloatArray) -> Fit | None:
 
 
 class _Posteriors(NamedTuple):
-    """Gaussian posteriors for m priors: means and variances (m, p), and log-evidence without prior volumes (m,)."""
+    """Gaussian posteriors for m priors: means relative to a fit and variances (m, p), and log-evidence (m,).
+
+    The evidence is without the volumes of the priors.
+    """
 
     means: FloatArray
     variances: FloatArray
     evidence: FloatArray
 
 
-def _posteriors(inner: FloatArray, toward: FloatArray, precision: FloatArray) -> _Posteriors:
-    """Return the posteriors of amounts with products (p, p), (p,) with the data, under prior precisions (m, p)."""
-    information = inner + (precision + _ROUNDED_OFF)[:, :, None] * np.eye(len(toward))
-    covariances = np.linalg.inv(information)
-    means = covariances @ toward
-    evidence = 0.5 * means @ toward - 0.5 * np.linalg.slogdet(information)[1]
-    return _Posteriors(means, np.einsum("mpp->mp", covariances), evidence)
+def _posteriors(inner: FloatArray, scores: FloatArray, now: FloatArray, precision: FloatArray) -> _Posteriors:
+    """Return the posteriors under priors about 0, from the likelihood's derivatives (p, p), (p,) at amounts `now` (p,).
+
+    Args:
+        precision: prior precisions (m, p).
+    """
+    information = inner + (precision + _ROUNDED_OFF)[:, :, None] * np.eye(len(scores))
+    covariances, toward = np.linalg.inv(information), scores - precision * now
+    means = np.einsum("mpq,mq->mp", covariances, toward)
+    evidence = 0.5 * (means * toward).sum(axis=1) - 0.5 * precision @ np.square(now)
+    return _Posteriors(means, np.einsum("mpp->mp", covariances), evidence - 0.5 * np.linalg.slogdet(information)[1])
 
 
 def _rise(promised: float, fit: Fit) -> float:

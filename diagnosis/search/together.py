@@ -278,7 +278,7 @@ class Sets:
         for k in chosen:
             kind = self._kinds[k]
             if kind.in_parts:
-                numbers[self._keys[k]] += 1
+                numbers[self._keys[k]] += len(self._places[k])
                 continue
             total += self._trials[k] + (min(self._first, ANOTHER) if kind in kinds else self._first)
             kinds.add(kind)

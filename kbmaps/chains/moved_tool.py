@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import FloatArray, rows
+from kbmaps.arrays import FloatArray
 from kbmaps.chains.chain import RigidChain
 from kbmaps.errors import DegenerateDataError
 from kbmaps.maps.kbmap import POSITION_OUTPUTS, KBMap
+from kbmaps.pairs import checked_pairs
 from kbmaps.robust import MEDIAN_NORM, ROUNDING_M, UNCALIBRATED_SIGMAS
 
 
@@ -27,9 +28,9 @@ def with_refitted_tool(
         sigma: noise of one coordinate [m], if known.
 
     Raises:
-        ShapeError, NonFiniteError, DegenerateDataError (no pairs)
+        ShapeError, NonFiniteError, SettingError (a sigma that is not positive), DegenerateDataError (no pairs)
     """
-    angles, positions = rows("q", q, chain.joints), rows("x", x, POSITION_OUTPUTS)
+    angles, positions, _ = checked_pairs(q, x, sigma, chain.joints)
     if not len(angles):
         raise DegenerateDataError("a marker's move needs at least 1 pair seen since; record more")
     oriented = KBMap(kbmap.bases, np.concatenate([kbmap.net[:POSITION_OUTPUTS], chain.orientation_maps(kbmap.bases)]))

@@ -114,8 +114,8 @@ class InverseKinematics:
 
     Args:
         model: positions and their derivative, as every map, chain and learner of this package has them; for poses also
-            the orientation (`PoseModel`): a `RigidChain` (that of a learner is `learner.chain`), a `KBMap` that has it,
-            or a `ToolLayer` on one of these.
+            the orientation (`PoseModel`): a `RigidChain` (that of a learner is `learner.chain`), or a `KBMap` that has
+            it.
         lower, upper: joint limits (d,) [rad, m]. A joint without a limit (infinite) may go anywhere; its samples are
             taken from one turn.
         seed: of the samples.

@@ -16,7 +16,8 @@ from bodyschema.diagnosis.fit.background import Scales
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.report.conclusion import conclusion
 from bodyschema.diagnosis.report.result import DiagnosisFile
-from bodyschema.diagnosis.search.together import beyond_tolerances, tolerated
+from bodyschema.diagnosis.search.scan import Candidate
+from bodyschema.diagnosis.search.together import Sets, beyond_tolerances, tolerated
 from bodyschema.effects import Effect, Simulation, load_simulation, write_extended
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.description import RobotDescription
@@ -190,3 +191,25 @@ def test_tolerances_cannot_stand_for_a_moment(robot: RobotDescription) -> None:
 )
 def test_a_slight_gain_keeps_no_link_that_tolerances_explain(robot: RobotDescription, name, loss, told) -> None:
     assert _is_told(Effect.at(robot, name, ELBOW), False, loss) is told
+
+
+def test_naming_a_link_costs_the_same_whole_as_number_by_number(robot: RobotDescription) -> None:
+    link = Effect.at(robot, "link_geometry", ELBOW, values=[1e-3, 0.0, 0.0, 0.0, 0.02, 0.0])
+    fit = start_of(robot, scattered(robot, 3, ROWS), (link,), 3).tolerating(Scales())
+    resting = link.with_values(np.zeros(6))
+    whole, numbers = resting.freeing((0, 1, 4)), [resting.freeing((number,)) for number in (0, 1, 4)]
+    at_once, in_parts = (Sets(fit, [Candidate(one, 0.0, 1) for one in some], 4.0) for some in ([whole], numbers))
+    assert at_once.of((0,)).worth == pytest.approx(in_parts.of((0, 1, 2)).worth, abs=1e-3)
+
+
+def test_intervals_do_not_depend_on_how_far_away_the_instrument_stands() -> None:
+    robot, rng = desk_arm(), np.random.default_rng([7, 10])
+    motion, ratio = scattered(robot, 3, ROWS), Effect.at(robot, "joint_scale", ELBOW, values=[0.02])
+    x = Simulation(robot, (ratio,), None, made(robot, rng)).positions(motion) + 5e-6 * rng.normal(size=(ROWS, 3))
+    widths = []
+    for away_m in (0.0, 10.0):
+        recording = measured(robot, motion, x + np.array([0.0, away_m, 0.0]))
+        start = aligned(Observations.of(recording, Simulation(robot)), Simulation(robot))
+        fit = start.with_causes([ratio]).tolerating(Scales())
+        widths.append(np.sqrt(np.diag(fit.covariance))[6:])
+    np.testing.assert_allclose(widths[1], widths[0], rtol=0.02)

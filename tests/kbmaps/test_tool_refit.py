@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 from planted_chains import bases_for, random_chain, random_map, random_q
 
-from kbmaps import DegenerateDataError, ExactLearner, prediction_errors, with_refitted_tool
+from kbmaps import (
+    DegenerateDataError,
+    ExactLearner,
+    NonFiniteError,
+    SettingError,
+    ShapeError,
+    prediction_errors,
+    with_refitted_tool,
+)
 
 
 @pytest.mark.parametrize("kinds", ["RRRR", "RPRR"])
@@ -37,4 +45,16 @@ def test_without_pairs_nothing_can_be_refitted():
     with pytest.raises(DegenerateDataError):
         with_refitted_tool(
             random_map(np.random.default_rng(1), bases_for("RR")), chain, np.empty((0, 2)), np.empty((0, 3))
+        )
+
+
+@pytest.mark.parametrize(
+    ("pairs", "sigma", "error"), [(1, None, ShapeError), (3, -0.01, SettingError), (3, float("nan"), NonFiniteError)]
+)
+def test_pairs_that_do_not_fit_together_are_refused(pairs, sigma, error):
+    rng = np.random.default_rng(4)
+    chain = random_chain(rng, "RR")
+    with pytest.raises(error):
+        with_refitted_tool(
+            chain.to_kbmap(bases_for("RR")), chain, random_q(rng, "RR", 3, 80), np.zeros((pairs, 3)), sigma
         )
