@@ -477,6 +477,11 @@ class OnlineLearner:
 
     def _waiting_for(self) -> str:
         needed, have = self.nominal.pairs_to_align, self._regimes.waiting.count
+        if have >= needed:
+            return (
+                f"there is no model yet: robot.toml says {self.nominal.unknown}, and the first fit of the {have} pairs "
+                "so far is not finished. Ask again in some seconds; if it stays so, guide the arm to other poses"
+            )
         return (
             f"there is no model yet: robot.toml says {self.nominal.unknown}, so positions have no frame until about "
             f"{needed} pairs have come ({have} so far). Start the sampler with `bodyschema run sampler` and guide "

@@ -27,6 +27,7 @@ from bodyschema.interfaces.records import Pair
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.model_bank import SOLVED
 from bodyschema.learning.online_learner import OnlineLearner
+from bodyschema.learning.snapshot import NoFrameError
 from bodyschema.learning.solvers.solver import DirectSolver, Solved
 from kbmaps import NLMS
 from kbmaps.contest import LISTED
@@ -304,6 +305,13 @@ def test_a_learner_that_waits_for_its_first_alignment_is_at_rest() -> None:
     learning = new_learning(nominal_model(pose_known=False))
     teach(learning, Scene.draw(0, 3).pairs)
     assert learning.at_rest
+
+
+def test_a_first_fit_under_way_is_not_called_too_few_pairs() -> None:
+    learning = new_learning(nominal_model(pose_known=False))
+    teach(learning, Scene.draw(0, 60).pairs, background=False)
+    with pytest.raises(NoFrameError, match="the first fit of the 60 pairs so far is not finished"):
+        learning.snapshot.predict(np.zeros((1, 4)))
 
 
 def test_reset_to_prior_answers_as_before_any_pair() -> None:

@@ -135,6 +135,11 @@ def predicted(learner: Config, capsys, *arguments: str) -> str:
     return " ".join(capsys.readouterr().out.split())
 
 
+def test_the_command_predict_speaks_of_one_vector(learner: Config) -> None:
+    with pytest.raises(RequestError, match=r"^q is 1e\+308 at joint 'waist'"):
+        app(["predict", "--robot", str(learner.file), "1e308", "0"], exit_on_error=False, result_action="return_value")
+
+
 def test_predict_loads_no_numpy(learner: Config) -> None:
     last = "atexit.register(lambda: print('numpy' in sys.modules))"
     code = f"import atexit, sys; {last}; from bodyschema.cli.main import main; main()"

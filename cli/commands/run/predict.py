@@ -46,7 +46,8 @@ def predict(
     with config.checked_on_error():
         rows = _rows(q, config, deg)
         with client(config.route("learner")) as bus:
-            reply = decode(bus.ask_one(Keys(config.name).predict, encode(JointsRequest([*rows]))), PredictReply)
+            request = JointsRequest([*(rows[0] if len(rows) == 1 else rows)])
+            reply = decode(bus.ask_one(Keys(config.name).predict, encode(request)), PredictReply)
     if as_json:
         print_json(reply)
         return
