@@ -515,8 +515,8 @@ class PairStore:
 
 
 def require_store(file: Path) -> None:
-    """Raise StoreError if the file does not exist."""
-    if not file.is_file():
+    """Raise StoreError if nothing is there. What is no file is refused when it is opened."""
+    if not file.exists():
         raise StoreError(f"there is no store {file}. The sampler makes it: start it with `bodyschema run sampler`")
 
 

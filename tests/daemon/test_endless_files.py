@@ -94,6 +94,8 @@ def test_no_store_is_opened_where_something_else_is(tmp_path: Path, make: Callab
     make(tmp_path / "pairs.sqlite")
     with pytest.raises(StoreError, match="is not a file"):
         store_schema.connect(tmp_path / "pairs.sqlite")
+    with pytest.raises(StoreError, match="is not a file"), PairReader(tmp_path / "pairs.sqlite"):
+        pass
 
 
 def test_an_image_of_more_pixels_than_memory_is_none(tmp_path: Path) -> None:
