@@ -144,12 +144,12 @@ def test_a_port_of_another_group_is_told_with_the_command(machine, monkeypatch) 
 class Told:
     """Doctor's findings about emulated servos."""
 
-    def __init__(self, make: str, tmp_path: Path, *faults: str, delay_s: float = 0.0) -> None:
+    def __init__(self, make: str, tmp_path: Path, *faults: str, delay_s: float = 0.0, read_s: float = 0.2) -> None:
         arm_of, config, the_make, open_port, *_ = MAKES[make]
         asked = [AskedFault.parsed(fault, JOINTS, arm_of.kinds) for fault in faults]
         self.arm = arm_of(config, dict.fromkeys(JOINTS, lambda _: 0.2), faults=asked, return_delay_s=delay_s)
         with DryRun(self.arm, {"arm": tmp_path / "bus"}) as bench:
-            self.checks = list(servo_checks(the_make, bench.config, SystemClock(), open_port, read_s=0.2))
+            self.checks = list(servo_checks(the_make, bench.config, SystemClock(), open_port, read_s=read_s))
 
     def of(self, subject: str) -> list[Check]:
         return [check for check in self.checks if check.subject == subject]
@@ -158,6 +158,8 @@ class Told:
 @EACH
 def test_servos_that_are_well_are_told_with_their_rate(make, tmp_path) -> None:
     told = Told(make, tmp_path)
+    if told.of("rate")[0].state == "wrong":  # on a full machine the bench may not answer in so short a time
+        told = Told(make, tmp_path, read_s=20.0)
     assert told.of("servos") == [Check("servos", "ok", "all 2 answer, each of the model that robot.toml names")]
     assert "readings/s are possible (250 wanted)" in told.of("rate")[0].said
 
