@@ -131,7 +131,7 @@ def _pose_columns(fit: Fit, run: Simulated) -> FloatArray:
     columns = [_columns(fit, run), *(run.by_shape(effect) for effect in fit.causes if effect.shapes)]
     numbers = [(effect, len(effect.amounts)) for effect in fit.simulation.effects]
     numbers += [(effect, len(effect.shapes)) for effect in fit.causes]
-    counted = np.concatenate([np.full(count, _is_of_pose(effect)) for effect, count in numbers])
+    counted = np.array([_is_of_pose(effect) for effect, count in numbers for _ in range(count)], dtype=bool)
     return np.concatenate(columns, axis=2) * np.insert(counted, fit.amounts, np.ones(len(fit.tolerated), dtype=bool))
 
 

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from bodyschema.cli.terminal.diagnosis_run import Found, Source
 from bodyschema.diagnosis.assess.stored import predicted_pose_covariance
 from bodyschema.diagnosis.diagnosis import Diagnosis
+from bodyschema.diagnosis.fit.background import Scales
 from bodyschema.diagnosis.fit.fit import fitted
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.effects import Effect, Motion, Simulation
@@ -75,6 +76,13 @@ def test_covariance_of_predicted_poses_covers_the_truth() -> None:
 
 def test_where_nothing_was_fitted_the_covariance_of_predicted_poses_is_not_known() -> None:
     assert predicted_pose_covariance(found(RobotDescription.load(DESK_ARM), None, 0, ()).diagnosis.stored) is None
+
+
+def test_tolerances_alone_have_a_covariance_of_predicted_poses() -> None:
+    fit = found(RobotDescription.load(DESK_ARM), None, 0, ()).diagnosis.stored.tolerating(Scales())
+    cov = predicted_pose_covariance(fit)
+    assert cov is not None
+    assert np.linalg.eigvalsh(cov).min() > 0.0
 
 
 def test_a_predicted_pose_turns_by_as_much_as_its_joint_is_unsure() -> None:
