@@ -50,7 +50,7 @@ class Explanation:
         worth: log-evidence of the whole, comparable only with that of other explanations [nats].
         size: RMS change by the unnamed causes beyond the named ones, in units of the stated noise.
         promise: first-order gain of the best single unnamed cause beside the named ones [nats].
-        counted: effective number of independent rows per row (0 to 1].
+        counted: effective number of independent rows per row (0, 1].
     """
 
     fit: Fit
