@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -48,6 +49,8 @@ def missing_here() -> str | None:
         return "no systemd, unshare, nsenter or ip; to run it: apt-get install systemd util-linux iproute2"
     if unified() is None:
         return "no cgroup2; to run it: mount -t cgroup2 none /sys/fs/cgroup"
+    if Path(sys.prefix).is_relative_to("/tmp"):
+        return "units with a /tmp of their own do not see a checkout in /tmp; to run it: clone it elsewhere"
     tried = ["unshare", "--fork", *NAMESPACES, "sh", "-c", "mount --make-rprivate / && mount -t cgroup2 none /mnt"]
     done = subprocess.run(tried, capture_output=True, text=True, timeout=LIMIT_S, check=False)
     if done.returncode != 0:
