@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -279,7 +280,7 @@ def diagnose(
     told.begin(SETS)
     told(f"{len(hypotheses.effects)} hypotheses")
     blocks = blocks or Blocks.cut(len(recording))
-    rows = _part_of(len(observations))
+    rows = _part_of(observations.motion.begins)
     if len(rows) == len(observations):
         found = _found(observations, simulation, hypotheses.effects, blocks, seed, told)
     else:
@@ -366,11 +367,22 @@ class _Found:
         return _Found(start, self.search, unknowns, explanation, stands, loose, self.is_reshaped, self)
 
 
-def _part_of(rows: int) -> IntArray:
-    """Return the rows in which causes are sought: all, or equal runs that are spread over a long recording."""
+def _part_of(begins: NDArray[np.bool_]) -> IntArray:
+    """Return the rows in which causes are sought: all, or equal runs that are spread over a long recording.
+
+    Each run is the one of its stretch that is broken least often: after a break, nobody knows on which side of its
+    backlash a joint is.
+
+    Args:
+        begins: (n,), True in the first row after each break.
+    """
+    rows = len(begins)
     if rows <= 2 * _MOST_ROWS:
         return np.arange(rows)
+    breaks = np.convolve(begins[1:], np.ones(_RUN - 1), "valid")
     firsts = np.linspace(0, rows - _RUN, _MOST_ROWS // _RUN).astype(np.intp)
+    for k, (first, after) in enumerate(pairwise(firsts.tolist())):
+        firsts[k] += np.argmin(breaks[first : after - _RUN + 1])
     return (firsts[:, None] + np.arange(_RUN)).ravel()
 
 

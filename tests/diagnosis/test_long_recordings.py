@@ -48,9 +48,18 @@ def test_a_part_of_a_motion_keeps_its_clock_and_begins_a_run_after_each_gap() ->
 
 
 def test_a_long_recording_is_looked_at_from_its_first_to_its_last_row_in_equal_runs() -> None:
-    rows = diagnosis._part_of(ROWS)
+    rows = diagnosis._part_of(np.zeros(ROWS, dtype=np.bool_))
     assert (rows[0], rows[-1], len(rows)) == (0, ROWS - 1, PART)
-    assert len(diagnosis._part_of(2 * PART)) == 2 * PART
+    assert len(diagnosis._part_of(np.zeros(2 * PART, dtype=np.bool_))) == 2 * PART
+
+
+def test_runs_of_a_broken_recording_are_those_with_the_fewest_breaks() -> None:
+    begins = np.zeros(ROWS, dtype=np.bool_)
+    begins[::ROWS] = True
+    begins[[70, 75, 80, 85]] = True  # from 68 to 87 would be the second run
+    rows = diagnosis._part_of(begins).reshape(-1, 20)
+    assert rows[1, 0] == 85
+    np.testing.assert_array_equal(rows[2], np.arange(136, 156))
 
 
 def test_causes_found_in_a_part_are_fitted_to_all_rows(long: Diagnosis) -> None:
