@@ -563,10 +563,12 @@ def beyond_tolerances(fit: Fit, cause: Effect, doubt: float) -> bool | None:
     """
     if fit.background.scales is None or _beside_tolerances(fit, cause) > _FOLLOWED:
         return None
-    sets = Sets(fit, [Candidate(one, 0.0, 1) for one in fit.causes], doubt)
-    all_causes = tuple(range(len(fit.causes)))
-    whole = sets.of(all_causes)
-    return whole.worth > sets.of(_without(all_causes, [fit.causes.index(cause)]), whole).worth
+    everything = [Candidate(one, 0.0, 1) for one in fit.causes]
+    others = [one for one in everything if one.effect is not cause]
+    whole = Sets(fit, everything, doubt).of(tuple(range(len(everything))))
+    # Two causes may each seem to be needed beside tolerances that only both together make small.
+    fewer = Sets(fit, others, doubt).climbed((tuple(range(len(others))), ()))
+    return whole.worth > max(one.worth for one in fewer)
 
 
 def _beside_tolerances(fit: Fit, cause: Effect) -> float:

@@ -164,6 +164,23 @@ def test_a_ratio_is_named_though_large_drive_errors_could_follow_it(robot: Robot
     assert beyond_tolerances(fit, fit.causes[0], doubt=4.0)
 
 
+@pytest.mark.parametrize(("size", "beyond"), [(7.0, False), (30.0, True)])
+def test_two_offsets_that_need_each_other_are_tolerances(robot: RobotDescription, size: float, beyond: bool) -> None:
+    # Without either one, tolerances have to be as large as without both, and one name alone gains nothing.
+    rng, angle = np.random.default_rng([7, 3]), 3e-3
+    q = rng.uniform(0.7 * robot.lower, 0.7 * robot.upper, (ROWS, len(robot.joints)))
+    links = [np.concatenate([2e-3 * rng.normal(size=3), angle * rng.normal(size=3)]) for _ in robot.joints]
+    parts = zip(robot.joints, links, strict=True)
+    tolerances = tuple(Effect.at(robot, "link_geometry", joint, values=values) for joint, values in parts)
+    offsets = [Effect.at(robot, "joint_offset", j, values=[s * size * angle]) for j, s in ((SHOULDER, 1), (ELBOW, -1))]
+    x = Simulation(robot, tuple(offsets), None, tolerances).positions(motion_of(q))
+    recording = measured(robot, motion_of(q), x + NOISE_M * rng.normal(size=x.shape))
+    fit = aligned(Observations.of(recording, Simulation(robot)), Simulation(robot)).with_causes(offsets)
+    fit = fit.tolerating(Scales())
+    fit = fit.tolerating(tolerated(fit).scales)
+    assert [beyond_tolerances(fit, cause, doubt=4.0) for cause in fit.causes] == [beyond, beyond]
+
+
 def test_sizes_that_do_not_show_are_bounded_by_the_data_alone(robot: RobotDescription) -> None:
     rng, found = np.random.default_rng([7, 9]), []
     q = rng.uniform(0.7 * robot.lower, 0.7 * robot.upper, (ROWS, len(robot.joints)))
