@@ -62,6 +62,8 @@ class World:
         spec = mujoco.MjSpec.from_string(urdf)
         spec.option.timestep = STEP_S
         spec.option.gravity = [0.0, 0.0, -GRAVITY_M_S2]
+        # MuJoCo scales its tolerance by the mean inertia: with motors so heavy any other one ends the solver too early.
+        spec.option.tolerance = 0.0
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         for joint in spec.joints:
             joint.limited = mujoco.mjtLimited.mjLIMITED_FALSE

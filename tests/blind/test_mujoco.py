@@ -46,6 +46,14 @@ def test_a_play_held_by_friction_trails_its_motor() -> None:
     np.testing.assert_allclose(ahead[moving], -0.5 * PLAY * np.sign(np.gradient(q)[moving]), atol=0.05 * PLAY)
 
 
+def test_friction_holds_a_link_still_while_its_motor_turns_back() -> None:
+    q, ahead = driven(Hinge(half_width=0.5 * PLAY, bearing_friction=300.0, motor=SHOULDER))
+    held = [-0.5 * PLAY * np.sign(q[1] - q[0])]
+    for step in np.diff(q):
+        held.append(np.clip(held[-1] - step, -0.5 * PLAY, 0.5 * PLAY))
+    np.testing.assert_allclose(ahead, held, atol=0.001 * PLAY)
+
+
 def test_late_images_of_static_poses_change_nothing(tmp_path: Path) -> None:
     case = hide(list(KINDS).index("late"), "static", tmp_path, rows=40)
     assert case.truth == ()
