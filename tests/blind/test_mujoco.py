@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from .dense import Checkout
 from .mujoco_cases import HERE, judged, outcome, placed_mm, run
-from .mujoco_hide import KINDS, STYLES, Truth, hide
+from .mujoco_hide import KINDS, STYLES, Truth, _beside_one_flank, hide
 from .mujoco_urdf import MARKER, MODELS, Urdf
 from .mujoco_world import STEP_S, Hinge, World
 
@@ -58,6 +59,12 @@ def test_late_images_of_static_poses_change_nothing(tmp_path: Path) -> None:
     case = hide(list(KINDS).index("late"), "static", tmp_path, rows=40)
     assert case.truth == ()
     assert placed_mm(case) < 1e3 * case.noise_m  # this seed has no tolerances
+
+
+@pytest.mark.parametrize(("angles", "same"), [([1e-3, 1e-3], ("joint_offset@elbow",)), ([1e-3, -1e-3], ())])
+def test_a_play_on_one_flank_is_an_offset_as_well(angles, same) -> None:
+    world = SimpleNamespace(angles={"elbow_give": angles})
+    assert _beside_one_flank(Truth("gravity_backlash@elbow", "play"), world).same == same
 
 
 def told(*causes: dict, verdict: str = "explained", depends_on: tuple[str, ...] = ()) -> dict:
