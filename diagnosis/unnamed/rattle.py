@@ -69,7 +69,7 @@ def rattle(fit: Fit) -> Rattle | None:
 
 
 def rattle_beside(fit: Fit) -> Rattle | None:
-    """Return the play of the marker with a fit that goes with it: the numbers of the fit may have followed the sides."""
+    """Return the play of the marker beside a fit that goes with it; its numbers may have followed the sides."""
     play, likelier = None, _two_sided(fit)
     for _ in range(_FITS):
         if likelier is None or (play is not None and likelier.likelihood < play.likelihood + _SAME):
