@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from bodyschema.diagnosis.assess.explanation import (
     Explanation,
     changed_by_the_way,
+    cost_of_names,
     explain,
     useful,
     without_one,
@@ -26,13 +27,14 @@ from bodyschema.diagnosis.fit.background import Scales
 from bodyschema.diagnosis.fit.fit import Fit, fitted
 from bodyschema.diagnosis.fit.instrument import instrument_factor, reshaped
 from bodyschema.diagnosis.fit.observations import IntArray, Observations
+from bodyschema.diagnosis.fit.worth import NAMED
 from bodyschema.diagnosis.search.drives import with_small_ripples
 from bodyschema.diagnosis.search.held_out import Added, Blocks, added, gain_percent, held_out_errors, is_marker
 from bodyschema.diagnosis.search.hypotheses import Hypotheses
 from bodyschema.diagnosis.search.scan import Candidate, Scan
 from bodyschema.diagnosis.search.search import Search, are_a_description
 from bodyschema.diagnosis.search.together import Tolerated, together, tolerated
-from bodyschema.diagnosis.unnamed.rattle import Rattle, rattle
+from bodyschema.diagnosis.unnamed.rattle import Rattle, likelihood, rattle, rattle_beside
 from bodyschema.diagnosis.unnamed.unknown import Unknowns
 from bodyschema.effects import Effect, Identity, Simulation
 from bodyschema.interfaces.records import FloatArray
@@ -288,6 +290,9 @@ def diagnose(
         told(f"the same in all {len(observations)} rows")
         found = part.over(observations, simulation)
     start, explanation, search = found.start, found.explanation, found.search
+    if found.loose is not None:
+        # Where the side goes with the pose, one that follows it predicts better.
+        start = aligned(replace(start.observations, rattling=None), simulation)
     left = found.left(blocks)
     fit = (explanation.fit if left.model is None else left.model.fit).settled()
     made = tolerated(fit)
@@ -353,18 +358,25 @@ class _Found:
         if loose is not None:
             loose = rattle(fit) or loose
             observations = observations.with_rattle(loose.ratio, loose.ways_of(fit))
-        start = aligned(observations, simulation)
-        unknowns, fit, stands = Unknowns(start), fit.to(observations), list(self.standings)
+        fit, stands = fit.to(observations), list(self.standings)
         for k in range(len(stands)):
             moment = _moment_anew(fit, fit.causes[k], before.motion.clock) if fit.causes[k].kind.begins else None
             if moment is not None:
                 causes = [*fit.causes]
                 causes[k] = moment.effect
                 fit, stands[k] = fit.with_causes(causes), replace(stands[k], itself=moment)
+        again = replace(self, explanation=replace(self.explanation, fit=fit), standings=stands, loose=loose, part=self)
+        return again.of(observations, simulation)
+
+    def of(self, observations: Observations, simulation: Simulation) -> _Found:
+        """Return the same causes, fitted to other observations of the same motion."""
+        start = aligned(observations, simulation)
+        unknowns, fit = Unknowns(start), self.explanation.fit.to(observations)
         chosen = unknowns.again(self.explanation.unknown)
         apart = unknowns.apart(fit, chosen) if chosen else None
-        explanation = replace(self.explanation, fit=fit, apart=apart)
-        return _Found(start, self.search, unknowns, explanation, stands, loose, self.is_reshaped, self)
+        return replace(
+            self, start=start, unknowns=unknowns, explanation=replace(self.explanation, fit=fit, apart=apart)
+        )
 
 
 def _part_of(begins: NDArray[np.bool_]) -> IntArray:
@@ -427,10 +439,9 @@ def _found(
     if again is not extended:
         unknowns = Unknowns(start)
         extended = _searched(again, search)
-    loose = None if start.is_exact else rattle(extended)
-    if loose is not None and explain(extended, search.path, unknowns, search, told).unknown:
-        # An error of the last joint moves the marker along one line as well.
-        loose = None
+    told.begin(NAMELESS, SEARCH)
+    explanation = explain(extended, search.path, unknowns, search, told)
+    loose = None if start.is_exact else _loose(explanation, [start, begun.with_causes([]), extended], search)
     for _ in range(_RATTLED if loose is not None else 0):
         assert loose is not None
         told(loose.what)
@@ -438,12 +449,12 @@ def _found(
         # What rattles has no place of its own, and does not slip.
         fixed = [effect for effect in hypotheses if effect.kind.stage != "tool"]
         search = Search(fixed, told)
-        start = aligned(start.observations.with_rattle(loose.ratio, loose.ways), simulation)
+        start = aligned(loose.taken_out_of(start.observations), simulation)
         unknowns = Unknowns(start)
         extended = _searched(together(start, fixed, told), search)
+        explanation = explain(extended, search.path, unknowns, search, told)
         loose = rattle(extended) or loose
-    told.begin(NAMELESS, SEARCH)
-    explanation = useful(explain(extended, search.path, unknowns, search, told), search, blocks, told)
+    explanation = useful(explanation, search, blocks, told)
     told.begin(RIVALS, NAMELESS)
     stands = standings(explanation.beside, search, blocks, seed, None if explanation.unknown else unknowns)
     while explanation.unknown and any(standing.probability < _HALF for standing in stands):
@@ -453,7 +464,24 @@ def _found(
             break
         explanation = fewer
         stands = standings(explanation.beside, search, blocks, seed)
-    return _Found(start, search, unknowns, explanation, stands, loose, other_shape is not None)
+    found = _Found(start, search, unknowns, explanation, stands, loose, other_shape is not None)
+    if loose is None:
+        return found
+    # No simulation tells on which side the marker lies.
+    whole = start.observations.without_play(np.zeros_like(start.observations.x))
+    return found.of(whole.with_rattle(loose.ratio, loose.ways), simulation)
+
+
+def _loose(explanation: Explanation, fits: Sequence[Fit], search: Search) -> Rattle | None:
+    """Return the play of a loose marker, where two sides of it beside one of the fits are more probable than all else.
+
+    A joint's error can move the marker along one line as well, but then the joints or the path tell where it lies.
+    """
+    beside, found = explanation.beside, [(rattle_beside(fit), cost_of_names(fit.causes, search)) for fit in fits]
+    other = explanation.worth - explanation.counted * beside.log_likelihood + likelihood(beside)
+    worths = [(play.likelihood - names - other, play) for play, names in found if play is not None]
+    worth, play = max(worths, key=lambda one: one[0], default=(-np.inf, None))
+    return play if worth > NAMED else None
 
 
 def _counted(fit: Fit, start: Fit, simulation: Simulation, shape: Observations | None = None) -> tuple[Fit, Fit]:

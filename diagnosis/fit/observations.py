@@ -39,6 +39,7 @@ class Observations:
         stated_factor: factor of the instrument's standard deviations over the stated ones.
         doubtful: rows (n,) at which the simulation lacks a state it needs; None for no such rows.
         rattling: covariance (n, 3, 3) [m²] of a loose marker; None for one that is fixed.
+        play: displacement (n, 3) [m] of a loose marker that was taken out of `x`; 0 for none.
     """
 
     motion: Motion
@@ -48,6 +49,7 @@ class Observations:
     stated_factor: float = 1.0
     doubtful: NDArray[np.bool_] | None = None
     rattling: FloatArray | None = None
+    play: FloatArray | float = 0.0
 
     @classmethod
     def of(cls, recording: Recording, simulation: Simulation) -> Observations:
@@ -74,15 +76,19 @@ class Observations:
         """Covariances (n, 3, 3) [m²] of the instrument and of the encoders' quantisation, up to one factor."""
         return self.stated_factor**2 * self.stated + self.rounding
 
-    def with_rattle(self, ratio: float, ways: FloatArray) -> Observations:
+    def with_rattle(self, ratio: FloatArray | float, ways: FloatArray) -> Observations:
         """Return the same observations of a loose marker.
 
         Args:
-            ratio: variance that its play adds, over that of the noise.
+            ratio: variance that its play adds, over that of the noise, of all rows or of each (n,).
             ways: direction of the play at each row (n, 3).
         """
         variances = ratio * np.trace(self.own, axis1=1, axis2=2) / 3.0
         return replace(self, rattling=variances[:, None, None] * ways[:, :, None] * ways[:, None, :])
+
+    def without_play(self, play: FloatArray) -> Observations:
+        """Return the same observations of a marker whose displacement `play` (n, 3) [m] is taken out of them."""
+        return replace(self, x=self.x + self.play - play, play=play)
 
     def some(self, rows: IntArray) -> Observations:
         """Return a part of the observations, of increasing rows (m,), before anything is known of the noise."""

@@ -62,6 +62,8 @@ class World:
         spec = mujoco.MjSpec.from_string(urdf)
         spec.option.timestep = STEP_S
         spec.option.gravity = [0.0, 0.0, -GRAVITY_M_S2]
+        # MuJoCo scales its tolerance by the mean inertia: with motors so heavy any other one ends the solver too early.
+        spec.option.tolerance = 0.0
         spec.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         for joint in spec.joints:
             joint.limited = mujoco.mjtLimited.mjLIMITED_FALSE
@@ -73,6 +75,8 @@ class World:
         self._data = mujoco.MjData(self._model)
         model = self._model
         self._hinges = hinges
+        # Angles of the hinges at the rows of the last run that were looked at.
+        self.angles: dict[str, list[float]] = {}
         self._motors = np.array([self.address(name) for name in joints])
         for address in self._motors:
             model.dof_armature[address] = MOTOR_KG_M2
@@ -130,6 +134,7 @@ class World:
         for _ in range(round(settle_s / STEP_S)):
             data.qpos[motors], data.qvel[motors] = path[0], 0.0
             self._step()
+        self.angles = {name: [] for name in self._hinges}
         places, turns, wanted = [], [], iter([*looked_at.tolist(), -1])
         following = next(wanted)
         for row in range(len(path)):
@@ -137,6 +142,8 @@ class World:
             if row == following:
                 mujoco.mj_kinematics(model, data)
                 self._keep(places, turns)
+                for name, own in self.angles.items():
+                    own.append(float(data.qpos[self.address(name)]))
                 following = next(wanted)
             self._step()
         return np.array(places), np.array(turns)

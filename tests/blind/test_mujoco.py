@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from .dense import Checkout
 from .mujoco_cases import HERE, judged, outcome, placed_mm, run
-from .mujoco_hide import KINDS, STYLES, Truth, hide
+from .mujoco_hide import KINDS, STYLES, Truth, _beside_one_flank, hide
 from .mujoco_urdf import MARKER, MODELS, Urdf
 from .mujoco_world import STEP_S, Hinge, World
 
@@ -46,10 +47,24 @@ def test_a_play_held_by_friction_trails_its_motor() -> None:
     np.testing.assert_allclose(ahead[moving], -0.5 * PLAY * np.sign(np.gradient(q)[moving]), atol=0.05 * PLAY)
 
 
+def test_friction_holds_a_link_still_while_its_motor_turns_back() -> None:
+    q, ahead = driven(Hinge(half_width=0.5 * PLAY, bearing_friction=300.0, motor=SHOULDER))
+    held = [-0.5 * PLAY * np.sign(q[1] - q[0])]
+    for step in np.diff(q):
+        held.append(np.clip(held[-1] - step, -0.5 * PLAY, 0.5 * PLAY))
+    np.testing.assert_allclose(ahead, held, atol=0.001 * PLAY)
+
+
 def test_late_images_of_static_poses_change_nothing(tmp_path: Path) -> None:
     case = hide(list(KINDS).index("late"), "static", tmp_path, rows=40)
     assert case.truth == ()
     assert placed_mm(case) < 1e3 * case.noise_m  # this seed has no tolerances
+
+
+@pytest.mark.parametrize(("angles", "same"), [([1e-3, 1e-3], ("joint_offset@elbow",)), ([1e-3, -1e-3], ())])
+def test_a_play_on_one_flank_is_an_offset_as_well(angles, same) -> None:
+    world = SimpleNamespace(angles={"elbow_give": angles})
+    assert _beside_one_flank(Truth("gravity_backlash@elbow", "play"), world).same == same
 
 
 def told(*causes: dict, verdict: str = "explained", depends_on: tuple[str, ...] = ()) -> dict:

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from planted_cases import SIGMA_M, measured, scattered, surveyed_arm
+from planted_cases import SIGMA_M, measured, scattered, surveyed_arm, walk
 
 from bodyschema.diagnosis import diagnosis
 from bodyschema.diagnosis.diagnosis import diagnose
@@ -14,6 +14,7 @@ from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.report.conclusion import conclusion
 from bodyschema.diagnosis.report.result import DiagnosisFile
+from bodyschema.diagnosis.unnamed.rattle import Rattle
 from bodyschema.effects import Effect, Simulation
 
 HALF_M = 2e-3
@@ -41,6 +42,18 @@ def test_the_play_of_a_loose_marker_is_not_in_the_noise(file) -> None:
     assert file.rms_mm.noise_floor == pytest.approx(1e3 * np.sqrt(3.0) * SIGMA_M, rel=0.15)
 
 
+def test_a_marker_that_hangs_where_gravity_takes_it_is_loose() -> None:
+    robot, rng = surveyed_arm(), np.random.default_rng(6)
+    motion = walk(robot, 2)
+    run, way = Simulation(robot).run(motion), np.array([0.6, 0.0, 0.8])
+    ways = run.columns(Effect.at(robot, "tool_offset")) @ way
+    down = (ways @ run.simulation.camera_pose[:3, :3].T)[:, 2]
+    x = run.measured + HALF_M * np.sign(down)[:, None] * ways + SIGMA_M * rng.normal(size=ways.shape)
+    found = conclusion(diagnose(measured(robot, motion, x), Simulation(robot)))
+    assert (found.verdict, found.causes) == ("unexplained", ())
+    assert found.unexplained.rms_mm == pytest.approx(1e3 * HALF_M, rel=0.1)
+
+
 def test_beside_a_loose_marker_the_noise_and_the_rows_left_out_stay(monkeypatch) -> None:
     robot, rng = surveyed_arm(), np.random.default_rng(0)
     simulation, motion = Simulation(robot), scattered(robot, 1, rows=40)
@@ -57,10 +70,8 @@ def test_beside_a_loose_marker_the_noise_and_the_rows_left_out_stay(monkeypatch)
     def explained(*_: object) -> None:
         raise Searched
 
-    alignment, loose = (
-        diagnosis.aligned,
-        SimpleNamespace(what="loose", ratio=3.0, ways=np.tile([0.0, 0.0, 1.0], (40, 1))),
-    )
+    alignment, axis = diagnosis.aligned, np.array([0.0, 0.0, 1.0])
+    loose = Rattle(HALF_M, 3.0, axis, ways=np.tile(axis, (40, 1)), sides=np.zeros(40), likelihood=0.0)
     monkeypatch.setattr(diagnosis, "aligned", aligned)
     monkeypatch.setattr(diagnosis, "together", lambda start, *_: start.tolerating(diagnosis.Scales()))
     monkeypatch.setattr(diagnosis, "_searched", lambda begun, *_: begun)
@@ -68,6 +79,7 @@ def test_beside_a_loose_marker_the_noise_and_the_rows_left_out_stay(monkeypatch)
     monkeypatch.setattr(diagnosis, "_left_out", lambda _: left_out)
     monkeypatch.setattr(diagnosis, "reshaped", lambda _: None)
     monkeypatch.setattr(diagnosis, "explain", lambda *_: SimpleNamespace(unknown=None))
+    monkeypatch.setattr(diagnosis, "_loose", lambda *_: loose)
     monkeypatch.setattr(diagnosis, "rattle", lambda _: loose)
     monkeypatch.setattr(diagnosis, "useful", explained)
     with pytest.raises(Searched):
