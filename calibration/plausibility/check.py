@@ -189,7 +189,9 @@ class _Check:
         either = "; or ".join(other.looks(names, self.search.fits[other].zeros) for other in self.others)
         either = f". These pairs fit as well if {either}" if either else ""
         if self._before > THRESHOLDS.much_better * fit.error:
-            return Plausibility(f"it seems that {text}", reading.remedy(names, fit.zeros) + either, misread=True)
+            better = self._before / max(fit.error, self.search.exact_m)
+            remedy = reading.remedy(names, fit.zeros) + either
+            return Plausibility(f"it seems that {text}", remedy, misread=True, better=better)
         return Plausibility(warnings=(f"perhaps {text}{either}",))
 
     def _as_it_is(self, fit: ReadingFit, held: tuple[Reading, ReadingFit] | None) -> Plausibility:
@@ -236,8 +238,8 @@ class _Check:
 
 
 def _decided(found: Plausibility, pairs: int) -> Plausibility:
-    """Turn a refusal into a warning where there are too few pairs."""
-    if found.refusal is None or pairs >= FEWEST_ROWS:
+    """Turn a refusal into a warning where there are too few pairs for it."""
+    if found.refusal is None or pairs >= FEWEST_ROWS or found.better >= THRESHOLDS.decisively:
         return found
     few = f"{found.refusal}. {found.remedy}. (These are {pairs} pairs: {FEWEST_ROWS} are needed to decide.)"
     return Plausibility(warnings=(few,))

@@ -314,11 +314,23 @@ def test_outliers_are_no_reason_to_doubt() -> None:
     assert replace(right, x=x).seen().sentences == ()
 
 
-def test_few_rows_are_warned_of_not_refused() -> None:
-    found = pairs().read(MISREAD["q3 counts the other way"]).seen(rows=30)
+def test_few_rows_that_fit_little_better_are_warned_of() -> None:
+    found = pairs(noise=0.035).read(MISREAD["q3 counts the other way"]).seen(rows=30)
     assert found.refusal is None
     assert "q3 counts the other way" in found.warnings[0]
     assert "These are 30 pairs" in found.warnings[0]
+
+
+@pytest.mark.parametrize("rows", [14, 30])
+def test_few_rows_that_fit_far_better_are_refused(rows) -> None:
+    found = pairs().read(MISREAD["the zero of q2 is about 90° off"]).seen(rows=rows)
+    assert "the zero of q2 is about 90° off" in (found.refusal or "")
+
+
+@pytest.mark.parametrize("seed", [0, *rarely(range(1, 6))])
+def test_few_right_rows_are_not_doubted(seed) -> None:
+    assert pairs(seed, count=14, zeros_deg=8.0, noise=0.005).seen().refusal is None
+    assert guided(seed, steps=30).seen().refusal is None
 
 
 def test_a_zero_far_off_is_mentioned() -> None:
