@@ -19,6 +19,7 @@ from kbmaps import RigidChain
 
 from .frames import order_of_axes, reordered_quaternions, turned_frame
 from .limits import reach_m, spread_m
+from .markers import several_markers
 from .reading import Reading
 from .rows import all_shifted, partly_carried, partly_shifted
 from .search import ROWS, ReadingFit, ReadingSearch, nameable
@@ -35,6 +36,8 @@ class _Settings:
     of_reach: float = 0.02
     # ... and above this multiple of the known noise.
     noises: float = 5.0
+    # Several markers are looked for from this share of the spread on.
+    of_one_marker: float = 0.01
     # Distances below this share of the reach are not distinguished.
     exact: float = 1e-5
 
@@ -117,6 +120,8 @@ class _Check:
             wrong = (partly_carried(search, self.robot.joints) if fits else None) or partly_shifted(
                 search, q, x, fits=fits
             )
+            if wrong is None and self._before > _SETTINGS.of_one_marker * self.spread:
+                wrong = several_markers(search, self._before)
             if wrong is not None:
                 return wrong
         size = size_of(search.chain, search.q, search.x, search.apart, search.exact_m)

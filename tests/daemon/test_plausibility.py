@@ -333,6 +333,33 @@ def test_few_right_rows_are_not_doubted(seed) -> None:
     assert guided(seed, steps=30).seen().refusal is None
 
 
+def with_markers(turns: np.ndarray, places: np.ndarray, noise: float = 0.0005) -> Pairs:
+    """Return pairs of an arm whose marker is at one of some places (k, 3) [m] in each row, by `turns` (n,)."""
+    parameters, rng = ChainParameters(arm(4)), np.random.default_rng(5)
+    q = np.array([0.3, -0.8, 1.2, 0.4]) + rng.uniform(-1.2, 1.2, (len(turns), 4))
+    x, jacobian = parameters.linearised(np.zeros(parameters.size), q)
+    x = x + np.einsum("nij,nj->ni", jacobian[:, :, parameters.tool], places[turns])
+    return Pairs(q, x + noise * rng.normal(size=x.shape))
+
+
+@pytest.mark.parametrize("markers", [2, 3])
+def test_several_markers_in_turn_are_named(markers) -> None:
+    found = with_markers(np.arange(90) % markers, 0.07 * np.eye(3)).seen()
+    assert f"the marker is at {markers} places on the hand in turn, up to 99" in (found.refusal or "")
+    assert "one marker at a time" in found.remedy
+
+
+def test_a_marker_that_was_moved_once_is_not_several() -> None:
+    assert "places" not in "".join(with_markers(np.arange(90) // 45, 0.07 * np.eye(3)).seen().sentences)
+
+
+@pytest.mark.parametrize("seed", [0, *rarely(range(1, 6))])
+def test_noise_is_not_several_markers(seed) -> None:
+    rng = np.random.default_rng(seed)
+    noisy = with_markers(np.zeros(90, dtype=int), np.zeros((1, 3)), noise=0.02)
+    assert replace(noisy, x=noisy.x + 0.02 * rng.standard_t(2.0, (90, 3))).seen().sentences == ()
+
+
 def test_a_zero_far_off_is_mentioned() -> None:
     right = pairs()
     found = replace(right, q=right.q - np.radians([0.0, 0.0, 30.0, 0.0, 0.0, 0.0])).seen()
