@@ -21,7 +21,7 @@ from .frames import order_of_axes, reordered_quaternions, turned_frame
 from .limits import reach_m, spread_m
 from .markers import several_markers
 from .reading import Reading
-from .rows import all_shifted, partly_carried, partly_shifted
+from .rows import all_shifted, many_apart, partly_carried, partly_shifted
 from .search import ROWS, ReadingFit, ReadingSearch, nameable
 from .size import of_another_size, size_of
 from .verdict import FEWEST_ROWS, THRESHOLDS, Plausibility, mm
@@ -111,7 +111,8 @@ class _Check:
     def rows_and_size(self, q: FloatArray, x: FloatArray) -> Plausibility:
         """Return what is wrong with the rows or the size of all pairs q (n, d) [rad, m] and x (n, 3) [m]."""
         search, best = self.search, self.search.fits[self.best].error
-        if len(q) >= FEWEST_ROWS and not (self._is_nameable(self.as_it_is) or self._is_nameable(self.best)):
+        placed = self._is_nameable(self.as_it_is) or self._is_nameable(self.best)
+        if not placed or many_apart(search, THRESHOLDS.named * self.spread):
             shifted = all_shifted(search, q, x, self._before)
             if shifted is not None:
                 return shifted
@@ -177,6 +178,7 @@ class _Check:
             f"the other way or a quarter turn off still by {mm(after)}",
             "Is the recording of another robot, or the URDF of another one, or is more than one thing wrong with the "
             f"columns? Where the positions are that noisy, say so with --sigma-mm{doubted}",
+            better=self._before / (THRESHOLDS.right * self.spread),
         )
 
     def _of_another_reading(self, reading: Reading, fit: ReadingFit, after: float) -> Plausibility:

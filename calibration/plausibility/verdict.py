@@ -24,8 +24,9 @@ class _Thresholds:
     # up to 38 steps, whose rows err alike, one wrong reading fitted up to 9.7 times better than another.
     decisively: float = 10.0
     # A reading with one change is reported if it leaves at most half of this share of the spread, with two a third, and
-    # so on. Right readings of real arms leave up to 0.032, wrong ones down to 0.03 with four changes and 0.09 with two.
+    # so on. Right readings of real arms leave up to `right`, wrong ones down to 0.03 with four changes, 0.09 with two.
     named: float = 0.12
+    right: float = 0.032
     # A known camera pose is not off by this much.
     turned_rad: float = math.radians(30.0)
     # Orientations of a tag on a nominal arm are no better than this.
@@ -43,7 +44,7 @@ class Plausibility:
         refusal: why the recording cannot be of this robot as it is, or None.
         remedy: what to do about that.
         misread: another reading of the columns was found that fits.
-        better: so many times better than the columns as they are.
+        better: so many times better than the columns as they are, or than those of any real arm where none fits.
         warnings: sentences about possible problems.
         undirected: joints whose sign these pairs do not determine.
     """

@@ -333,6 +333,29 @@ def test_few_right_rows_are_not_doubted(seed) -> None:
     assert guided(seed, steps=30).seen().refusal is None
 
 
+def test_a_shift_of_few_rows_is_refused() -> None:
+    right = pairs(joints=4, count=30)
+    found = replace(right, q=right.q[:-1], x=right.x[1:]).seen()
+    assert "with the angles of 1 row later" in (found.refusal or "")
+
+
+def test_a_shift_of_a_cycle_of_poses_is_named() -> None:
+    """The positions of three of four poses in turn fit the angles of three others."""
+    rng = np.random.default_rng(1)
+    parameters = ChainParameters(arm(4))
+    poses = np.array([0.3, -0.8, 1.2, 0.4]) + rng.uniform(-1.0, 1.0, (4, 4))
+    q = np.tile(poses, (15, 1)) + rng.uniform(-0.03, 0.03, (60, 4))
+    x = parameters.positions(np.zeros(parameters.size), q) + 5e-4 * rng.normal(size=(60, 3))
+    found = Pairs(q[:-1], x[1:]).seen()
+    assert "with the angles of 1 row later" in (found.refusal or "")
+
+
+def test_few_rows_of_another_robot_are_refused() -> None:
+    right = pairs(joints=4, count=30)
+    found = replace(right, x=np.random.default_rng(1).permutation(right.x)).seen()
+    assert "hardly of this robot" in (found.refusal or "")
+
+
 def with_markers(turns: np.ndarray, places: np.ndarray, noise: float = 0.0005) -> Pairs:
     """Return pairs of an arm whose marker is at one of some places (k, 3) [m] in each row, by `turns` (n,)."""
     parameters, rng = ChainParameters(arm(4)), np.random.default_rng(5)
