@@ -241,6 +241,12 @@ def test_quaternions_in_another_order_are_refused_and_named(order, signs, said) 
     assert (found.refusal is None) == (not said)
 
 
+def test_quaternions_of_few_rows_are_refused_and_named() -> None:
+    right = pairs(zeros_deg=0.0, count=30)
+    shown = Rotation.from_matrix(arm().orientation(right.q)).as_quat()[:, [3, 0, 1, 2]]
+    assert "w first" in (Pairs(right.q, arm().positions(right.q)).seen(orientation=shown).refusal or "")
+
+
 def test_a_doubt_about_the_size_hides_no_other_fault() -> None:
     right = pairs(zeros_deg=0.0)
     shown = Rotation.from_matrix(arm().orientation(right.q)).as_quat()[:, [3, 0, 1, 2]]
