@@ -53,7 +53,8 @@ def several_markers(search: ReadingSearch, before: float) -> Plausibility | None
     found = search.placed_by(chosen)
     scatters = [_scatter(search.on_hand(found, k)) for k in range(_SETTINGS.tries)]
     places = _places(search.on_hand(found, int(np.argmin(scatters))))
-    largest = np.flatnonzero(places == np.bincount(places[places >= 0]).argmax()) if (places >= 0).any() else []
+    counts = np.bincount(places[places >= 0], minlength=1)
+    largest = np.flatnonzero(places == counts.argmax())
     if len(largest) < _SETTINGS.chosen:
         return None
     on_hand = search.on_hand(search.placed_by(largest[None]), 0)
