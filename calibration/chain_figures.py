@@ -64,7 +64,7 @@ class ChainFigures:
     @cached_property
     def values(self) -> FloatArray:
         """The figures (9 + d,) of the most probable chain."""
-        return self._figures(self.beliefs[0].mean, self._split(self.beliefs[0]))
+        return self._figures(self._split(self.beliefs[0]))
 
     @property
     def drawn(self) -> FloatArray:
@@ -82,7 +82,7 @@ class ChainFigures:
         for belief, share in zip(self.beliefs, self.shares, strict=True):
             split = self._split(belief)
             jacobian = self._derivatives(split)
-            apart = _unwound(self._figures(belief.mean, split) - self.values)
+            apart = _unwound(self._figures(split) - self.values)
             inner = _given(belief.covariance, self._hidden)
             covariance += share * (jacobian @ inner @ jacobian.T + np.outer(apart, apart))
         return covariance
@@ -154,15 +154,16 @@ class ChainFigures:
             zeros=split[parameters.zeros],
         )
 
-    def _figures(self, change: FloatArray, split: FloatArray) -> FloatArray:
-        geometry = self._geometry(change, split)
+    def _figures(self, split: FloatArray) -> FloatArray:
+        """Return the figures (9 + d,) of a change: of the links too, else a zero that is not shown moves the marker."""
+        geometry = self._geometry(split, split)
         camera = geometry.T_parent_camera
         return np.concatenate([camera[:3, 3], rpy_of(camera[:3, :3]), geometry.marker_xyz, split[self._zeros]])
 
     def _derivatives(self, change: FloatArray) -> FloatArray:
         steps = _Settings.step * np.eye(len(change))
-        here = self._figures(change, change)
-        return np.array([_unwound(self._figures(moved, moved) - here) for moved in change + steps]).T / _Settings.step
+        here = self._figures(change)
+        return np.array([_unwound(self._figures(moved) - here) for moved in change + steps]).T / _Settings.step
 
 
 def after_exact_pairs(prior: ChainBelief, change: FloatArray, robot: RobotDescription) -> ChainBelief:

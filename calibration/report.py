@@ -272,7 +272,7 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
             expected_mm=None if expected is None else 1e3 * expected.mean_m,
             expected_p95_mm=None if expected is None else 1e3 * expected.p95_m,
             hand_eye=named.hand_eye(frame),
-            tool_xyz_m=named.geometry.marker_xyz.tolist(),
+            tool_xyz_m=named.values[6:9].tolist(),
             tool_covariance=named.covariance[6:9, 6:9].ravel().tolist(),
             trusted=calibration.trusted,
             free_expected_mm=None if free is None or free.expected is None else 1e3 * free.expected.mean_m,

@@ -79,6 +79,7 @@ class Diagnosis:
         aligned: fit of the parameters that robot.toml does not know.
         geometry: fit with all lengths, axes, joint offsets, the tool and the camera's pose free.
         extended: fit with the causes, the tolerances, and the smooth model of the unnamed causes.
+        alone: the same without the smooth model.
         stored: the part of it that is surely better on another recording, which is written to extended.toml.
         tolerated: sizes of the tolerances.
         standings: assessment of each cause against its rivals.
@@ -94,6 +95,7 @@ class Diagnosis:
     aligned: Fit
     geometry: Fit
     extended: Fit
+    alone: Fit
     stored: Fit
     tolerated: Tolerated
     standings: tuple[Standing, ...]
@@ -122,11 +124,18 @@ class Diagnosis:
         return self._extended_errors(self.extended)
 
     @cached_property
-    def with_names_alone(self) -> FloatArray | None:
-        """Held-out distances (n,) [m] with the named causes and no smooth model; None where there is no such model."""
+    def without_model(self) -> FloatArray | None:
+        """Held-out distances (n,) [m] with causes and tolerances but no smooth model; None where there is none."""
         if self.left.model is None or self.left.model.stored is None or self.leaves_out:
             return None
-        return np.linalg.norm(held_out_errors(self.aligned.with_causes(self.causes), self.blocks), axis=1)
+        return np.linalg.norm(held_out_errors(self.alone, self.blocks), axis=1)
+
+    @cached_property
+    def modelled(self) -> FloatArray:
+        """Change of the predictions (n, 3) [m] by the model of unnamed causes, all else fitted with and without it."""
+        if self.left.model is None:
+            return np.zeros_like(self.extended.predicted)
+        return self.extended.predicted + self.left.model.unstored - self.alone.predicted
 
     def _extended_errors(self, fit: Fit) -> FloatArray:
         """Return measured minus predicted (n, 3) [m] on rows held out from causes and smooth model."""
@@ -304,6 +313,7 @@ def diagnose(
         aligned=start,
         geometry=_geometry(start),
         extended=fit,
+        alone=explanation.fit,
         stored=fit if fit.is_exact else _stored(start, explanation.fit, fit, left, blocks),
         tolerated=made,
         standings=tuple(found.standings),

@@ -19,8 +19,9 @@ from kbmaps import RigidChain
 
 from .frames import order_of_axes, reordered_quaternions, turned_frame
 from .limits import reach_m, spread_m
+from .markers import several_markers
 from .reading import Reading
-from .rows import all_shifted, partly_carried, partly_shifted
+from .rows import all_shifted, many_apart, partly_carried, partly_shifted
 from .search import ROWS, ReadingFit, ReadingSearch, nameable
 from .size import of_another_size, size_of
 from .verdict import FEWEST_ROWS, THRESHOLDS, Plausibility, mm
@@ -35,6 +36,8 @@ class _Settings:
     of_reach: float = 0.02
     # ... and above this multiple of the known noise.
     noises: float = 5.0
+    # Several markers are looked for from this share of the spread on.
+    of_one_marker: float = 0.01
     # Distances below this share of the reach are not distinguished.
     exact: float = 1e-5
 
@@ -108,7 +111,8 @@ class _Check:
     def rows_and_size(self, q: FloatArray, x: FloatArray) -> Plausibility:
         """Return what is wrong with the rows or the size of all pairs q (n, d) [rad, m] and x (n, 3) [m]."""
         search, best = self.search, self.search.fits[self.best].error
-        if len(q) >= FEWEST_ROWS and not (self._is_nameable(self.as_it_is) or self._is_nameable(self.best)):
+        placed = self._is_nameable(self.as_it_is) or self._is_nameable(self.best)
+        if not placed or many_apart(search, THRESHOLDS.named * self.spread):
             shifted = all_shifted(search, q, x, self._before)
             if shifted is not None:
                 return shifted
@@ -117,6 +121,8 @@ class _Check:
             wrong = (partly_carried(search, self.robot.joints) if fits else None) or partly_shifted(
                 search, q, x, fits=fits
             )
+            if wrong is None and self._before > _SETTINGS.of_one_marker * self.spread:
+                wrong = several_markers(search, self._before)
             if wrong is not None:
                 return wrong
         size = size_of(search.chain, search.q, search.x, search.apart, search.exact_m)
@@ -172,6 +178,7 @@ class _Check:
             f"the other way or a quarter turn off still by {mm(after)}",
             "Is the recording of another robot, or the URDF of another one, or is more than one thing wrong with the "
             f"columns? Where the positions are that noisy, say so with --sigma-mm{doubted}",
+            better=self._before / (THRESHOLDS.right * self.spread),
         )
 
     def _of_another_reading(self, reading: Reading, fit: ReadingFit, after: float) -> Plausibility:
@@ -189,7 +196,9 @@ class _Check:
         either = "; or ".join(other.looks(names, self.search.fits[other].zeros) for other in self.others)
         either = f". These pairs fit as well if {either}" if either else ""
         if self._before > THRESHOLDS.much_better * fit.error:
-            return Plausibility(f"it seems that {text}", reading.remedy(names, fit.zeros) + either, misread=True)
+            better = self._before / max(fit.error, self.search.exact_m)
+            remedy = reading.remedy(names, fit.zeros) + either
+            return Plausibility(f"it seems that {text}", remedy, misread=True, better=better)
         return Plausibility(warnings=(f"perhaps {text}{either}",))
 
     def _as_it_is(self, fit: ReadingFit, held: tuple[Reading, ReadingFit] | None) -> Plausibility:
@@ -236,8 +245,8 @@ class _Check:
 
 
 def _decided(found: Plausibility, pairs: int) -> Plausibility:
-    """Turn a refusal into a warning where there are too few pairs."""
-    if found.refusal is None or pairs >= FEWEST_ROWS:
+    """Turn a refusal into a warning where there are too few pairs for it."""
+    if found.refusal is None or pairs >= FEWEST_ROWS or found.better >= THRESHOLDS.decisively:
         return found
     few = f"{found.refusal}. {found.remedy}. (These are {pairs} pairs: {FEWEST_ROWS} are needed to decide.)"
     return Plausibility(warnings=(few,))

@@ -61,13 +61,15 @@ def reordered_quaternions(
     errors = _errors_rad(chain, q, fit.rotation, orientation)
     before, best = errors.pop(_AS_IT_IS), min(errors, key=errors.__getitem__)
     after = errors[best]
-    if before <= THRESHOLDS.much_better * max(after, THRESHOLDS.oriented_rad):
+    better = before / max(after, THRESHOLDS.oriented_rad)
+    if better <= THRESHOLDS.much_better:
         return None
     return Plausibility(
         f"it seems that the columns qx, qy, qz, qw {best}: the orientations then fit to {math.degrees(after):.1f}°, "
         f"and as they are to {math.degrees(before):.1f}°",
         f"In the recording, {_REMEDIES[best]}",
         misread=True,
+        better=better,
     )
 
 

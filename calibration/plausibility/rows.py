@@ -50,7 +50,14 @@ def all_shifted(search: ReadingSearch, q: FloatArray, x: FloatArray, before: flo
         f"to {mm(after)}, and as they are to {mm(before)}",
         remedy,
         misread=True,
+        better=before / after,
     )
+
+
+def many_apart(search: ReadingSearch, far: float) -> bool:
+    """Return True if many rows are far [m] from the arm that the others place: few poses in turn fit some others."""
+    (apart,) = search.distances(search.q, search.x, [(search.q, search.x)])
+    return bool((apart > far).mean() > _SETTINGS.shifted)
 
 
 def partly_shifted(search: ReadingSearch, q: FloatArray, x: FloatArray, *, fits: bool) -> Plausibility | None:

@@ -8,10 +8,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray
 from kbmaps import ChainParameters, DegenerateDataError, RigidChain, align
-from kbmaps.chains.placement import place
+from kbmaps.chains.placement import Placements, place
 from kbmaps.rotations import rotation_vectors
 
 from .limits import A_RADIAN_M, KNOWN_TOOL_M, MEASURED, SLIDES_M, TOOL_M, ZEROS_RAD, spread_m
@@ -193,6 +194,19 @@ class ReadingSearch:
         change[p.zeros], change[p.tool] = placed.zeros[0], placed.tools[0]
         drawn = (p.positions(change, each) @ placed.rotations[0].T + placed.shifts[0] for each, _ in pairs)
         return np.stack([np.linalg.norm(at - seen, axis=1) for at, (_, seen) in zip(drawn, pairs, strict=True)])
+
+    def placed_by(self, rows: NDArray[np.intp]) -> Placements:
+        """Place the nominal chain to sets of rows (s, n), with the columns as they are."""
+        return place(self.chain, self.q[rows], self.x[rows], zeros_std=self._std, tool_std=TOOL_M)
+
+    def on_hand(self, placed: Placements, one: int) -> FloatArray:
+        """Return the positions (n, 3) [m] beside the marker, along the axes of its frame, by one of some placements."""
+        p = self._parameters
+        change = np.zeros(p.size)
+        change[p.zeros], change[p.tool] = placed.zeros[one], placed.tools[one]
+        x, jacobian = p.linearised(change, self.q)
+        off = (self.x - placed.shifts[one]) @ placed.rotations[one] - x
+        return np.einsum("nij,ni->nj", jacobian[:, :, p.tool], off)
 
     def with_marker_known(self, reading: Reading) -> tuple[Reading, ReadingFit] | None:
         """Return the reading with a zero near the hand off by quarter turns, and its fit, if the known marker shows it.

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from bodyschema.interfaces.errors import RecordingError
 
-# With fewer rows nothing is refused: a wrong reading may fit by chance.
+# With fewer rows a wrong reading may fit by chance, and another one is refused only if it fits `decisively` better.
 FEWEST_ROWS = 40
 
 
@@ -20,9 +20,13 @@ class _Thresholds:
     # with tolerances of 0.5° and 1 mm, offsets of 10° and noise of 10 mm stay below 1.15 with all wrong readings.
     much_better: float = 1.5
     as_good: float = 1.15
+    # With few rows, scattered ones with a wrong reading fit 20 to 570 times better in the right one. On guided paths of
+    # up to 38 steps, whose rows err alike, one wrong reading fitted up to 9.7 times better than another.
+    decisively: float = 10.0
     # A reading with one change is reported if it leaves at most half of this share of the spread, with two a third, and
-    # so on. Right readings of real arms leave up to 0.032, wrong ones down to 0.03 with four changes and 0.09 with two.
+    # so on. Right readings of real arms leave up to `right`, wrong ones down to 0.03 with four changes, 0.09 with two.
     named: float = 0.12
+    right: float = 0.032
     # A known camera pose is not off by this much.
     turned_rad: float = math.radians(30.0)
     # Orientations of a tag on a nominal arm are no better than this.
@@ -40,6 +44,7 @@ class Plausibility:
         refusal: why the recording cannot be of this robot as it is, or None.
         remedy: what to do about that.
         misread: another reading of the columns was found that fits.
+        better: so many times better than the columns as they are, or than those of any real arm where none fits.
         warnings: sentences about possible problems.
         undirected: joints whose sign these pairs do not determine.
     """
@@ -47,6 +52,7 @@ class Plausibility:
     refusal: str | None = None
     remedy: str = ""
     misread: bool = False
+    better: float = 1.0
     warnings: tuple[str, ...] = ()
     undirected: tuple[str, ...] = ()
 

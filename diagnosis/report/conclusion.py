@@ -110,7 +110,7 @@ def _rms_mm(diagnosis: Diagnosis) -> Errors:
 
 
 def _named_mm(diagnosis: Diagnosis) -> float | None:
-    alone = diagnosis.with_names_alone
+    alone = diagnosis.without_model
     return None if alone is None else 1e3 * float(np.sqrt(np.square(alone[diagnosis.markers]).mean()))
 
 
@@ -305,7 +305,7 @@ def _unexplained(diagnosis: Diagnosis) -> Unexplained:
     rattle_mm = 0.0 if left.rattle is None else 1e3 * left.rattle.half_m
     if left.model is None:
         return Unexplained(rattle_mm, tuple(names), left.p_value, left.what)
-    rms = float(np.hypot(rattle_mm, 1e3 * np.sqrt(np.square(left.model.explained).sum(axis=1).mean())))
+    rms = float(np.hypot(rattle_mm, 1e3 * np.sqrt(np.square(diagnosis.modelled).sum(axis=1).mean())))
     model = left.model.stored if diagnosis.stored is diagnosis.extended else None
     stored = () if model is None else tuple(dict.fromkeys(model.joints))
     return Unexplained(rms, tuple(names), left.p_value, left.what, stored, left.untold)

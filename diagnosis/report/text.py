@@ -89,17 +89,19 @@ def remedies(diagnosis: DiagnosisFile, robot: RobotDescription, steps: FloatArra
     causes = in_order(diagnosis.causes)
     found = [replace(Found.of(cause), weighed=diagnosis.weighed) for cause in causes]
     told = [presenter_of(each.effect).remedy(workshop, what) for each, what in zip(causes, found, strict=True)]
-    return [_if_sure(cause, remedy, diagnosis.seen_by) for cause, remedy in zip(causes, told, strict=True)]
+    return [_if_sure(cause, remedy, diagnosis) for cause, remedy in zip(causes, told, strict=True)]
 
 
-def _if_sure(cause: Cause, remedy: str, seen_by: str) -> str:
+def _if_sure(cause: Cause, remedy: str, diagnosis: DiagnosisFile) -> str:
     """Return the remedy, preceded by what to confirm before any change."""
-    open_ones = [rival for rival in cause.rivals if rival.by == "this_motion"]
-    if cause.probability >= SURE or not open_ones:
+    open_ones = [rival for rival in cause.rivals if rival.by == "this_motion" and cause.probability < SURE]
+    rivals = [rival_named(rival, diagnosis.seen_by) for rival in open_ones[:2]]
+    if diagnosis.verdict == "unexplained":
+        rivals.append("a part of what remains unexplained")
+    if not rivals:
         return remedy
-    rivals = " or ".join(rival_named(rival, seen_by) for rival in open_ones[:2])
-    itself = named(cause.effect, cause.where, cause.source, seen_by)
-    return f"If it is {itself} and not {rivals}: {remedy[0].lower()}{remedy[1:]}"
+    itself = named(cause.effect, cause.where, cause.source, diagnosis.seen_by)
+    return f"If it is {itself} and not {' or '.join(rivals)}: {remedy[0].lower()}{remedy[1:]}"
 
 
 def sentence(
@@ -118,7 +120,7 @@ def sentence(
     """Return the verdict in one or two short sentences.
 
     Args:
-        named_mm: RMS with the causes alone [mm], where there is also a smooth model of unnamed causes.
+        named_mm: RMS without the smooth model of unnamed causes [mm], where there is one.
         tolerated_mm: RMS with small errors everywhere and no cause [mm], where such errors show.
         seen_by: the kind of measuring device, as in `DiagnosisFile`.
         timed, weighed: as in `Found`.
@@ -132,7 +134,12 @@ def sentence(
         return f"The simulation is right to within the noise: nothing found in {rms.aligned:.3g} mm of error"
     if not causes:
         told = "What is measured differs from the simulation in a way that none of the known effects explains"
-        return told if named_mm is None else f"{told}; a smooth model of it explains {_share(gain)} ({figures})"
+        if named_mm is None:
+            return told
+        if not _shows(tolerances):
+            return f"{told}; a smooth model of it explains {_share(gain)} ({figures})"
+        figures += f", {named_mm:.3g} mm without the model"
+        return f"{told}; small errors everywhere and a smooth model of the rest explain {_share(gain)} ({figures})"
     head = _head(causes, tolerances, seen_by, timed=timed, weighed=weighed)
     if gain.held_out_percent <= 0.0:
         return f"{head}: this explains the pairs that were fitted and no others ({figures})"
@@ -146,7 +153,7 @@ def sentence(
 def _head(causes: Sequence[Cause], tolerances: Tolerances | None, seen_by: str, *, timed: bool, weighed: bool) -> str:
     """Return the largest causes as a sentence without its full stop."""
     ordered = in_order(causes)
-    everywhere = ["small errors everywhere"] if tolerances is not None and tolerances.share_percent >= SMALL else []
+    everywhere = ["small errors everywhere"] if _shows(tolerances) else []
     first = [cause for cause in ordered if not (cause.is_correction or (everywhere and cause.is_small))][:_TOLD]
     said = [finding(c.effect, c.where, c.source, told_values(c), seen_by, timed=timed, weighed=weighed) for c in first]
     told = [clause + _or(cause, seen_by) for clause, cause in zip(said, first, strict=True)]
@@ -158,6 +165,11 @@ def _head(causes: Sequence[Cause], tolerances: Tolerances | None, seen_by: str, 
     parts = [*told, *everywhere]
     head = f"{', '.join(parts[:-1])} and {parts[-1]}" if len(parts) > 1 else parts[0]
     return head[0].upper() + head[1:]
+
+
+def _shows(tolerances: Tolerances | None) -> bool:
+    """Return True if small errors everywhere have more than a small share of the gain."""
+    return tolerances is not None and tolerances.share_percent >= SMALL
 
 
 def _or(cause: Cause, seen_by: str) -> str:

@@ -226,6 +226,21 @@ def test_residuals_that_the_told_noise_does_not_explain_are_said() -> None:
     assert "residuals are 3.0 times what the noise explains" in said(planted(1), misfit=3.0)
 
 
+def test_a_zero_that_is_not_shown_does_not_move_the_marker() -> None:
+    """Of an arm whose shoulder alone moves, a turn of the shoulder's zero and one of the marker look alike."""
+    arm = planted(1)
+    q = arm.recording.q * [1.0, 1.0, 0.0, 0.0]
+    x = arm.parameters.positions(arm.change, q) + SIGMA_M * np.random.default_rng(2).normal(size=(len(q), 3))
+    figures = Calibration.of(
+        arm.robot, Recording(joints=arm.robot.joints, q=q, x=x), sigma_m=None, zeros_rad=ZEROS_RAD, trusted="links"
+    ).figures
+    assert not figures.shown.any()
+    belief, k = figures.beliefs[0], range(arm.parameters.size)[arm.parameters.zeros][1]
+    alike = np.radians(1.0) * belief.covariance[:, k] / belief.covariance[k, k]
+    other = dataclasses.replace(figures, beliefs=(dataclasses.replace(belief, mean=belief.mean + alike),))
+    np.testing.assert_allclose(other.values[6:9], figures.values[6:9], rtol=0, atol=5e-4)
+
+
 # --- the command
 
 

@@ -241,6 +241,12 @@ def test_quaternions_in_another_order_are_refused_and_named(order, signs, said) 
     assert (found.refusal is None) == (not said)
 
 
+def test_quaternions_of_few_rows_are_refused_and_named() -> None:
+    right = pairs(zeros_deg=0.0, count=30)
+    shown = Rotation.from_matrix(arm().orientation(right.q)).as_quat()[:, [3, 0, 1, 2]]
+    assert "w first" in (Pairs(right.q, arm().positions(right.q)).seen(orientation=shown).refusal or "")
+
+
 def test_a_doubt_about_the_size_hides_no_other_fault() -> None:
     right = pairs(zeros_deg=0.0)
     shown = Rotation.from_matrix(arm().orientation(right.q)).as_quat()[:, [3, 0, 1, 2]]
@@ -314,11 +320,73 @@ def test_outliers_are_no_reason_to_doubt() -> None:
     assert replace(right, x=x).seen().sentences == ()
 
 
-def test_few_rows_are_warned_of_not_refused() -> None:
-    found = pairs().read(MISREAD["q3 counts the other way"]).seen(rows=30)
+def test_few_rows_that_fit_little_better_are_warned_of() -> None:
+    found = pairs(noise=0.035).read(MISREAD["q3 counts the other way"]).seen(rows=30)
     assert found.refusal is None
     assert "q3 counts the other way" in found.warnings[0]
     assert "These are 30 pairs" in found.warnings[0]
+
+
+@pytest.mark.parametrize("rows", [14, 30])
+def test_few_rows_that_fit_far_better_are_refused(rows) -> None:
+    found = pairs().read(MISREAD["the zero of q2 is about 90° off"]).seen(rows=rows)
+    assert "the zero of q2 is about 90° off" in (found.refusal or "")
+
+
+@pytest.mark.parametrize("seed", [0, *rarely(range(1, 6))])
+def test_few_right_rows_are_not_doubted(seed) -> None:
+    assert pairs(seed, count=14, zeros_deg=8.0, noise=0.005).seen().refusal is None
+    assert guided(seed, steps=30).seen().refusal is None
+
+
+def test_a_shift_of_few_rows_is_refused() -> None:
+    right = pairs(joints=4, count=30)
+    found = replace(right, q=right.q[:-1], x=right.x[1:]).seen()
+    assert "with the angles of 1 row later" in (found.refusal or "")
+
+
+def test_a_shift_of_a_cycle_of_poses_is_named() -> None:
+    """The positions of three of four poses in turn fit the angles of three others."""
+    rng = np.random.default_rng(1)
+    parameters = ChainParameters(arm(4))
+    poses = np.array([0.3, -0.8, 1.2, 0.4]) + rng.uniform(-1.0, 1.0, (4, 4))
+    q = np.tile(poses, (15, 1)) + rng.uniform(-0.03, 0.03, (60, 4))
+    x = parameters.positions(np.zeros(parameters.size), q) + 5e-4 * rng.normal(size=(60, 3))
+    found = Pairs(q[:-1], x[1:]).seen()
+    assert "with the angles of 1 row later" in (found.refusal or "")
+
+
+def test_few_rows_of_another_robot_are_refused() -> None:
+    right = pairs(joints=4, count=30)
+    found = replace(right, x=np.random.default_rng(1).permutation(right.x)).seen()
+    assert "hardly of this robot" in (found.refusal or "")
+
+
+def with_markers(turns: np.ndarray, places: np.ndarray, noise: float = 0.0005) -> Pairs:
+    """Return pairs of an arm whose marker is at one of some places (k, 3) [m] in each row, by `turns` (n,)."""
+    parameters, rng = ChainParameters(arm(4)), np.random.default_rng(5)
+    q = np.array([0.3, -0.8, 1.2, 0.4]) + rng.uniform(-1.2, 1.2, (len(turns), 4))
+    x, jacobian = parameters.linearised(np.zeros(parameters.size), q)
+    x = x + np.einsum("nij,nj->ni", jacobian[:, :, parameters.tool], places[turns])
+    return Pairs(q, x + noise * rng.normal(size=x.shape))
+
+
+@pytest.mark.parametrize("markers", [2, 3])
+def test_several_markers_in_turn_are_named(markers) -> None:
+    found = with_markers(np.arange(90) % markers, 0.07 * np.eye(3)).seen()
+    assert f"the marker is at {markers} places on the hand in turn, up to 99" in (found.refusal or "")
+    assert "one marker at a time" in found.remedy
+
+
+def test_a_marker_that_was_moved_once_is_not_several() -> None:
+    assert "places" not in "".join(with_markers(np.arange(90) // 45, 0.07 * np.eye(3)).seen().sentences)
+
+
+@pytest.mark.parametrize("seed", [0, *rarely(range(1, 6))])
+def test_noise_is_not_several_markers(seed) -> None:
+    rng = np.random.default_rng(seed)
+    noisy = with_markers(np.zeros(90, dtype=int), np.zeros((1, 3)), noise=0.02)
+    assert replace(noisy, x=noisy.x + 0.02 * rng.standard_t(2.0, (90, 3))).seen().sentences == ()
 
 
 def test_a_zero_far_off_is_mentioned() -> None:

@@ -20,6 +20,7 @@ from bodyschema.diagnosis.report.result import (
     Interval,
     Pairs,
     Unexplained,
+    Verdict,
 )
 from bodyschema.diagnosis.report.text import finding, remedies
 from bodyschema.effects import Effect, Motion, Simulation
@@ -56,9 +57,15 @@ def cause(effect: Effect, **more) -> Cause:
     )
 
 
-def told(robot: RobotDescription, *causes: Cause, step: float = 0.0, torque: float | None = None) -> list[str]:
+def told(
+    robot: RobotDescription,
+    *causes: Cause,
+    step: float = 0.0,
+    torque: float | None = None,
+    verdict: Verdict = "explained",
+) -> list[str]:
     file = DiagnosisFile(
-        "explained", "", Pairs(1, 1, 0), ERRORS, ERRORS, Gain(0.0, (0.0, 0.0)), causes, (), Unexplained(0.0, (), 1.0),
+        verdict, "", Pairs(1, 1, 0), ERRORS, ERRORS, Gain(0.0, (0.0, 0.0)), causes, (), Unexplained(0.0, (), 1.0),
         (), (),
     )  # fmt: skip
     d = len(robot.joints)
@@ -84,6 +91,12 @@ def edited(robot: RobotDescription, keys: str) -> RobotDescription:
 def test_an_offset_is_given_in_degrees_and_ticks(robot) -> None:
     effect = Effect.at(robot, "joint_offset", "elbow_pitch", values={"offset_rad": np.radians(0.52)})
     assert "Add +0.52° (+6 ticks of 4096 a turn)" in told(robot, cause(effect), step=2.0 * np.pi / 4096)[0]
+
+
+def test_beside_what_is_unexplained_a_remedy_is_conditional(robot) -> None:
+    effect = Effect.at(robot, "joint_coupling", "elbow_pitch", "base_yaw", values=[3e-4])
+    (remedy,) = told(robot, cause(effect), verdict="unexplained")
+    assert remedy.startswith("If it is joint elbow_pitch moving with joint base_yaw and not a part of what remains")
 
 
 @pytest.mark.parametrize("step", [1e-4, np.radians(0.01)])

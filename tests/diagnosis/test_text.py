@@ -54,6 +54,14 @@ def test_the_sentence_tells_what_the_smooth_model_adds():
     assert "10 → 2 mm on held-out data, 6 mm without the smooth model" in said
 
 
+def test_tolerances_share_the_credit_with_a_smooth_model():
+    errors, of = Errors(10.0, 10.0, 5.0, 2.0, 1.9), Interval(0.1, (0.05, 0.2))
+    arm = Tolerances(of, of, of, links_share_percent=60.0)
+    said = sentence("unexplained", [], errors, Gain(80.0, (75.0, 85.0)), arm, named_mm=3.0)
+    assert "small errors everywhere and a smooth model of the rest explain 80 %" in said
+    assert "(10 → 2 mm on held-out data, 3 mm without the model)" in said
+
+
 def _zero(joint: str, probability: float = 1.0, share: float = 10.0) -> Cause:
     rival = Indistinguishable("link_geometry", joint, None, "this_motion", 1.0 - probability)
     rivals = (rival,) if probability < 1.0 else ()

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from planted_cases import ELBOW, SHOULDER, SIGMA_M, desk_arm, measured, motion_of, seen, surveyed_arm, walk
+from planted_cases import ELBOW, SHOULDER, SIGMA_M, desk_arm, measured, motion_of, scattered, seen, surveyed_arm, walk
 
 from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
 from bodyschema.diagnosis.report.conclusion import conclusion
@@ -67,6 +68,29 @@ def test_no_cause_is_named_for_it(file) -> None:
 
 def test_the_model_of_what_has_no_name_predicts_rows_that_it_was_not_fitted_to(file) -> None:
     assert file.rms_mm.extended < 0.2 * file.rms_mm.aligned
+
+
+def test_what_is_left_is_no_larger_than_the_error(file) -> None:
+    assert 0.5 * file.rms_mm.aligned < file.unexplained.rms_mm < file.rms_mm.aligned
+
+
+def test_the_error_without_the_model_is_that_of_causes_and_tolerances() -> None:
+    robot, rng = surveyed_arm(), np.random.default_rng(3)
+    joints = [Effect.at(robot, "link_geometry", joint) for joint in robot.joints]
+    made = tuple(
+        replace(link, values=np.append(1e-3 * rng.normal(size=3), 5e-3 * rng.normal(size=3))) for link in joints
+    )
+    motion = scattered(robot, 5, 150)
+    q = motion.q.copy()
+    q[:, robot.joints.index(SHOULDER)] += 0.002 * np.square(q[:, robot.joints.index(ELBOW)])
+    x = Simulation(robot, (), None, made).positions(motion_of(q)) + SIGMA_M * rng.normal(size=(150, 3))
+    found = diagnose(measured(robot, motion, x), Simulation(robot), only=NEAREST)
+    assert found.without_model is not None
+    before, without, after = (
+        np.sqrt(np.square(d).mean())
+        for d in (found.held_out["aligned"], found.without_model, found.held_out["extended"])
+    )
+    assert after < without < 0.6 * before
 
 
 def test_the_advice_says_where_to_look(file) -> None:

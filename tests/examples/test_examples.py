@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import runpy
 from pathlib import Path
@@ -9,7 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from bodyschema.cli.main import app
 from bodyschema.robot.description import RobotDescription
 
 ROOT = Path(__file__).parents[2]
@@ -82,3 +85,27 @@ def test_each_is_short(script: Path) -> None:
 def test_the_library_page_lists_them_all() -> None:
     page = (ROOT / "docs" / "library.md").read_text(encoding="utf-8")
     assert re.findall(r"\(\.\./examples/([0-9]_\w+\.py)\)", page) == [script.name for script in SCRIPTS]
+
+
+def test_poses_of_a_tool_calibrate_the_camera_on_it(tmp_path, capsys) -> None:
+    """As docs/one_camera.md says, without a joint of the robot."""
+    for file in (ROOT / "examples" / "tool_poses").iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    rng = np.random.default_rng(4)
+    places = rng.uniform([0.2, -0.3, 0.3], [0.7, 0.3, 0.6], (30, 3))
+    angles = rng.uniform([2.64, -0.5, -2.0], [3.64, 0.5, 0.5], (30, 3))
+    R_base_tool = Rotation.from_euler("xyz", angles)
+    R_tool_camera, t_tool_camera = Rotation.from_euler("xyz", [0.03, 0.01, -1.58]), np.array([-0.017, 0.031, -0.011])
+    on_tool = R_base_tool.inv().apply(np.array([0.4, -0.1, 0.0]) - places)
+    seen = R_tool_camera.inv().apply(on_tool - t_tool_camera) + 5e-4 * rng.normal(size=(30, 3))
+    names = [f"tool_{name}" for name in ("x", "y", "z", "roll", "pitch", "yaw")]
+    rows = np.hstack([places, angles, seen])
+    np.savetxt(tmp_path / "poses.csv", rows, "%.9f", ",", header=",".join([*names, "x", "y", "z"]), comments="")
+    words = ["calibrate", str(tmp_path / "poses.csv"), "--trust-urdf", "--json"]
+    app(words, exit_on_error=False, result_action="return_value")
+    found = json.loads(capsys.readouterr().out)
+    off = [
+        number["learnt"] - wanted for number, wanted in zip(found["camera_xyz_mm"], 1e3 * t_tool_camera, strict=True)
+    ]
+    assert found["camera_link"] == "tool"
+    assert np.abs(off).max() < 1.0

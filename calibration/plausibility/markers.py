@@ -1,0 +1,96 @@
+"""Check that the marker is at one place on the hand: of several reflectors or tags, each row has one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.cluster.hierarchy import fcluster, linkage
+
+from bodyschema.interfaces.records import FloatArray
+
+from .search import ReadingSearch
+from .verdict import Plausibility, mm
+
+
+@dataclass(frozen=True)
+class _Settings:
+    """Settings of the check for several markers."""
+
+    # Rows that place the arm, and how often they are chosen: of three markers in equal parts, none are of one alone
+    # once in 140.
+    chosen: int = 5
+    tries: int = 400
+    # Places that are nearer are one: a marker that is loose moves less [m].
+    one_place_m: float = 0.01
+    # Smallest share and number of the rows at a place, and smallest share at all places together.
+    share: float = 0.08
+    fewest: int = 3
+    covered: float = 0.85
+    # Several places are reported if the pairs fit this many times better. Three reflectors on a real arm fitted 28
+    # times better; 13 real recordings of one marker had no second place, whatever the factor.
+    better: float = 5.0
+    seed: int = 0
+
+
+_SETTINGS = _Settings()
+
+
+def several_markers(search: ReadingSearch, before: float) -> Plausibility | None:
+    """Return a refusal if the marker is at several places on the hand in turn; else None.
+
+    The arm is placed by a few rows at a time (Fischler and Bolles 1981): where these are of one marker, the others lie
+    at few places on the hand.
+
+    Args:
+        search: the search over readings, which found none better than the columns as they are.
+        before: distance of the pairs as they are [m].
+    """
+    rng, rows = np.random.default_rng(_SETTINGS.seed), len(search.q)
+    if rows < 2 * _SETTINGS.chosen:
+        return None
+    chosen = rng.permuted(np.tile(np.arange(rows), (_SETTINGS.tries, 1)), axis=1)[:, : _SETTINGS.chosen]
+    found = search.placed_by(chosen)
+    scatters = [_scatter(search.on_hand(found, k)) for k in range(_SETTINGS.tries)]
+    places = _places(search.on_hand(found, int(np.argmin(scatters))))
+    counts = np.bincount(places[places >= 0], minlength=1)
+    largest = np.flatnonzero(places == counts.argmax())
+    if len(largest) < _SETTINGS.chosen:
+        return None
+    on_hand = search.on_hand(search.placed_by(largest[None]), 0)
+    places = _places(on_hand)
+    names = np.unique(places[places >= 0])
+    if len(names) < 2 or (places >= 0).mean() < _SETTINGS.covered:
+        return None
+    centres = np.stack([on_hand[places == name].mean(axis=0) for name in names])
+    kept = places >= 0
+    after = float(np.sqrt(np.square(on_hand[kept] - centres[np.searchsorted(names, places[kept])]).sum(axis=1).mean()))
+    # A marker that was moved once is told with its row.
+    changes = int((np.diff(places[kept]) != 0).sum())
+    if before < _SETTINGS.better * after or changes < len(names):
+        return None
+    shares = ", ".join(f"{100.0 * float((places == name).mean()):.0f} %" for name in names)
+    apart = max(float(np.linalg.norm(one - other)) for one in centres for other in centres)
+    return Plausibility(
+        f"it seems that the marker is at {len(names)} places on the hand in turn, up to {mm(apart)} apart ({shares} of "
+        f"the rows): at its own place, each row fits to {mm(after)}, and as they are to {mm(before)}",
+        "Give the rows of one marker at a time, where several reflectors or tags were measured. Where it is one, it is "
+        "loose, or its rows are of several tools",
+        misread=True,
+        better=before / after,
+    )
+
+
+def _scatter(on_hand: FloatArray) -> float:
+    """Return the median distance of points (n, 3) from the nearest but one [m]."""
+    apart = np.linalg.norm(on_hand[:, None] - on_hand, axis=2)
+    return float(np.median(np.partition(apart, 2, axis=1)[:, 2]))
+
+
+def _places(on_hand: FloatArray) -> NDArray[np.intp]:
+    """Return the place of each point (n,), from 1; -1 where it is at none with enough others."""
+    places = np.asarray(fcluster(linkage(on_hand), _SETTINGS.one_place_m, "distance"), dtype=np.intp)
+    counts = np.bincount(places)
+    few = counts < max(_SETTINGS.fewest, _SETTINGS.share * len(places))
+    return np.where(few[places], -1, places)
