@@ -161,7 +161,8 @@ def test_the_claimed_sigma_covers_60_to_75_percent_in_every_kind_of_image(many_e
 def test_the_claimed_sigma_covers_65_to_71_percent_over_all_kinds_of_images(many_errors):
     together = joined(many_errors.values())
     report("all together", together)
-    assert ((together.covered() >= 0.65) & (together.covered() <= 0.71)).all(), together.covered()
+    # Of 5900 fixes a standard error is 0.006.
+    assert ((together.covered() >= 0.65 - 0.006) & (together.covered() <= 0.71 + 0.006)).all(), together.covered()
 
 
 @pytest.mark.soak

@@ -18,8 +18,8 @@ from bodyschema.vision.board import Corners, NotFound
 from bodyschema.vision.calibration.calibrate import Asked, Fitted, calibrate, fit
 from bodyschema.vision.calibration.gather import Unusable, gathered, require_both, summarised
 from bodyschema.vision.calibration.guidance import Coverage
+from bodyschema.vision.calibration.held_out import covariance
 from bodyschema.vision.calibration.images import ImagePair
-from bodyschema.vision.calibration.influence import covariance
 from bodyschema.vision.calibration.view import View
 from bodyschema.vision.rig.lens import Lens
 from bodyschema.vision.rig.stereo_rig import CalibrationError, lenses_of
@@ -79,6 +79,25 @@ def test_intervals_cover_where_corners_of_a_view_move_together() -> None:
         found = fit([curved(view, rng) for view in corner_views(rig, rng, 14)], BOARD.corners_m, SIZE, "pinhole")
         misses.append((found.bundle.vector - true_vector(rig)) / sigmas(found))
     assert np.mean(np.abs(np.concatenate(misses)) < 2.0) > 0.85
+
+
+def test_a_view_left_out_changes_the_weights_of_others_too() -> None:
+    rng = np.random.default_rng(0)
+    moved = np.linspace(0.0, 0.4, 14)[:, None] * rng.standard_normal((14, 2))  # [px], between the two images
+    views = [
+        replace(view, right=replace(view.right, px=view.right.px + off))
+        for view, off in zip(corner_views(webcams(rng), rng, 14), moved, strict=True)
+    ]
+    found = fit(views, BOARD.corners_m, SIZE, "pinhole")
+    assert found.left_out == ()
+    without = np.array(
+        [
+            fit([*views[:k], *views[k + 1 :]], BOARD.corners_m, SIZE, "pinhole").bundle.vector[-3:]
+            for k in range(len(views))
+        ]
+    )
+    jackknife = np.sqrt((len(views) - 1) * without.var(axis=0))
+    np.testing.assert_allclose(sigmas(found)[-3:], jackknife, rtol=0.2)
 
 
 def curved(view: View, rng: np.random.Generator) -> View:

@@ -17,19 +17,17 @@ from bodyschema.vision.rig.stereo_rig import CalibrationError, Made, OneEyeRig, 
 
 from .bundle import Bundle, solve
 from .guidance import Coverage
-from .held_out import HeldOut, held_out
-from .influence import covariance
+from .held_out import HeldOut, covariance, held_out
 from .refocus import focal_spread, refocused
 from .requirements import contradicts, lacking, misplaced, together, unsure
 from .start import start
 from .view import EYES, ONE_EYE, Eye, View
-from .weights import corner_weights
+from .weights import weighed
 
 ModelChoice = Literal["auto", "pinhole", "fisheye", "rational"]
 
 _OUTLIER_SPREADS = 8.0
 _MOST_LEFT_OUT = 0.35
-_REWEIGHTED = 3
 # Power of the distance from the axis in the last term of the distortion, and the 1-sigma of that term at the image's
 # corner where it would fold the image over: a lens of a webcam has 0.01.
 _STEEPEST_POWER: dict[Model, int] = {"pinhole": 6, "fisheye": 8, "rational": 6}
@@ -197,7 +195,7 @@ def _fit(
     left_out: list[LeftOut] = []
     vector, poses = start(kept, corners_m, image_size_px, model, eyes)
     while True:
-        bundle = _weighed(kept, corners_m, solve(kept, corners_m, model, vector, poses))
+        bundle = weighed(kept, corners_m, solve(kept, corners_m, model, vector, poses))
         worst = _outlier(bundle.view_rms_px())
         if worst is None:
             break
@@ -236,15 +234,7 @@ def _stiffened(views: Sequence[View], corners_m: FloatArray, bundle: Bundle, ima
         prior[last] = (bundle.sigma_px * corner ** _STEEPEST_POWER[bundle.model] / _STEEPEST_TERM) ** 2
         vector[last] = 0.0
     stiff = solve(views, corners_m, bundle.model, vector, bundle.poses, bundle.weights, prior)
-    return _weighed(views, corners_m, stiff)
-
-
-def _weighed(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> Bundle:
-    """Refit with weights that follow the accuracy of each image's corners."""
-    for _ in range(_REWEIGHTED):
-        weights = corner_weights(views, corners_m, bundle)
-        bundle = solve(views, corners_m, bundle.model, bundle.vector, bundle.poses, weights, bundle.prior)
-    return bundle
+    return weighed(views, corners_m, stiff)
 
 
 def _chosen(fits: dict[Model, Fitted]) -> Model:

@@ -1,9 +1,9 @@
-"""Held-out error of a calibration, by cross-validation over views."""
+"""Held-out error and covariance of a calibration, from fits without some of the views."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 from bodyschema.interfaces.records import FloatArray
 
 from .bundle import POSE, Bundle, solve, view_residuals
+from .influence import inverse_of
 from .view import View
+from .weights import weighed
 
 _FOLDS = 10
 
@@ -64,3 +66,22 @@ def held_out(views: Sequence[View], corners_m: FloatArray, whole: Bundle) -> Hel
             squares[k] = np.sum(left[own > 0.0] ** 2)
     freedom = np.array([each.size - POSE for each in whole.kept])
     return HeldOut(squares, freedom)
+
+
+def covariance(views: Sequence[View], corners_m: FloatArray, whole: Bundle) -> FloatArray:
+    """Return the covariance of the rig's parameters, shape (p, p), without assuming independent corners of one view.
+
+    A board that is not flat, that moves between the two images, and a lens that no model describes move the corners of
+    a view together. So each view as a whole stands for its own variance: the delete-one jackknife (Efron 1982). Where
+    views disagree, the weights of all depend on each, so that they are found again without it.
+    """
+    count = len(views)
+    moved = np.zeros((count, len(whole.vector)))
+    for k in range(count):
+        start = replace(
+            whole, poses=np.delete(whole.poses, k, axis=0), weights=(*whole.weights[:k], *whole.weights[k + 1 :])
+        )
+        moved[k] = weighed([*views[:k], *views[k + 1 :]], corners_m, start).vector
+    inverse = inverse_of(whole.normal)
+    known = inverse @ np.diag(whole.prior) @ inverse * whole.sigma_px**2
+    return np.cov(moved, rowvar=False, bias=True) * (count - 1) + known

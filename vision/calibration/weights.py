@@ -19,10 +19,11 @@ from scipy.spatial.transform import Rotation
 
 from bodyschema.interfaces.records import FloatArray
 
-from .bundle import Bundle
+from .bundle import Bundle, solve
 from .influence import influences
 from .view import View
 
+_REWEIGHTED = 3
 _FARTHEST = 5.0  # 1-sigmas: a corner farther off is an outlier
 _GROUP = 60  # corners with squares of similar width
 _SHARED = 6.0  # prior weight of the usual variance, in corners, against an image's own
@@ -77,6 +78,14 @@ def corner_weights(views: Sequence[View], corners_m: FloatArray, bundle: Bundle)
     weights = np.where(kept, 1.0 / (usual * spread.shares(usual, kept)), 0.0)
     weights /= weights.mean()
     return tuple(np.split(weights, np.cumsum([view.corner_count for view in views])[:-1]))
+
+
+def weighed(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> Bundle:
+    """Refit with weights that follow the accuracy of each image's corners."""
+    for _ in range(_REWEIGHTED):
+        weights = corner_weights(views, corners_m, bundle)
+        bundle = solve(views, corners_m, bundle.model, bundle.vector, bundle.poses, weights, bundle.prior)
+    return bundle
 
 
 def _spread(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> _Spread:
