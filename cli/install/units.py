@@ -34,8 +34,8 @@ EVERY_ADDRESS = "IPAddressAllow=any"
 WITH_RESTART_STEPS = 254
 
 # zenoh asks the kernel for the machine's interfaces (netlink) and places its memory (mbind); the learner's background
-# work lowers its priority (setpriority). No RemoveIPC: it would remove the other unit's shared memory, of the same
-# user.
+# work lowers its priority (sched_setscheduler, setpriority). No RemoveIPC: it would remove the other unit's shared
+# memory, of the same user.
 _SANDBOX = """\
 UMask=0027
 NoNewPrivileges=yes
@@ -63,7 +63,7 @@ SystemCallArchitectures=native
 SystemCallErrorNumber=EPERM
 SystemCallFilter=@system-service
 SystemCallFilter=~@privileged @resources
-SystemCallFilter=mbind setpriority
+SystemCallFilter=mbind sched_setscheduler setpriority
 """
 _ROUTER = """\
 # Written by `bodyschema install router`; `bodyschema install router --uninstall` removes it.

@@ -32,7 +32,7 @@ from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.wire import encode
 from bodyschema.interfaces.errors import ConfigError, StoreUnwritable
 from bodyschema.interfaces.protocols import Clock
-from bodyschema.interfaces.waits import NICENESS, RETRY_S, STATUS_EVERY_S
+from bodyschema.interfaces.waits import RETRY_S, STATUS_EVERY_S
 from bodyschema.recordings.store.file import lock
 
 IDLE_S = 0.02
@@ -56,14 +56,17 @@ class Background:
         self._idle_since = [clock.now()] * len(workers)
 
     def run(self) -> None:
-        """Run the work: at low priority, or at normal priority within a share of a processor.
+        """Run the work: as a batch thread, or as a usual one within a share of a processor.
+
+        A batch thread does not interrupt others when it wakes, and has its fair share of a machine that others keep
+        busy; a nice value of 10 leaves it a tenth of that.
 
         On a busy machine a low-priority thread may be preempted while it holds Python's interpreter lock, and all other
         threads of the process then wait with it.
         """
         if self._rest == 0.0:
-            with contextlib.suppress(OSError):  # niceness is optional: without it answers are slightly later
-                os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)
+            with contextlib.suppress(OSError):  # optional: without it answers are slightly later
+                os.sched_setscheduler(threading.get_native_id(), os.SCHED_BATCH, os.sched_param(0))
         while not self._stop.is_set():
             self._service.beat("background")
             begin = time.thread_time()

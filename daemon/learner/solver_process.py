@@ -1,13 +1,14 @@
 """Run the solver in a separate process.
 
 One solve takes tenths of a second inside LAPACK, which holds the interpreter's lock; in a thread it would delay answers
-by that time. The child works at low priority, uses a processor at most half of the time, and ends with its parent.
+by that time. The child is a batch process, uses a processor at most half of the time, and ends with its parent.
 
 Both directions carry frames: four bytes of length, then a MessagePack message.
 """
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import signal
@@ -30,7 +31,6 @@ from bodyschema.learning.solvers.orientation import OrientationSolution
 from bodyschema.learning.solvers.solver import DirectSolver, Solved, Task
 from kbmaps import ChainBelief, ChainTolerances, KBMap, OrientedChain, ResidualModel
 
-NICENESS = 5
 LONGEST_REST_S = 5.0
 # A child that owes an answer and uses no processor for this long is stopped or locked up: the learner's `WatchdogSec`.
 HUNG_AFTER_S = 60.0
@@ -273,7 +273,8 @@ def _read(stream: IO[bytes]) -> Start | Learn | Solve | None:
 
 
 if __name__ == "__main__":
-    os.nice(NICENESS)
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     try:
         serve(sys.stdin.buffer, sys.stdout.buffer)
     except BrokenPipeError:
