@@ -58,11 +58,9 @@ class Background:
     def run(self) -> None:
         """Run the work: as a batch thread, or as a usual one within a share of a processor.
 
-        A batch thread does not interrupt others when it wakes, and has its fair share of a machine that others keep
-        busy; a nice value of 10 leaves it a tenth of that.
-
-        On a busy machine a low-priority thread may be preempted while it holds Python's interpreter lock, and all other
-        threads of the process then wait with it.
+        A batch thread does not interrupt others when it wakes. It has its share of a machine that others keep busy,
+        where a thread of low priority would learn nothing for minutes, and make all threads of the process wait when
+        it is preempted with Python's interpreter lock.
         """
         if self._rest == 0.0:
             with contextlib.suppress(OSError):  # optional: without it answers are slightly later

@@ -1,7 +1,7 @@
 """The learner process of one robot. It needs a sampler for new pairs, but keeps answering without one.
 
 Threads: zenoh's (queries, from an immutable snapshot; published pairs, into a queue), one for each robot that learns
-each pair immediately, one at low priority for replay and the solver's orders, and the main thread for status and
+each pair immediately, one as batch work for replay and the solver's orders, and the main thread for status and
 checkpoints; `bodyschema.daemon.learner.host` has the last two.
 """
 

@@ -230,7 +230,7 @@ class ChangeMonitor:
     def add(self, *pairs: Pair, kept: ArrayLike) -> None:
         """Add one or several pairs, learnt or, if not `kept` (n,), outliers."""
         if self._reference is None:
-            self._renew()  # not in `offer`: that runs at low priority, and this takes a while
+            self._renew()  # not in `offer`: that runs in the background, and this takes a while
         if len(self._pairs) + len(pairs) > MOST_WATCHED and not self.alarmed:
             self._shorten()
         for pair, learnt in zip(pairs, np.broadcast_to(kept, len(pairs)).tolist(), strict=True):

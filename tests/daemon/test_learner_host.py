@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import threading
@@ -290,7 +291,21 @@ def test_no_robot_waits_for_another_s_backlog() -> None:
     stop, done = threading.Event(), list[str]()
     workers = [Scripted("busy", 4, done, stop.set), Scripted("quiet", 2, done, stop.set)]
     background = Background(workers, Service.nobodys(SystemClock()), SystemClock(), stop)
-    thread = threading.Thread(target=background.run)  # it lowers its thread's priority, for good
+    thread = threading.Thread(target=background.run)  # its thread becomes a batch thread, for good
     thread.start()
     thread.join()
     assert done == ["busy", "quiet", "busy", "quiet", "busy", "busy"]
+
+
+def test_background_work_neither_interrupts_others_nor_starves() -> None:
+    stop, seen = threading.Event(), list[tuple[int, int]]()
+
+    def end() -> None:
+        seen.append((os.sched_getscheduler(threading.get_native_id()), os.getpriority(os.PRIO_PROCESS, 0)))
+        stop.set()
+
+    background = Background([Scripted("one", 6, [], end)], Service.nobodys(SystemClock()), SystemClock(), stop)
+    thread = threading.Thread(target=background.run)
+    thread.start()
+    thread.join()
+    assert seen == [(os.SCHED_BATCH, os.getpriority(os.PRIO_PROCESS, 0))]

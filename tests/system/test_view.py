@@ -88,8 +88,10 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Running]:
     rarely = f"[learner]\nsolve_every = {AT_ONCE}\nreplays_per_pair = 1.0\n"
     file.write_text(f'{text}\n[drivers]\nrecording = "walk.csv"\n{rarely}', encoding="utf-8")
     with scene.log_file.open("wb") as log:
-        words = {"sampler": ["-m", "bodyschema"], "learner": [Path(__file__).with_name("at_even_priority.py")]}
-        both = {name: warm.Child(*command, "run", name, "--robot", file, stderr=log) for name, command in words.items()}
+        both = {
+            name: warm.Child("-m", "bodyschema", "run", name, "--robot", file, stderr=log)
+            for name in ("sampler", "learner")
+        }
     try:
         for name, process in both.items():
             while not is_alive(getattr(config.tables.zenoh, name), Keys(config.robot.name).alive(name)):
