@@ -461,7 +461,7 @@ def _found(
         search = Search(fixed, told)
         start = aligned(loose.taken_out_of(start.observations), simulation)
         unknowns = Unknowns(start)
-        extended = _searched(together(start, fixed, told), search)
+        extended = search.run(start) if start.is_exact else _searched(together(start, fixed, told), search)
         explanation = explain(extended, search.path, unknowns, search, told)
         loose = rattle(extended) or loose
     explanation = useful(explanation, search, blocks, told)
