@@ -67,7 +67,7 @@ def several_markers(search: ReadingSearch, before: float) -> Plausibility | None
     kept = places >= 0
     off = on_hand[kept] - centres[np.searchsorted(names, places[kept])]
     after = max(float(np.sqrt(np.square(off).sum(axis=1).mean())), search.exact_m)
-    # A marker that was moved once is told with its row.
+    # A marker that was moved once is reported by calibration, with its row.
     changes = int((np.diff(places[kept]) != 0).sum())
     if before < _SETTINGS.better * after or changes < len(names):
         return None
