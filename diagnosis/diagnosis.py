@@ -392,8 +392,8 @@ class _Found:
 def _part_of(begins: NDArray[np.bool_]) -> IntArray:
     """Return the rows in which causes are sought: all, or equal runs that are spread over a long recording.
 
-    Each run is the one of its stretch that is broken least often: after a break, nobody knows on which side of its
-    backlash a joint is.
+    Each run is the one of its stretch that is broken least often: after a break, the side of a joint's
+    backlash is unknown.
 
     Args:
         begins: (n,), True in the first row after each break.
@@ -461,7 +461,7 @@ def _found(
         search = Search(fixed, told)
         start = aligned(loose.taken_out_of(start.observations), simulation)
         unknowns = Unknowns(start)
-        extended = _searched(together(start, fixed, told), search)
+        extended = search.run(start) if start.is_exact else _searched(together(start, fixed, told), search)
         explanation = explain(extended, search.path, unknowns, search, told)
         loose = rattle(extended) or loose
     explanation = useful(explanation, search, blocks, told)

@@ -18,7 +18,7 @@ from bodyschema.robot.description import RobotDescription
 from kbmaps import RigidChain
 
 from .frames import order_of_axes, reordered_quaternions, turned_frame
-from .limits import reach_m, spread_m
+from .limits import place_an_arm, reach_m, spread_m
 from .markers import several_markers
 from .reading import Reading
 from .rows import all_shifted, many_apart, partly_carried, partly_shifted
@@ -73,7 +73,7 @@ def plausibility(
     """
     chain = chain or robot.chain
     exact_m, spread = _SETTINGS.exact * reach_m(robot), spread_m(x)
-    if 3 * len(q) < 2 * (chain.joints + 9) or spread < exact_m:
+    if not place_an_arm(len(q), chain.joints) or spread < exact_m:
         return Plausibility()
     rows = np.unique(np.linspace(0, len(q) - 1, ROWS).astype(np.intp))
     search = ReadingSearch(chain, q[rows], x[rows], exact_m, robot.camera.pose_known)
@@ -113,7 +113,7 @@ class _Check:
         search, best = self.search, self.search.fits[self.best].error
         placed = self._is_nameable(self.as_it_is) or self._is_nameable(self.best)
         if not placed or many_apart(search, THRESHOLDS.named * self.spread):
-            shifted = all_shifted(search, q, x, self._before)
+            shifted = all_shifted(search, q, x)
             if shifted is not None:
                 return shifted
         if not (self._fits_clearly_better and self._is_nameable(self.best)):

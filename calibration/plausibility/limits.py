@@ -56,6 +56,11 @@ _UNITS_PER_SECOND = (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds
 A_RADIAN_M, FEWEST_MOVES = 0.1, 20
 
 
+def place_an_arm(rows: int, joints: int) -> bool:
+    """Return True if pairs have twice as many coordinates as an arm has offsets, with those of camera and marker."""
+    return 3 * rows >= 2 * (joints + 9)
+
+
 def reach_m(robot: RobotDescription) -> float:
     """Return an upper bound of the marker's distance from the first joint [m]: all links and strokes end to end."""
     chain = robot.chain

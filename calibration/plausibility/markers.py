@@ -24,7 +24,7 @@ class _Settings:
     tries: int = 400
     # Places that are nearer are one: a marker that is loose moves less [m].
     one_place_m: float = 0.01
-    # Smallest share and number of the rows at a place, and smallest share at all places together.
+    # Smallest share of the rows and number of poses at a place, and smallest share of the rows at all places together.
     share: float = 0.08
     fewest: int = 3
     covered: float = 0.85
@@ -53,20 +53,21 @@ def several_markers(search: ReadingSearch, before: float) -> Plausibility | None
     chosen = rng.permuted(np.tile(np.arange(rows), (_SETTINGS.tries, 1)), axis=1)[:, : _SETTINGS.chosen]
     found = search.placed_by(chosen)
     scatters = [_scatter(search.on_hand(found, k)) for k in range(_SETTINGS.tries)]
-    places = _places(search.on_hand(found, int(np.argmin(scatters))))
+    places = _places(search, search.on_hand(found, int(np.argmin(scatters))))
     counts = np.bincount(places[places >= 0], minlength=1)
     largest = np.flatnonzero(places == counts.argmax())
     if len(largest) < _SETTINGS.chosen:
         return None
     on_hand = search.on_hand(search.placed_by(largest[None]), 0)
-    places = _places(on_hand)
+    places = _places(search, on_hand)
     names = np.unique(places[places >= 0])
     if len(names) < 2 or (places >= 0).mean() < _SETTINGS.covered:
         return None
     centres = np.stack([on_hand[places == name].mean(axis=0) for name in names])
     kept = places >= 0
-    after = float(np.sqrt(np.square(on_hand[kept] - centres[np.searchsorted(names, places[kept])]).sum(axis=1).mean()))
-    # A marker that was moved once is told with its row.
+    off = on_hand[kept] - centres[np.searchsorted(names, places[kept])]
+    after = max(float(np.sqrt(np.square(off).sum(axis=1).mean())), search.exact_m)
+    # A marker that was moved once is reported by calibration, with its row.
     changes = int((np.diff(places[kept]) != 0).sum())
     if before < _SETTINGS.better * after or changes < len(names):
         return None
@@ -88,9 +89,12 @@ def _scatter(on_hand: FloatArray) -> float:
     return float(np.median(np.partition(apart, 2, axis=1)[:, 2]))
 
 
-def _places(on_hand: FloatArray) -> NDArray[np.intp]:
+def _places(search: ReadingSearch, on_hand: FloatArray) -> NDArray[np.intp]:
     """Return the place of each point (n,), from 1; -1 where it is at none with enough others."""
     places = np.asarray(fcluster(linkage(on_hand), _SETTINGS.one_place_m, "distance"), dtype=np.intp)
-    counts = np.bincount(places)
-    few = counts < max(_SETTINGS.fewest, _SETTINGS.share * len(places))
-    return np.where(few[places], -1, places)
+    for place in range(1, int(places.max()) + 1):
+        rows = np.flatnonzero(places == place)
+        # A pose that is held or comes back has the same errors of the arm in each row.
+        if len(rows) < _SETTINGS.share * len(places) or len(search.poses_apart(rows)) < _SETTINGS.fewest:
+            places[rows] = -1
+    return places

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray
 
-from .limits import spread_m
+from .limits import place_an_arm, spread_m
 from .search import ROWS, ReadingSearch
 from .verdict import FEWEST_ROWS, THRESHOLDS, Plausibility, mm
 
@@ -30,18 +30,21 @@ class _Settings:
 _SETTINGS = _Settings()
 
 
-def all_shifted(search: ReadingSearch, q: FloatArray, x: FloatArray, before: float) -> Plausibility | None:
+def all_shifted(search: ReadingSearch, q: FloatArray, x: FloatArray) -> Plausibility | None:
     """Return a refusal if each position belongs to the angles of a row nearby; else None.
 
     Args:
         search: the search over other readings, which found none.
         q, x: all pairs (n, d) [rad, m] and (n, 3) [m].
-        before: distance of the pairs as they are [m].
     """
     shifts, rows = _rows_nearby(len(q))
-    errors = search.errors(np.stack([q[rows + shift] for shift in shifts]), np.stack([x[rows]] * len(shifts)))
+    if not place_an_arm(len(rows), search.chain.joints):
+        return None
+    # As they are, the same rows: others may hold the outliers.
+    tried = [0, *shifts]
+    errors = search.errors(np.stack([q[rows + shift] for shift in tried]), np.stack([x[rows]] * len(tried)))
     best = int(errors.argmin())
-    after, shift = float(errors[best]), shifts[best]
+    before, after, shift = float(errors[0]), float(errors[best]), tried[best]
     if after > THRESHOLDS.named / 2 * spread_m(x) or before < THRESHOLDS.much_better * after:
         return None
     row, remedy = _moved(shift)

@@ -102,7 +102,7 @@ class ReadingSearch:
         self.chain, self.q, self.x, self.exact_m, self._pose_known = chain, q, x, exact_m, pose_known
         self._parameters = ChainParameters(chain)
         self._std = np.where(chain.prismatic, SLIDES_M, ZEROS_RAD)
-        self.apart = _poses_apart(q / np.where(chain.prismatic, A_RADIAN_M, 1.0))
+        self.apart = self.poses_apart(np.arange(len(q)))
         self._poses = len(self.apart)
         self._tried: set[Reading] = set()
         self.fits: dict[Reading, ReadingFit] = {}
@@ -194,6 +194,16 @@ class ReadingSearch:
         change[p.zeros], change[p.tool] = placed.zeros[0], placed.tools[0]
         drawn = (p.positions(change, each) @ placed.rotations[0].T + placed.shifts[0] for each, _ in pairs)
         return np.stack([np.linalg.norm(at - seen, axis=1) for at, (_, seen) in zip(drawn, pairs, strict=True)])
+
+    def poses_apart(self, rows: NDArray[np.intp]) -> list[int]:
+        """Return those of some rows (m,) whose poses are `apart_rad` from each other, in at least one joint."""
+        q = self.q[rows] / np.where(self.chain.prismatic, A_RADIAN_M, 1.0)
+        apart = np.abs(q[:, None] - q).max(axis=2) > _SETTINGS.apart_rad
+        kept: list[int] = []
+        for pose, far in enumerate(apart):
+            if far[kept].all():
+                kept.append(pose)
+        return rows[kept].tolist()
 
     def placed_by(self, rows: NDArray[np.intp]) -> Placements:
         """Place the nominal chain to sets of rows (s, n), with the columns as they are."""
@@ -367,16 +377,6 @@ class ReadingSearch:
             if found not in fits or fit.nats < fits[found].nats:
                 fits[found] = fit
         return fits
-
-
-def _poses_apart(q: FloatArray) -> list[int]:
-    """Return poses of q (n, d) that are `apart_rad` from each other, in at least one joint."""
-    apart = np.abs(q[:, None] - q).max(axis=2) > _SETTINGS.apart_rad
-    kept: list[int] = []
-    for pose, far in enumerate(apart):
-        if far[kept].all():
-            kept.append(pose)
-    return kept
 
 
 def nameable(reading: Reading, fit: ReadingFit, spread: float) -> bool:

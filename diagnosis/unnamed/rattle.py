@@ -16,6 +16,8 @@ from bodyschema.interfaces.records import FloatArray
 _APART, _NAMED = 3.0, 15.0
 # A smaller play beside the noise across it is left to the noise.
 _BEYOND_NOISE = 2.5
+# Least width across the play, as a share of that along it: with less, covariances cannot be inverted.
+_LEAST_ACROSS = 1e-5
 _ROUNDS = 50
 # Most fits beside a play, and the gain in likelihood that ends them [nats].
 _FITS, _SAME = 8, 1.0
@@ -81,13 +83,16 @@ def rattle_beside(fit: Fit) -> Rattle | None:
 
 
 def _two_sided(fit: Fit) -> Rattle | None:
+    if fit.is_exact:
+        # With the play taken out of them, positions of a simulation have no noise to compare it with.
+        return None
     rows, left = fit.noise.weights > 0.0, _on_link(fit)
     variances, axes = np.linalg.eigh(np.cov(left[rows].T))
     means, sigma, worth, sides = _two_sides(left @ axes[:, 2], rows)
     half = 0.5 * float(means[1] - means[0])
     if 2.0 * half < _APART * sigma or worth < _NAMED:
         return None
-    ratio = float(variances[2] / variances[:2].mean()) - 1.0
+    ratio = float(variances[2] / max(variances[:2].mean(), _LEAST_ACROSS**2 * variances[2])) - 1.0
     ways = np.einsum("nji,j->ni", _turns(fit), axes[:, 2])
     return Rattle(half, ratio, axes[:, 2], ways, sides, likelihood(fit) + worth)
 

@@ -356,6 +356,15 @@ def test_a_shift_of_a_cycle_of_poses_is_named() -> None:
     assert "with the angles of 1 row later" in (found.refusal or "")
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_outliers_in_few_rows_are_no_shift(seed) -> None:
+    """With a row of another place, three rows fit any angles."""
+    rng, right = np.random.default_rng(seed), pairs(seed, joints=3, count=9)
+    x = right.x.copy()
+    x[rng.choice(9, 2, replace=False)] += 0.3 * rng.normal(size=(2, 3))
+    assert "shifted" not in "".join(replace(right, x=x).seen().sentences)
+
+
 def test_few_rows_of_another_robot_are_refused() -> None:
     right = pairs(joints=4, count=30)
     found = replace(right, x=np.random.default_rng(1).permutation(right.x)).seen()
@@ -380,6 +389,19 @@ def test_several_markers_in_turn_are_named(markers) -> None:
 
 def test_a_marker_that_was_moved_once_is_not_several() -> None:
     assert "places" not in "".join(with_markers(np.arange(90) // 45, 0.07 * np.eye(3)).seen().sentences)
+
+
+@pytest.mark.parametrize("seed", [0, *rarely(range(1, 6))])
+def test_poses_that_come_back_are_not_several_markers(seed) -> None:
+    """The errors of a rough arm are the same in each row of a pose."""
+    rng, parameters = np.random.default_rng(seed), ChainParameters(arm())
+    made = ChainTolerances(axes=0.02, points=0.01, tool=0.02)
+    change = parameters.standard_deviations(made) * rng.normal(size=parameters.size)
+    change[parameters.zeros] = np.radians(3.0) * rng.normal(size=6)
+    poses = np.array([0.3, -0.8, 1.2, 0.4, 0.9, 0.0]) + rng.uniform(-1.2, 1.2, (10, 6))
+    q = np.tile(poses, (6, 1)) + rng.uniform(-0.003, 0.003, (60, 6))
+    x = parameters.positions(change, q) + 5e-4 * rng.normal(size=(60, 3))
+    assert "places" not in "".join(Pairs(q, x).seen().sentences)
 
 
 @pytest.mark.parametrize("seed", [0, *rarely(range(1, 6))])

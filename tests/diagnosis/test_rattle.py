@@ -54,6 +54,18 @@ def test_a_marker_that_hangs_where_gravity_takes_it_is_loose() -> None:
     assert found.unexplained.rms_mm == pytest.approx(1e3 * HALF_M, rel=0.1)
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_loose_marker_without_noise_is_loose(seed) -> None:
+    robot, rng = surveyed_arm(), np.random.default_rng(seed + 5)
+    motion = scattered(robot, seed, rows=100)
+    run = Simulation(robot).run(motion)
+    ways = run.columns(Effect.at(robot, "tool_offset")) @ np.array([0.6, 0.0, 0.8])
+    x = run.measured + HALF_M * rng.choice([-1.0, 1.0], 100)[:, None] * ways
+    found = conclusion(diagnose(measured(robot, motion, x), Simulation(robot)))
+    assert (found.verdict, found.causes) == ("unexplained", ())
+    assert found.unexplained.rms_mm == pytest.approx(1e3 * HALF_M, rel=1e-3)
+
+
 def test_beside_a_loose_marker_the_noise_and_the_rows_left_out_stay(monkeypatch) -> None:
     robot, rng = surveyed_arm(), np.random.default_rng(0)
     simulation, motion = Simulation(robot), scattered(robot, 1, rows=40)
