@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bodyschema.diagnosis.fit.fit import Fit
+from bodyschema.diagnosis.fit.fit import Fit, wanders
 from bodyschema.diagnosis.fit.worth import NAMED
 from bodyschema.diagnosis.search.held_out import Blocks, held_out_errors, is_marker
 from bodyschema.diagnosis.search.search import Search, describe, named
@@ -51,6 +51,7 @@ class Explanation:
         size: RMS change by the unnamed causes beyond the named ones, in units of the stated noise.
         promise: first-order gain of the best single unnamed cause beside the named ones [nats].
         counted: effective number of independent rows per row (0, 1].
+        inexact: RMS change by an imperfect shape of the named causes, in the same units.
     """
 
     fit: Fit
@@ -59,6 +60,15 @@ class Explanation:
     size: float = 0.0
     promise: float = -np.inf
     counted: float = 1.0
+    inexact: float = 0.0
+
+    @property
+    def wanders(self) -> bool:
+        """True if neighbouring rows share what no unnamed cause predicts, and it is more than an imperfect shape."""
+        fit = self.beside
+        if fit.is_exact or not wanders(fit.correlation, fit.observations.motion.begins):
+            return False
+        return float(np.sqrt(np.square(fit.left).mean())) > self.inexact
 
     @property
     def beside(self) -> Fit:
@@ -139,7 +149,7 @@ def _compared(found: Fit, path: Sequence[Fit], unknowns: Unknowns, search: Searc
     if best.apart is not None:
         best = _rescaled(best, best.apart, unknowns, search)
         best = _pruned(best, unknowns, search, rest=is_rest and best.fit is found)
-    return best
+    return replace(best, inexact=inexact)
 
 
 def useful(explanation: Explanation, search: Search, blocks: Blocks, tell: Callable[[str], None]) -> Explanation:

@@ -304,7 +304,8 @@ def _unexplained(diagnosis: Diagnosis) -> Unexplained:
     names = [joints[k] for k in left.joints] + (["time"] if left.with_time else [])
     rattle_mm = 0.0 if left.rattle is None else 1e3 * left.rattle.half_m
     if left.model is None:
-        return Unexplained(rattle_mm, tuple(names), left.p_value, left.what)
+        rms = float(np.hypot(rattle_mm, 1e3 * left.unpredicted_m))
+        return Unexplained(rms, tuple(names), left.p_value, left.what, (), left.untold)
     rms = float(np.hypot(rattle_mm, 1e3 * np.sqrt(np.square(diagnosis.modelled).sum(axis=1).mean())))
     model = left.model.stored if diagnosis.stored is diagnosis.extended else None
     stored = () if model is None else tuple(dict.fromkeys(model.joints))

@@ -118,9 +118,12 @@ def families(run: Simulated) -> list[Family]:
             what = "the lens refocuses: its focal length wanders"
             for count in (count for count in _JOINT_TIMES if _ROWS_A_WAVE * count < len(motion)):
                 found.append(Family(what, "place", None, (), True, _along_axis, _any_of_time(count)))
-        what = "the clocks of images and joints run apart"
-        found.append(Family(what, "clock", None, (), True, _late, _one_and_time, is_specific=True))
-        found.append(Family(what, "clock", None, (), True, _late, _any_of_time(_TIMES)))
+        for what, amounts in (
+            ("the clocks of images and joints run apart", _shares_of_time),
+            ("how late the images are changes with time", _waves_of_time),
+        ):
+            is_linear = amounts is _shares_of_time
+            found.append(Family(what, "clock", None, (), True, _late, amounts, is_specific=is_linear))
     for degree in (2, 3):
         what = "an error of depth that depends on where the marker is in the image"
         found.append(Family(what, "place", None, (), False, _in_depth, _places_in_image(degree)))
@@ -242,9 +245,15 @@ def _any_of_time(count: int) -> Columns:
     return amounts
 
 
-def _one_and_time(run: Simulated) -> FloatArray:
+def _shares_of_time(run: Simulated) -> FloatArray:
+    """Return the time (n, 1), from -1/2 to 1/2: lateness in the mean has a name."""
     clock = run.motion.clock
-    return _with_one((clock - clock[0])[:, None] / max(float(clock[-1] - clock[0]), 1e-9))
+    return (clock - clock[0])[:, None] / max(float(clock[-1] - clock[0]), 1e-9) - 0.5
+
+
+def _waves_of_time(run: Simulated) -> FloatArray:
+    """Return cosines (n, a) over the time of the recording, without a constant."""
+    return _any_of_time(_TIMES)(run)[:, 1:]
 
 
 def _warming_or_any_of_time(run: Simulated) -> FloatArray:
