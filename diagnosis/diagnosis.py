@@ -246,7 +246,7 @@ class Diagnosis:
         left = fit.observations.x - fit.predicted - unstored
         motion = fit.observations.motion
         shared = correlation(np.where(kept[:, None], left, 0.0), motion.begins)
-        shared = shared if wanders(shared, motion.begins) else 0.0
+        shared = shared if self.left.rattle is None and wanders(shared, motion.begins) else 0.0
         left = left[kept]
         roots = np.linalg.inv(fit.observations.whitening)
         stated = roots @ np.swapaxes(roots, 1, 2)

@@ -56,7 +56,7 @@ class Leftover:
 
 def leftover(explanation: Explanation, unknowns: Unknowns, blocks: Blocks, loose: Rattle | None) -> Leftover:
     """Return the residual structure that the families of an explanation describe, and the play of a loose marker."""
-    left = _of_families(explanation, unknowns, blocks)
+    left = _of_families(explanation, unknowns, blocks, is_loose=loose is not None)
     if loose is None:
         return left
     # Look at the joint that carries the marker.
@@ -65,14 +65,15 @@ def leftover(explanation: Explanation, unknowns: Unknowns, blocks: Blocks, loose
     return replace(left, what=(*left.what, loose.what), joints=joints, rattle=loose)
 
 
-def _of_families(explanation: Explanation, unknowns: Unknowns, blocks: Blocks) -> Leftover:
+def _of_families(explanation: Explanation, unknowns: Unknowns, blocks: Blocks, *, is_loose: bool) -> Leftover:
     fit, apart = explanation.fit, explanation.apart
     if fit.is_exact:
         return Leftover((), (), False, 1.0)
     if apart is None:
         beside = unknowns.apart(fit, (unknowns.nearest(fit)[0][0],))
         left = Leftover((), (), False, min(1.0, _chance(fit, beside, unknowns) * unknowns.count))
-        if not explanation.wanders:
+        # On which side of its play a marker lies is alike in neighbouring rows.
+        if is_loose or not explanation.wanders:
             return left
         squares = np.square(fit.observations.x - fit.predicted).sum(axis=1)
         shared = float(np.sqrt(fit.correlation * np.average(squares, weights=fit.noise.weights)))
