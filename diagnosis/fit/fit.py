@@ -44,9 +44,9 @@ _UNABSORBED = 1e-6
 _ROUNDED_OFF, _STILL = 1e-12, 1e-6
 # Floor of the residuals, in units of the stated noise: numerical rounding.
 ROUNDED = 1e-9
-# Largest correlation of neighbouring rows that counts, and the largest that noise of an instrument is taken to have: that
-# of a slow tracker. With 0.6, three of six recordings of such a tracker were unexplained; with 0.8, two of six errors that
-# wander were noise.
+# Largest correlation of neighbouring rows that counts, and the largest that noise of an instrument is taken to have:
+# that of a slow tracker. With 0.6, three of six recordings of such a tracker were unexplained; with 0.8, two of six
+# errors that wander were noise.
 _MOST_ALIKE, _NOISE_ALIKE = 0.99, 0.7
 # A larger share of outliers within such a window is a change and not outliers.
 _WINDOW, _BURST = 61, 0.45
