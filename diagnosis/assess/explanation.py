@@ -201,7 +201,9 @@ def _missed(fit: Fit, blocks: Blocks) -> FloatArray:
 def _rescaled(best: Explanation, apart: Apart, unknowns: Unknowns, search: Search) -> Explanation:
     """Refit with the tolerance scales found beside the unnamed causes, where that is more probable."""
     scales = tolerated(apart.fit).scales
-    again = _with_unknown(best.fit.tolerating(scales), unknowns, search, best.counted)
+    # Linearised about what is found beside them: without them, tolerances follow them far from there.
+    about = apart.fit.tolerating(scales).to(best.fit.observations)
+    again = _with_unknown(about, unknowns, search, best.counted)
     before = best.fit.background.scales
     gained = again.worth - best.worth - scales.doubt + (0.0 if before is None else before.doubt)
     return again if again.unknown and gained > 0.0 else best
