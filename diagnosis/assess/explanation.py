@@ -147,7 +147,10 @@ def _compared(found: Fit, path: Sequence[Fit], unknowns: Unknowns, search: Searc
         if other.apart is not None and better and unknowns.predicts(other.apart, found):
             best = other
     if best.apart is not None:
-        best = _rescaled(best, best.apart, unknowns, search)
+        # Linearised about what is found beside them: without them, tolerances follow them far from there. In the
+        # contest nothing is linearised again, where named causes are not either.
+        about = best.apart.fit.tolerating(tolerated(best.apart.fit).scales).to(best.fit.observations)
+        best = _rescaled(best, best.apart, unknowns, search, about)
         best = _pruned(best, unknowns, search, rest=is_rest and best.fit is found)
     return replace(best, inexact=inexact)
 
@@ -198,12 +201,16 @@ def _missed(fit: Fit, blocks: Blocks) -> FloatArray:
     return np.square(held_out_errors(fit, blocks)).sum(axis=1)
 
 
-def _rescaled(best: Explanation, apart: Apart, unknowns: Unknowns, search: Search) -> Explanation:
-    """Refit with the tolerance scales found beside the unnamed causes, where that is more probable."""
+def _rescaled(
+    best: Explanation, apart: Apart, unknowns: Unknowns, search: Search, about: Fit | None = None
+) -> Explanation:
+    """Refit with the tolerance scales found beside the unnamed causes, where that is more probable.
+
+    Args:
+        about: the named causes with these scales, linearised elsewhere.
+    """
     scales = tolerated(apart.fit).scales
-    # Linearised about what is found beside them: without them, tolerances follow them far from there.
-    about = apart.fit.tolerating(scales).to(best.fit.observations)
-    again = _with_unknown(about, unknowns, search, best.counted)
+    again = _with_unknown(about or best.fit.tolerating(scales), unknowns, search, best.counted)
     before = best.fit.background.scales
     gained = again.worth - best.worth - scales.doubt + (0.0 if before is None else before.doubt)
     return again if again.unknown and gained > 0.0 else best
