@@ -24,7 +24,7 @@ from bodyschema.diagnosis.assess.shares import Shares, shares
 from bodyschema.diagnosis.assess.stored import is_better_with, stored
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.background import Scales
-from bodyschema.diagnosis.fit.fit import Fit, fitted
+from bodyschema.diagnosis.fit.fit import Fit, correlation, fitted, wanders
 from bodyschema.diagnosis.fit.instrument import instrument_factor, reshaped
 from bodyschema.diagnosis.fit.observations import IntArray, Observations
 from bodyschema.diagnosis.fit.worth import NAMED
@@ -233,15 +233,26 @@ class Diagnosis:
 
     @cached_property
     def noise(self) -> FloatArray:
-        """Noise covariances (n, 3, 3) [m²], from the residuals of the complete model."""
+        """Noise covariances (n, 3, 3) [m²], from the residuals of the complete model.
+
+        Where neighbouring rows share nearly all of them, only what they do not share is noise: half the square of their
+        differences.
+        """
         fit, kept = self.extended, self.markers
+        if self.left.model is not None:
+            # Large tolerances moved into the simulation are right to first order alone.
+            fit = self.left.model.fit
         unstored = 0.0 if self.left.model is None else self.left.model.unstored
-        left = (fit.observations.x - fit.predicted - unstored)[kept]
+        left = fit.observations.x - fit.predicted - unstored
+        motion = fit.observations.motion
+        shared = correlation(np.where(kept[:, None], left, 0.0), motion.begins)
+        shared = shared if self.left.rattle is None and wanders(shared, motion.begins) else 0.0
+        left = left[kept]
         roots = np.linalg.inv(fit.observations.whitening)
         stated = roots @ np.swapaxes(roots, 1, 2)
         # Scale the stated noise to the size of the residuals, corrected for what the fit absorbed.
         spent = min(fit.background.spent(fit.noise.sigma) / max(left.size, 1), _MOST_SPENT)
-        size = np.square(left).sum() / np.trace(stated[kept], axis1=1, axis2=2).sum() / (1.0 - spent)
+        size = np.square(left).sum() / np.trace(stated[kept], axis1=1, axis2=2).sum() / (1.0 - spent) * (1.0 - shared)
         # The play of a loose marker is no noise.
         return float(size) * fit.observations.own
 

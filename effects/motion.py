@@ -123,25 +123,32 @@ class Motion:
                 cubics[:3, first : end - 1] = _cubics(self.clock[first:end], self.q[first:end])
         return frozen_array(cubics)
 
-    def earlier(self, lag_s: float) -> Motion:
-        """Return the readings that the encoders gave `lag_s` before each row, interpolated without overshoot.
+    def earlier(self, lag_s: float | FloatArray) -> Motion:
+        """Return the readings that the encoders gave `lag_s`, alike or (n,), before each row, without overshoot.
 
         Before the first row of a run, and after its last, the nearest rate continues. Single rows, and all rows where
         there are no times, stay unchanged (Fritsch and Butland 1984).
         """
-        if lag_s == 0.0 or self.t is None:
+        if self.t is None:
             return self
-        return _earlier(self, lag_s)
+        if isinstance(lag_s, np.ndarray):
+            return _asked(self, self.t - lag_s)
+        return self if lag_s == 0.0 else _earlier(self, lag_s)
 
 
 @lru_cache(maxsize=_EARLIER_KEPT)
 def _earlier(motion: Motion, lag_s: float) -> Motion:
     """Return the earlier readings; cached, since a search repeats the same lags."""
     assert motion.t is not None
+    return _asked(motion, motion.t - lag_s)
+
+
+def _asked(motion: Motion, asked: FloatArray) -> Motion:
+    """Return the readings at the times `asked` (n,), each by the run of its row."""
+    assert motion.t is not None
     t, cubics = motion.t, motion.cubics
     lengths = [end - first for first, end in motion.runs]
     first, end = (np.repeat(rows, lengths) for rows in zip(*motion.runs, strict=True))
-    asked = t - lag_s
     inside = np.clip(asked, t[first], t[end - 1])
     interval = np.clip(np.searchsorted(t, inside, side="right") - 1, first, np.maximum(end - 2, first))
     since = (inside - t[interval])[:, None]

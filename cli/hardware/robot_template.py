@@ -57,7 +57,7 @@ marker_link = {marker_link}
 marker_xyz = [0.0, 0.0, 0.0]
 # true once marker_xyz was measured; false fits it first.
 marker_known = false
-# Who bears the arm's weight: torque_free | zero_force | held
+# CHECK: who bears the arm's weight while it is recorded: torque_free (a guiding hand) | zero_force | held (its motors).
 hold = "torque_free"
 
 # The measurement frame: the left optical frame, x right, y down, z forward.

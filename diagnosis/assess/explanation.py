@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bodyschema.diagnosis.fit.fit import Fit
+from bodyschema.diagnosis.fit.fit import Fit, wanders
 from bodyschema.diagnosis.fit.worth import NAMED
 from bodyschema.diagnosis.search.held_out import Blocks, held_out_errors, is_marker
 from bodyschema.diagnosis.search.search import Search, describe, named
@@ -51,6 +51,7 @@ class Explanation:
         size: RMS change by the unnamed causes beyond the named ones, in units of the stated noise.
         promise: first-order gain of the best single unnamed cause beside the named ones [nats].
         counted: effective number of independent rows per row (0, 1].
+        inexact: RMS change by an imperfect shape of the named causes, in the same units.
     """
 
     fit: Fit
@@ -59,6 +60,15 @@ class Explanation:
     size: float = 0.0
     promise: float = -np.inf
     counted: float = 1.0
+    inexact: float = 0.0
+
+    @property
+    def wanders(self) -> bool:
+        """True if neighbouring rows share what no unnamed cause predicts, and it is more than an imperfect shape."""
+        fit = self.beside
+        if fit.is_exact or not wanders(fit.correlation, fit.observations.motion.begins):
+            return False
+        return float(np.sqrt(np.square(fit.left).mean())) > self.inexact
 
     @property
     def beside(self) -> Fit:
@@ -137,9 +147,12 @@ def _compared(found: Fit, path: Sequence[Fit], unknowns: Unknowns, search: Searc
         if other.apart is not None and better and unknowns.predicts(other.apart, found):
             best = other
     if best.apart is not None:
-        best = _rescaled(best, best.apart, unknowns, search)
+        # Linearised about what is found beside them: without them, tolerances follow them far from there. In the
+        # contest nothing is linearised again, where named causes are not either.
+        about = best.apart.fit.tolerating(tolerated(best.apart.fit).scales).to(best.fit.observations)
+        best = _rescaled(best, best.apart, unknowns, search, about)
         best = _pruned(best, unknowns, search, rest=is_rest and best.fit is found)
-    return best
+    return replace(best, inexact=inexact)
 
 
 def useful(explanation: Explanation, search: Search, blocks: Blocks, tell: Callable[[str], None]) -> Explanation:
@@ -188,10 +201,16 @@ def _missed(fit: Fit, blocks: Blocks) -> FloatArray:
     return np.square(held_out_errors(fit, blocks)).sum(axis=1)
 
 
-def _rescaled(best: Explanation, apart: Apart, unknowns: Unknowns, search: Search) -> Explanation:
-    """Refit with the tolerance scales found beside the unnamed causes, where that is more probable."""
+def _rescaled(
+    best: Explanation, apart: Apart, unknowns: Unknowns, search: Search, about: Fit | None = None
+) -> Explanation:
+    """Refit with the tolerance scales found beside the unnamed causes, where that is more probable.
+
+    Args:
+        about: the named causes with these scales, linearised elsewhere.
+    """
     scales = tolerated(apart.fit).scales
-    again = _with_unknown(best.fit.tolerating(scales), unknowns, search, best.counted)
+    again = _with_unknown(about or best.fit.tolerating(scales), unknowns, search, best.counted)
     before = best.fit.background.scales
     gained = again.worth - best.worth - scales.doubt + (0.0 if before is None else before.doubt)
     return again if again.unknown and gained > 0.0 else best

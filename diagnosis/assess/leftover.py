@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 from scipy.special import chdtrc
 
 from bodyschema.diagnosis.fit.fit import Fit
@@ -14,6 +15,8 @@ from bodyschema.diagnosis.unnamed.smooth import SmoothModel, smooth_model
 from bodyschema.diagnosis.unnamed.unknown import Apart, Unknowns
 
 from .explanation import Explanation
+
+_WANDERS = "an error that neighbouring rows share and nothing that was tested predicts"
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +31,7 @@ class Leftover:
         model: the causes beside a smooth model of it; None where no structure is left.
         untold: descriptions of time-dependent parts, which no stored model can contain.
         rattle: play of a loose marker; None for one that is fixed.
+        unpredicted_m: RMS of what neighbouring rows share and nothing predicts [m].
     """
 
     what: tuple[str, ...]
@@ -37,6 +41,7 @@ class Leftover:
     model: SmoothModel | None = None
     untold: tuple[str, ...] = ()
     rattle: Rattle | None = None
+    unpredicted_m: float = 0.0
 
     @property
     def is_there(self) -> bool:
@@ -51,7 +56,7 @@ class Leftover:
 
 def leftover(explanation: Explanation, unknowns: Unknowns, blocks: Blocks, loose: Rattle | None) -> Leftover:
     """Return the residual structure that the families of an explanation describe, and the play of a loose marker."""
-    left = _of_families(explanation, unknowns, blocks)
+    left = _of_families(explanation, unknowns, blocks, is_loose=loose is not None)
     if loose is None:
         return left
     # Look at the joint that carries the marker.
@@ -60,13 +65,19 @@ def leftover(explanation: Explanation, unknowns: Unknowns, blocks: Blocks, loose
     return replace(left, what=(*left.what, loose.what), joints=joints, rattle=loose)
 
 
-def _of_families(explanation: Explanation, unknowns: Unknowns, blocks: Blocks) -> Leftover:
+def _of_families(explanation: Explanation, unknowns: Unknowns, blocks: Blocks, *, is_loose: bool) -> Leftover:
     fit, apart = explanation.fit, explanation.apart
     if fit.is_exact:
         return Leftover((), (), False, 1.0)
     if apart is None:
         beside = unknowns.apart(fit, (unknowns.nearest(fit)[0][0],))
-        return Leftover((), (), False, min(1.0, _chance(fit, beside, unknowns) * unknowns.count))
+        left = Leftover((), (), False, min(1.0, _chance(fit, beside, unknowns) * unknowns.count))
+        # On which side of its play a marker lies is alike in neighbouring rows.
+        if is_loose or not explanation.wanders:
+            return left
+        squares = np.square(fit.observations.x - fit.predicted).sum(axis=1)
+        shared = float(np.sqrt(fit.correlation * np.average(squares, weights=fit.noise.weights)))
+        return replace(left, what=(_WANDERS,), with_time=True, untold=(_WANDERS,), unpredicted_m=shared)
     families = [way.family for way in apart.chosen]
     joints = [joints_of(family, own, fit.run) for family, own in zip(families, apart.numbers, strict=True)]
     return Leftover(

@@ -10,17 +10,19 @@ import numpy as np
 from bodyschema.diagnosis.fit.fit import Fit, amount_columns, solved
 from bodyschema.diagnosis.fit.scatter import beyond_single_rows, limited_rows, remembers
 from bodyschema.diagnosis.fit.worth import SAME, nats
-from bodyschema.diagnosis.search.held_out import Blocks
+from bodyschema.diagnosis.search.held_out import Blocks, beside_fit
 from bodyschema.diagnosis.search.scan import Candidate
 from bodyschema.diagnosis.search.search import Search
 from bodyschema.diagnosis.unnamed.unknown import Unknowns
-from bodyschema.effects import Effect, Motion
+from bodyschema.effects import Effect, EffectType, Motion
 from bodyschema.interfaces.records import FloatArray
 
 from .nameless import Nameless
 
 # Predictions are the same if their expected Δχ² is smaller.
 _SAME_SHARE = 1e-3
+# Share of a column's squares below which it is not told from the fit's own parameters.
+_TOLD = 1e-7
 # Number of resamplings for probabilities; 0.3 to 3 times this changes them by less than 0.03.
 _BAGGED = 400
 # A less probable rival is not listed.
@@ -79,6 +81,8 @@ class Standing:
         dof: number of its amounts that the data determine.
         gain: its Δχ².
         rivals: the probable ones, the most probable first.
+        is_like_sag: True if a joint that gives under the arm's weight explains nearly as much, and was not tested, or
+            with weights that are assumed.
     """
 
     itself: Candidate
@@ -86,6 +90,7 @@ class Standing:
     dof: int
     gain: float
     rivals: tuple[Rival, ...]
+    is_like_sag: bool = False
 
 
 def standings(fit: Fit, search: Search, blocks: Blocks, seed: int, unknowns: Unknowns | None = None) -> list[Standing]:
@@ -136,7 +141,36 @@ def _standing(
             rivals.append(Rival(other, alternative, float(share), _difference(fit, other), anywhere, signal, one))
     same = sum(rival.probability for rival in rivals if rival.is_one)
     ordered = tuple(sorted(rivals, key=lambda rival: rival.probability, reverse=True))
-    return Standing(itself, float(probable[0]) + same, itself.dof, gain, ordered)
+    sags = is_like_sag(without, cause, _COMES_NEAR * itself.gain)
+    return Standing(itself, float(probable[0]) + same, itself.dof, gain, ordered, sags)
+
+
+def resembles_sag(kind: EffectType) -> bool:
+    """Return True for an error of a joint that depends on angles alone, as sag nearly does."""
+    lasts = not (kind.depends_on_path or kind.changes_with_time)
+    return kind.encoder is not None and lasts and not kind.is_zero
+
+
+def is_like_sag(without: Fit, cause: Effect, least: float) -> bool:
+    """Return True if a spring at one joint explains what a cause does, although its weight is assumed or not borne.
+
+    Args:
+        without: the fit without the cause.
+        least: the Δχ² that it has to explain, to first order.
+    """
+    run = without.run
+    if (run.simulation.bears_weight and run.simulation.gravity.known) or not resembles_sag(cause.kind):
+        return False
+    columns = without.weighted(run.by_joint * run.torques[:, None, :])
+    beside = beside_fit(without, columns).reshape(without.left.size, -1)
+    left = without.evident.ravel()
+    toward, squares = beside.T @ left, np.square(beside).sum(axis=0)
+    # The share of a column that the fit's own parameters leave may be rounding alone.
+    told = (toward > 0.0) & (squares > _TOLD * np.square(columns).sum(axis=(0, 1)))
+    explained = np.square(toward[told]) / squares[told]
+    rows = 3.0 * float(without.noise.weights.sum())
+    share = float(explained.max(initial=0.0)) / max(float(left @ left), 1e-300)
+    return bool(-rows * np.log1p(-min(share, 1.0 - 1e-9)) >= least)
 
 
 def bagged(behind: Sequence[float], rows: Sequence[FloatArray], blocks: Blocks, seed: int) -> FloatArray:

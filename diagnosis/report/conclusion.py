@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 import numpy as np
 
-from bodyschema.diagnosis.assess.rivals import Rival, Standing
+from bodyschema.diagnosis.assess.rivals import Rival, Standing, resembles_sag
 from bodyschema.diagnosis.diagnosis import MOST_DOUBTFUL, Diagnosis
 from bodyschema.diagnosis.fit.background import ANGLE_RAD, DRIVE_RAD, LENGTH_M
 from bodyschema.diagnosis.fit.fit import Fit
@@ -14,7 +14,6 @@ from bodyschema.diagnosis.search.aliases import alias_sentences
 from bodyschema.diagnosis.search.scan import Candidate
 from bodyschema.diagnosis.search.together import is_at_limit
 from bodyschema.effects import Effect
-from bodyschema.effects.effect_type import EffectType
 from bodyschema.interfaces.records import FloatArray
 
 from .result import (
@@ -38,6 +37,8 @@ _HALF_WIDTH_95 = 1.959964
 _OF_A_DESCRIPTION = 0.5
 # ... and that an error beside a joint that gives is one of its own, where the weight is assumed.
 _OF_A_GUESS = 0.5
+_UNKNOWN_WEIGHT = "the spread of the arm's weight, which the URDF does not state"
+_UNTESTED_WEIGHT = "sag, which was not tested: robot.toml says that the hand bore the weight"
 # Below this p-value, the report explains why a hypothesis is not a cause.
 _HARDLY_CHANCE = 1e-3
 
@@ -149,24 +150,20 @@ def _causes(diagnosis: Diagnosis, seen_by: str) -> tuple[Cause, ...]:
                 evidence=evidence(standing, seen_by),
             )
         )
-    if not diagnosis.aligned.simulation.gravity.known:
-        giving = {cause.where for cause in fit.causes if cause.kind.is_spring}
-        beside = [cause.where in giving and _like_sag(cause.kind) for cause in fit.causes]
-        causes = [_or_sag(cause) if likely else cause for cause, likely in zip(causes, beside, strict=True)]
+    simulation = diagnosis.aligned.simulation
+    what = _UNKNOWN_WEIGHT if simulation.bears_weight else _UNTESTED_WEIGHT
+    giving = {cause.where for cause in fit.causes if cause.kind.is_spring}
+    for k, (cause, standing) in enumerate(zip(fit.causes, diagnosis.standings, strict=True)):
+        beside_spring = not simulation.gravity.known and cause.where in giving and resembles_sag(cause.kind)
+        if beside_spring or standing.is_like_sag:
+            causes[k] = _or_sag(causes[k], what)
     if diagnosis.outliers_are_found:
         causes.append(_outliers(diagnosis))
     return tuple(causes)
 
 
-def _like_sag(kind: EffectType) -> bool:
-    """Return True for an error of a joint that depends on its angle alone, as sag about nearly does."""
-    lasts = not (kind.depends_on_path or kind.changes_with_time)
-    return kind.encoder is not None and lasts and not kind.is_zero
-
-
-def _or_sag(cause: Cause) -> Cause:
-    """Return a cause beside a joint that gives, of an arm whose weight is assumed: it may be a part of that."""
-    what = "the spread of the arm's weight, which the URDF does not state"
+def _or_sag(cause: Cause, what: str) -> Cause:
+    """Return a cause that may be a joint that gives, or a part of that, where the weight is assumed or not tested."""
     sag = Indistinguishable("unexplained", None, None, "this_motion", _OF_A_GUESS, what)
     return msgspec.structs.replace(cause, probability=min(cause.probability, _OF_A_GUESS), rivals=(sag, *cause.rivals))
 
@@ -304,7 +301,8 @@ def _unexplained(diagnosis: Diagnosis) -> Unexplained:
     names = [joints[k] for k in left.joints] + (["time"] if left.with_time else [])
     rattle_mm = 0.0 if left.rattle is None else 1e3 * left.rattle.half_m
     if left.model is None:
-        return Unexplained(rattle_mm, tuple(names), left.p_value, left.what)
+        rms = float(np.hypot(rattle_mm, 1e3 * left.unpredicted_m))
+        return Unexplained(rms, tuple(names), left.p_value, left.what, (), left.untold)
     rms = float(np.hypot(rattle_mm, 1e3 * np.sqrt(np.square(diagnosis.modelled).sum(axis=1).mean())))
     model = left.model.stored if diagnosis.stored is diagnosis.extended else None
     stored = () if model is None else tuple(dict.fromkeys(model.joints))

@@ -126,7 +126,7 @@ def added(fit: Fit, candidates: Sequence[Candidate], blocks: Blocks) -> list[Add
     products = _Products.of(fit, np.concatenate([fit.columns, fresh], axis=2), blocks)
     precision = np.append(fit.precision, 1.0 / np.square(np.array(usual)))
     before, *after = products.missed(precision, len(fit.precision), [np.arange(0), *groups]).tolist()
-    beside = _beside(fit, fresh)
+    beside = beside_fit(fit, fresh)
     return [
         Added(100.0 * (1.0 - missed / before if before > 0.0 else 0.0), _p_value(fit, beside[:, :, own], blocks))
         for missed, own in zip(after, groups, strict=True)
@@ -194,10 +194,10 @@ def block_p_value(fit: Fit, columns: FloatArray, blocks: Blocks) -> float:
     neighbouring rows are correlated, as when a joint stands still and is rounded in the same way again and again (Liang
     and Zeger 1986; Hotelling's T² for few blocks).
     """
-    return _p_value(fit, _beside(fit, columns), blocks)
+    return _p_value(fit, beside_fit(fit, columns), blocks)
 
 
-def _beside(fit: Fit, columns: FloatArray) -> FloatArray:
+def beside_fit(fit: Fit, columns: FloatArray) -> FloatArray:
     """Return what columns (n, 3, k) change beside a fit, `unshared`."""
     flat = fit.unshared(columns.reshape(fit.left.size, -1))
     basis = fit.orthogonal.reshape(fit.left.size, -1)

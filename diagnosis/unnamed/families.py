@@ -39,7 +39,7 @@ class Family:
 
     Attributes:
         what: short description.
-        kind: the erring part: a joint, a body (a link, the tool, the camera), or the place in the image.
+        kind: the erring part: a joint, a body (a link, the tool, the camera), the place in the image, or the clock.
         joint: the erring joint, or the joint after the erring link; None where there is no single joint.
         drivers: the one or two joints on which alone it depends; empty for other families.
         over_time: True if it depends on time.
@@ -53,7 +53,7 @@ class Family:
     """
 
     what: str
-    kind: Literal["joint", "body", "place"]
+    kind: Literal["joint", "body", "place", "clock"]
     joint: int | None
     drivers: tuple[int, ...]
     over_time: bool
@@ -118,6 +118,12 @@ def families(run: Simulated) -> list[Family]:
             what = "the lens refocuses: its focal length wanders"
             for count in (count for count in _JOINT_TIMES if _ROWS_A_WAVE * count < len(motion)):
                 found.append(Family(what, "place", None, (), True, _along_axis, _any_of_time(count)))
+        for what, amounts in (
+            ("the clocks of images and joints run apart", _shares_of_time),
+            ("how late the images are changes with time", _waves_of_time),
+        ):
+            is_linear = amounts is _shares_of_time
+            found.append(Family(what, "clock", None, (), True, _late, amounts, is_specific=is_linear))
     for degree in (2, 3):
         what = "an error of depth that depends on where the marker is in the image"
         found.append(Family(what, "place", None, (), False, _in_depth, _places_in_image(degree)))
@@ -195,6 +201,11 @@ def _camera(run: Simulated) -> FloatArray:
     return run.columns(Effect.at(run.simulation.robot, "camera_pose"))
 
 
+def _late(run: Simulated) -> FloatArray:
+    """Return displacements per second by which the images are late."""
+    return run.columns(Effect.at(run.simulation.robot, "camera_latency"))
+
+
 def _anywhere(run: Simulated) -> FloatArray:
     return np.broadcast_to(np.eye(3), (len(run.motion), 3, 3))
 
@@ -232,6 +243,17 @@ def _any_of_time(count: int) -> Columns:
         return np.cos(np.pi * share[:, None] * np.arange(count + 1))
 
     return amounts
+
+
+def _shares_of_time(run: Simulated) -> FloatArray:
+    """Return the time (n, 1), from -1/2 to 1/2: lateness in the mean has a name."""
+    clock = run.motion.clock
+    return (clock - clock[0])[:, None] / max(float(clock[-1] - clock[0]), 1e-9) - 0.5
+
+
+def _waves_of_time(run: Simulated) -> FloatArray:
+    """Return cosines (n, a) over the time of the recording, without a constant."""
+    return _any_of_time(_TIMES)(run)[:, 1:]
 
 
 def _warming_or_any_of_time(run: Simulated) -> FloatArray:

@@ -358,11 +358,14 @@ class Unknowns:
     def _without(
         self, observations: Observations, chosen: Sequence[Way], numbers: Sequence[FloatArray]
     ) -> Observations:
-        """Remove the families' part: a joint's error from the readings, others from the positions."""
+        """Remove the families' part: a joint's error and lateness from the readings, others from the positions."""
         q, x = observations.motion.q.copy(), observations.x.copy()
         for family, own in ((way.family, own) for way, own in zip(chosen, numbers, strict=True)):
             if family.kind == "joint":
                 q[:, family.joint] += family.moved_by(self._run, own)[:, 0]
+            elif family.kind == "clock":
+                motion = observations.motion
+                q += motion.earlier(family.moved_by(self._run, own)[:, 0]).q - motion.q
             elif family.undone is not None:
                 x = family.undone(x, own)
             else:

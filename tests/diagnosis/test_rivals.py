@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from planted_cases import BASE, SHOULDER, desk_arm, motion_of, seen, surveyed_arm, walk
+from planted_cases import BASE, SHOULDER, desk_arm, motion_of, scattered, seen, surveyed_arm, walk
 
 from bodyschema.diagnosis.assess.rivals import whole_range
 from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
@@ -158,3 +158,30 @@ def test_a_slide_without_limits_is_not_sent_three_metres_away() -> None:
     motion = SimpleNamespace(q=np.array([[0.1], [0.3]]))
     fit = SimpleNamespace(simulation=SimpleNamespace(robot=robot), observations=SimpleNamespace(motion=motion))
     assert whole_range(fit, 0) == pytest.approx((-0.1, 0.5))
+
+
+def only_shoulder(robot: RobotDescription, seed: int) -> Motion:
+    q = np.tile(scattered(robot, seed, 1).q, (150, 1))
+    k = robot.joints.index(SHOULDER)
+    q[:, k] = scattered(robot, seed, 150).q[:, k]
+    return motion_of(q)
+
+
+@pytest.mark.parametrize(("hold", "what"), [("torque_free", "sag, which was not tested"), ("held", "the spread of")])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_an_error_of_a_joint_that_sag_explains_as_well_is_not_sure(seed, hold, what) -> None:
+    held, robot = desk_arm({"torque_free": "held"}), desk_arm({"torque_free": hold})
+    springs = tuple(Effect.at(held, "joint_compliance", joint, values=[0.02]) for joint in (SHOULDER,))
+    recording = seen(held, only_shoulder(held, seed), springs, seed)
+    only = ("joint_scale", "joint_eccentricity", "joint_ripple")
+    (cause,) = conclusion(diagnose(recording, Simulation(robot), only=only)).causes
+    assert cause.probability <= 0.5
+    assert cause.rivals[0].what.startswith(what)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_a_ratio_of_an_arm_that_moves_all_its_joints_is_no_sag(seed) -> None:
+    robot = desk_arm()
+    recording = seen(robot, scattered(robot, seed), (Effect.at(robot, "joint_scale", SHOULDER, values=[0.01]),), seed)
+    (cause,) = conclusion(diagnose(recording, Simulation(robot), only=("joint_scale", "joint_offset"))).causes
+    assert cause.probability > 0.9

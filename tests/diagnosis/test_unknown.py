@@ -174,3 +174,42 @@ def test_a_named_cause_alone_leaves_nothing_unexplained(robot) -> None:
     found = conclusion(diagnose(seen(robot, walk(robot, 1, ROWS), (truth,), 1), Simulation(robot)))
     assert [(cause.effect, cause.where) for cause in found.causes] == [("joint_eccentricity", SHOULDER)]
     assert found.unexplained.depends_on == ()
+
+
+def smooth_walk(robot: RobotDescription, seed: int, rows: int) -> Motion:
+    """Return a walk whose path between two readings is known."""
+    q = walk(robot, seed, rows + 40).q
+    return motion_of(np.stack([np.convolve(angles, np.full(41, 1 / 41), "valid") for angles in q.T], axis=1)[:rows])
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("robot", [desk_arm(), surveyed_arm()], ids=["placed", "surveyed"])
+def test_clocks_that_run_apart_are_told_beside_the_mean_delay(robot, seed) -> None:
+    motion, simulation = smooth_walk(robot, seed, 300), Simulation(robot)
+    late = np.linspace(0.02, 0.5, len(motion))
+    x = simulation.positions(motion.earlier(late))
+    x += SIGMA_M * np.random.default_rng([seed, 1]).normal(size=x.shape)
+    diagnosis = diagnose(measured(robot, motion, x), simulation, only=("camera_latency", "camera_moved", "tool_slip"))
+    file = conclusion(diagnosis)
+    assert file.verdict == "unexplained"
+    assert [cause.effect for cause in file.causes] == ["camera_latency"]
+    assert diagnosis.left.what == ("the clocks of images and joints run apart",)
+    assert file.rms_mm.noise_floor is not None
+    assert file.rms_mm.noise_floor < 1.5e3 * SIGMA_M * np.sqrt(3.0)
+
+
+def wandering(rows: int, seed: int) -> FloatArray:
+    """Return errors (n, 3) that neighbouring rows share, and that no joint, place or slow function of time predicts."""
+    steps = np.random.default_rng([seed, 3]).normal(size=(rows + 24, 3))
+    return np.stack([np.convolve(axis, np.full(25, 25**-0.5), "valid") for axis in steps.T], axis=1)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_what_wanders_and_no_family_predicts_is_unexplained_and_no_noise(robot, seed) -> None:
+    motion, simulation = walk(robot, seed, ROWS), Simulation(robot)
+    noise = SIGMA_M * np.random.default_rng([seed, 1]).normal(size=(ROWS, 3))
+    x = simulation.positions(motion) + noise + 20.0 * SIGMA_M * wandering(ROWS, seed)
+    file = conclusion(diagnose(measured(robot, motion, x), simulation, only=NEAREST))
+    assert file.verdict == "unexplained"
+    assert file.rms_mm.noise_floor is not None
+    assert file.rms_mm.noise_floor < 8.0e3 * SIGMA_M * np.sqrt(3.0)
