@@ -54,7 +54,7 @@ class Region:
         """Return a view of this rectangle of `image` (height, width, ...)."""
         return image[self.top : self.bottom, self.left : self.right]
 
-    def disc(self, centre_px: FloatArray, radius_px: float) -> NDArray[np.bool_]:
+    def circle_mask(self, centre_px: FloatArray, radius_px: float) -> NDArray[np.bool_]:
         """Return the mask of this rectangle's pixels inside a circle, shape (bottom - top, right - left)."""
         rows, columns = np.ogrid[self.top : self.bottom, self.left : self.right]
         return (columns - centre_px[0]) ** 2 + (rows - centre_px[1]) ** 2 <= radius_px**2
@@ -138,7 +138,7 @@ def patch_at(image: ImageArray, centre_px: FloatArray, radius_px: float, gate: G
         return None
     box = Region(*low.tolist(), *high.tolist())
     mask = gate.mask(box.crop(image))
-    fill = float(mask[box.disc(centre_px, radius_px)].mean()) / 255.0
+    fill = float(mask[box.circle_mask(centre_px, radius_px)].mean()) / 255.0
     return Patch(box, centre_px, radius_px, fill) if fill >= _LEAST_FILL else None
 
 
@@ -236,7 +236,7 @@ def _washed_out(image: ImageArray, patch: Patch) -> bool:
     if cv2.countNonZero(white) <= _MOST_WHITE * np.pi / 4 * white.size:
         return False
     # The corners of the box show the background.
-    return float(white[patch.box.disc(patch.centre_px, patch.radius_px)].mean()) > 255.0 * _MOST_WHITE
+    return float(white[patch.box.circle_mask(patch.centre_px, patch.radius_px)].mean()) > 255.0 * _MOST_WHITE
 
 
 def _clear_of_border(box: Region, margin_px: float, size: tuple[int, int]) -> bool:
