@@ -209,8 +209,10 @@ def test_the_ball_is_found_in_nearly_all_images_of_the_simulator_s_renderer():
 
 @pytest.mark.soak
 @pytest.mark.timeout(3600)
-def test_the_claimed_sigma_covers_60_to_75_percent_over_many_images_of_the_simulator_s_renderer():
+def test_many_images_of_the_simulator_s_renderer_have_fixes_and_claims_that_hold():
     found = errors_on_bullet_images(VGA, frames=1000, seed=200)
     report("bullet", found)
     covered = found.covered()
     assert ((covered >= 0.60) & (covered <= 0.75)).all(), covered
+    # At a rate of 0.5 % there are more than this once in a thousand times.
+    assert len(found.misses) <= successes(1.0 - 1e-3, 1000, 0.005), found.misses

@@ -274,6 +274,14 @@ def test_a_ball_over_exposed_to_white_in_part_is_still_found():
     assert sigmas_off(found, BALL) < FAR_SIGMAS
 
 
+def test_a_glossy_ball_before_a_white_wall_is_found_as_before_a_grey_one():
+    # A fifth of the ball is white; with the wall's share of its bounding box it would be too much.
+    look = Look(specular=5.0, shininess=4.0, noise_sd=2.0)
+    wall = Slab((-9.0, -9.0), (9.0, 9.0), 5.0, rgb=(3.0, 3.0, 3.0))
+    for things in ((BALL,), (wall, BALL)):
+        assert sigmas_off(answer(*things, look=look), BALL) < FAR_SIGMAS
+
+
 def test_the_largest_ball_that_both_eyes_hold_is_found():
     ball = Ball((0.06, 0.0, 0.2))
     tracker = StereoTracker(VGA)

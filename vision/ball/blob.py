@@ -54,6 +54,11 @@ class Region:
         """Return a view of this rectangle of `image` (height, width, ...)."""
         return image[self.top : self.bottom, self.left : self.right]
 
+    def circle_mask(self, centre_px: FloatArray, radius_px: float) -> NDArray[np.bool_]:
+        """Return the mask of this rectangle's pixels inside a circle, shape (bottom - top, right - left)."""
+        rows, columns = np.ogrid[self.top : self.bottom, self.left : self.right]
+        return (columns - centre_px[0]) ** 2 + (rows - centre_px[1]) ** 2 <= radius_px**2
+
     def grown(self, by: int, within: tuple[int, int]) -> Region:
         """Return the rectangle enlarged by `by` pixels on each side, clipped to an image of (width, height)."""
         return Region(
@@ -133,9 +138,7 @@ def patch_at(image: ImageArray, centre_px: FloatArray, radius_px: float, gate: G
         return None
     box = Region(*low.tolist(), *high.tolist())
     mask = gate.mask(box.crop(image))
-    rows, columns = np.ogrid[box.top : box.bottom, box.left : box.right]
-    inside = (columns - centre_px[0]) ** 2 + (rows - centre_px[1]) ** 2 <= radius_px**2
-    fill = float(mask[inside].mean()) / 255.0
+    fill = float(mask[box.circle_mask(centre_px, radius_px)].mean()) / 255.0
     return Patch(box, centre_px, radius_px, fill) if fill >= _LEAST_FILL else None
 
 
@@ -229,9 +232,11 @@ def _level(image: ImageArray, box: Region, centre_px: FloatArray, radius_px: flo
 
 def _washed_out(image: ImageArray, patch: Patch) -> bool:
     """Return True if much of the ball is white in all channels, so that neither colour nor shading is usable."""
-    pixels = patch.box.crop(image)
-    white = cv2.countNonZero(cv2.inRange(pixels, (WHITE,) * 3, (255,) * 3))
-    return white > _MOST_WHITE * np.pi / 4 * (pixels.size // 3)
+    white = cv2.inRange(patch.box.crop(image), (WHITE,) * 3, (255,) * 3)
+    if cv2.countNonZero(white) <= _MOST_WHITE * np.pi / 4 * white.size:
+        return False
+    # The corners of the box show the background.
+    return float(white[patch.box.circle_mask(patch.centre_px, patch.radius_px)].mean()) > 255.0 * _MOST_WHITE
 
 
 def _clear_of_border(box: Region, margin_px: float, size: tuple[int, int]) -> bool:
