@@ -566,9 +566,10 @@ def beyond_tolerances(fit: Fit, cause: Effect, doubt: float) -> bool | None:
     everything = [Candidate(one, 0.0, 1) for one in fit.causes]
     others = [one for one in everything if one.effect is not cause]
     whole = Sets(fit, everything, doubt).of(tuple(range(len(everything))))
-    # Two causes may each seem to be needed beside tolerances that only both together make small.
+    # Two causes may each seem to be needed beside tolerances that only both together make small. Whether to name them
+    # is one decision then, although each name has been charged with it.
     fewer = Sets(fit, others, doubt).climbed((tuple(range(len(others))), ()))
-    return whole.worth > max(one.worth for one in fewer)
+    return all(whole.worth > one.worth - NAMED * (len(others) - len(one.chosen)) for one in fewer)
 
 
 def _beside_tolerances(fit: Fit, cause: Effect) -> float:
