@@ -18,7 +18,7 @@ from bodyschema.robot.description import RobotDescription
 from kbmaps import RigidChain
 
 from .frames import order_of_axes, reordered_quaternions, turned_frame
-from .limits import MEASURED, place_an_arm, reach_m, spread_m
+from .limits import place_an_arm, reach_m, spread_m
 from .markers import several_markers
 from .reading import Reading
 from .rows import all_shifted, few_outliers, many_apart, partly_carried, partly_shifted
@@ -248,7 +248,7 @@ class _Check:
 
 def _decided(found: Plausibility, search: ReadingSearch, pairs: int) -> Plausibility:
     """Turn a refusal into a warning where there are too few pairs or poses for it."""
-    enough = pairs >= FEWEST_ROWS and (found.better == 1.0 or search.is_certain(math.log(found.better), MEASURED))
+    enough = pairs >= FEWEST_ROWS and (found.better == 1.0 or search.is_certain(math.log(found.better)))
     if found.refusal is None or enough or found.better >= THRESHOLDS.decisively:
         return found
     many = f"{pairs} pairs of {len(search.poses.rows)} poses"
