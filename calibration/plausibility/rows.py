@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from bodyschema.interfaces.records import FloatArray
 
 from .limits import MEASURED, place_an_arm, spread_m
-from .poses import Poses
 from .search import ROWS, ReadingSearch
 from .verdict import FEWEST_ROWS, THRESHOLDS, Plausibility, mm
 
@@ -24,7 +23,7 @@ class _Settings:
 
     # A position belongs to the angles of a row this near at most.
     near_rows: int = 3
-    # Rows are shifted if this share of the poses fits so many times better with angles or positions of the row as far
+    # Rows are shifted if this share of them fits so many times better with angles or positions of the row as far
     # away. Up to 0.09 do so in right recordings, 0.16 and more where a fifth of a real recording is shifted.
     shifted: float = 0.12
     shifted_better: float = 5.0
@@ -116,8 +115,7 @@ def partly_shifted(search: ReadingSearch, q: FloatArray, x: FloatArray, *, fits:
     placed_by = [(own_q, own_x), *([] if fits else of_angles)]
     found = np.stack([search.distances(*placed, pairs) for placed in placed_by])
     nearer = _SETTINGS.shifted_better * found.min(axis=0)[1:] < found[0, 0]
-    poses = Poses.of(search.chain, own_q)
-    shares = np.array([poses.mean(rows) for rows in nearer]).reshape(2, -1)
+    shares = nearer.mean(axis=1).reshape(2, -1)
     angles, positions = shares.max(axis=1)
     if max(angles, positions) < _SETTINGS.shifted:
         return None
@@ -128,7 +126,7 @@ def partly_shifted(search: ReadingSearch, q: FloatArray, x: FloatArray, *, fits:
         remedy = "Join the two logs by time, not by row: rows hold the angles of others"
     return Plausibility(
         "it seems that angles and positions are shifted against each other in "
-        f"{100.0 * float(nearer[shares.argmax()].mean()):.0f} % of the rows: {fit}",
+        f"{100.0 * max(angles, positions):.0f} % of the rows: {fit}",
         remedy,
         misread=True,
     )
