@@ -21,7 +21,7 @@ from .frames import order_of_axes, reordered_quaternions, turned_frame
 from .limits import place_an_arm, reach_m, spread_m
 from .markers import several_markers
 from .reading import Reading
-from .rows import all_shifted, many_apart, partly_carried, partly_shifted
+from .rows import all_shifted, few_outliers, many_apart, partly_carried, partly_shifted
 from .search import ROWS, ReadingFit, ReadingSearch, nameable
 from .size import of_another_size, size_of
 from .verdict import FEWEST_ROWS, THRESHOLDS, Plausibility, mm
@@ -83,7 +83,7 @@ def plausibility(
     if found.refusal is None:
         columns = check.columns(None if orientation is None else orientation[rows])
         found = replace(columns, warnings=(*found.warnings, *columns.warnings))
-    return _decided(found, len(q))
+    return _decided(found, search, len(q))
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +125,7 @@ class _Check:
                 wrong = several_markers(search, self._before)
             if wrong is not None:
                 return wrong
-        size = size_of(search.chain, search.q, search.x, search.apart, search.exact_m)
+        size = size_of(search.chain, search.q, search.x, search.poses.rows, search.exact_m)
         return of_another_size(size, spread_m(search.x), self._before, best) or Plausibility()
 
     def columns(self, orientation: FloatArray | None) -> Plausibility:
@@ -147,7 +147,8 @@ class _Check:
         )
         unnamed = reading != self.as_it_is and not nameable(reading, fit, self.spread)
         if after > of_another_arm or (unnamed and after > self.noise):
-            return self._of_no_reading(reading, fit, after)
+            outliers = few_outliers(search, self._before)
+            return Plausibility(warnings=(outliers,)) if outliers else self._of_no_reading(reading, fit, after)
         if reading != self.as_it_is:
             return self._of_another_reading(reading, fit, after)
         found = self._as_it_is(fit, held)
@@ -237,18 +238,21 @@ class _Check:
             if self.search.has_far_zero(joint, fit)
         ]
         if fit.error > max(THRESHOLDS.named * self.spread, self.noise):
-            warnings.append(f"{self._nominal_arm_misses()}: they may be of another robot, or their columns misread")
+            other = f"{self._nominal_arm_misses()}: they may be of another robot, or their columns misread"
+            warnings.append(few_outliers(self.search, self._before) or other)
         return Plausibility(warnings=tuple(warnings), undirected=self.search.undirected(names))
 
     def _nominal_arm_misses(self) -> str:
         return f"placed as well as it can be, the nominal arm misses the pairs by {mm(self._before)}"
 
 
-def _decided(found: Plausibility, pairs: int) -> Plausibility:
-    """Turn a refusal into a warning where there are too few pairs for it."""
-    if found.refusal is None or pairs >= FEWEST_ROWS or found.better >= THRESHOLDS.decisively:
+def _decided(found: Plausibility, search: ReadingSearch, pairs: int) -> Plausibility:
+    """Turn a refusal into a warning where there are too few pairs or poses for it."""
+    enough = pairs >= FEWEST_ROWS and (found.better == 1.0 or search.is_certain(math.log(found.better)))
+    if found.refusal is None or enough or found.better >= THRESHOLDS.decisively:
         return found
-    few = f"{found.refusal}. {found.remedy}. (These are {pairs} pairs: {FEWEST_ROWS} are needed to decide.)"
+    many = f"{pairs} pairs of {len(search.poses.rows)} poses"
+    few = f"{found.refusal}. {found.remedy}. (These are {many}: about {FEWEST_ROWS} poses decide.)"
     return Plausibility(warnings=(few,))
 
 

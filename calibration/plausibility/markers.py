@@ -10,6 +10,7 @@ from scipy.cluster.hierarchy import fcluster, linkage
 
 from bodyschema.interfaces.records import FloatArray
 
+from .poses import Poses
 from .search import ReadingSearch
 from .verdict import Plausibility, mm
 
@@ -95,6 +96,9 @@ def _places(search: ReadingSearch, on_hand: FloatArray) -> NDArray[np.intp]:
     for place in range(1, int(places.max()) + 1):
         rows = np.flatnonzero(places == place)
         # A pose that is held or comes back has the same errors of the arm in each row.
-        if len(rows) < _SETTINGS.share * len(places) or len(search.poses_apart(rows)) < _SETTINGS.fewest:
+        if (
+            len(rows) < _SETTINGS.share * len(places)
+            or len(Poses.of(search.chain, search.q[rows]).rows) < _SETTINGS.fewest
+        ):
             places[rows] = -1
     return places

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,7 +12,7 @@ from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray
 
-from .limits import place_an_arm, spread_m
+from .limits import MEASURED, place_an_arm, spread_m
 from .search import ROWS, ReadingSearch
 from .verdict import FEWEST_ROWS, THRESHOLDS, Plausibility, mm
 
@@ -21,13 +23,46 @@ class _Settings:
 
     # A position belongs to the angles of a row this near at most.
     near_rows: int = 3
-    # Rows are shifted if this share of them fits so many times better with angles or positions of the row as far away.
-    # Up to 0.09 do so in right recordings, 0.16 and more where a fifth of the rows of a real recording is shifted.
+    # Rows are shifted if this share of them fits so many times better with angles or positions of the row as far
+    # away. Up to 0.09 do so in right recordings, 0.16 and more where a fifth of a real recording is shifted.
     shifted: float = 0.12
     shifted_better: float = 5.0
+    # Outliers are looked for among few rows: at most so many choices of rows are left out, each a fit of a few ms.
+    most_choices: int = 400
 
 
 _SETTINGS = _Settings()
+
+
+def few_outliers(search: ReadingSearch, before: float) -> str:
+    """Return a warning if few rows place the arm without some of them; else "".
+
+    Of many rows, outliers do not keep the others from placing the arm.
+
+    Args:
+        search: the search over readings, which found none; its rows are all.
+        before: distance of the pairs as they are [m].
+    """
+    rows, joints = len(search.q), search.chain.joints
+    most = rows - math.ceil(MEASURED * rows)
+    if math.comb(rows, most) > _SETTINGS.most_choices:
+        return ""
+    for off in range(1, most + 1):
+        if 3 * (rows - off) <= joints + 9:
+            break
+        left_out = np.array(list(itertools.combinations(range(rows), off)))
+        kept = np.array([np.delete(np.arange(rows), some) for some in left_out])
+        errors = search.placed_by(kept).errors(1.0)
+        best = int(errors.argmin())
+        if errors[best] < THRESHOLDS.named / (1 + off) * spread_m(search.x):
+            *first, last = (str(row + 1) for row in left_out[best].tolist())
+            which = f"{', '.join(first)} and {last}" if first else last
+            rows_are = "rows {} are outliers" if off > 1 else "row {} is an outlier"
+            return (
+                f"perhaps {rows_are.format(which)}: without, the pairs fit to {mm(float(errors[best]))}, and as they "
+                f"are to {mm(before)}. Measure there again, or leave the rows out"
+            )
+    return ""
 
 
 def all_shifted(search: ReadingSearch, q: FloatArray, x: FloatArray) -> Plausibility | None:
@@ -107,15 +142,17 @@ def partly_carried(search: ReadingSearch, names: Sequence[str]) -> Plausibility 
         return None
     angles = [search.q, *(reading.angles(search.q, slides) for reading in readings)]
     own, *read = (search.distances(q, search.x, [(q, search.x)])[0] for q in angles)
-    shares = [float((_SETTINGS.shifted_better * one < own).mean()) for one in read]
-    worse = [float((_SETTINGS.shifted_better * own < one).mean()) for one in read]
+    nearer = [_SETTINGS.shifted_better * one < own for one in read]
+    shares = [search.poses.mean(rows) for rows in nearer]
+    worse = [search.poses.mean(_SETTINGS.shifted_better * own < one) for one in read]
     best = int(np.argmax(np.subtract(shares, worse)))
-    if shares[best] - worse[best] < _SETTINGS.shifted:
+    gain = search.poses.mean(np.log(np.maximum(own, search.exact_m) / np.maximum(read[best], search.exact_m)))
+    if shares[best] - worse[best] < _SETTINGS.shifted or not search.is_certain(gain):
         return None
     nothing = np.zeros(len(names))
     return Plausibility(
-        f"it seems that {readings[best].looks(names, nothing)}: {100.0 * shares[best]:.0f} % of the rows then fit at "
-        f"least {_SETTINGS.shifted_better:g} times better",
+        f"it seems that {readings[best].looks(names, nothing)}: {100.0 * float(nearer[best].mean()):.0f} % of the rows "
+        f"then fit at least {_SETTINGS.shifted_better:g} times better",
         readings[best].remedy(names, nothing),
         misread=True,
     )

@@ -15,7 +15,8 @@ from kbmaps import ChainParameters, DegenerateDataError, RigidChain, align
 from kbmaps.chains.placement import Placements, place
 from kbmaps.rotations import rotation_vectors
 
-from .limits import A_RADIAN_M, KNOWN_TOOL_M, MEASURED, SLIDES_M, TOOL_M, ZEROS_RAD, spread_m
+from .limits import KNOWN_TOOL_M, MEASURED, SLIDES_M, TOOL_M, ZEROS_RAD, spread_m
+from .poses import Poses
 from .reading import QUARTER, Reading
 from .size import evidences
 from .verdict import THRESHOLDS
@@ -41,9 +42,6 @@ class _Settings:
     # A reading is more probable by this much [nats], less a penalty for each change of the reading.
     certain: float = 10.0
     a_change: float = 3.0
-    # Rows on the way from one pose to another say together what one says: errors of links change slowly along a path.
-    # They count as one within this distance, of the joint that moved farthest.
-    apart_rad: float = math.radians(10.0)
     # A joint offset above this is mentioned: that of one in 300 generated arms with offsets of up to 10°.
     far_zero_rad: float = math.radians(20.0)
     # ... unless the pairs fit about as well with half of it.
@@ -95,15 +93,14 @@ class ReadingSearch:
 
     Attributes:
         fits: the best fit of each reading so far.
-        apart: rows of poses far from each other.
+        poses: of the rows.
     """
 
     def __init__(self, chain: RigidChain, q: FloatArray, x: FloatArray, exact_m: float, pose_known: bool) -> None:
         self.chain, self.q, self.x, self.exact_m, self._pose_known = chain, q, x, exact_m, pose_known
         self._parameters = ChainParameters(chain)
         self._std = np.where(chain.prismatic, SLIDES_M, ZEROS_RAD)
-        self.apart = self.poses_apart(np.arange(len(q)))
-        self._poses = len(self.apart)
+        self.poses = Poses.of(chain, q)
         self._tried: set[Reading] = set()
         self.fits: dict[Reading, ReadingFit] = {}
 
@@ -180,7 +177,7 @@ class ReadingSearch:
             tool_std=TOOL_M,
         )
         ratio = max(float(held.errors(MEASURED)[0]), self.exact_m) / fit.error
-        return ratio > THRESHOLDS.much_better and 3.0 * MEASURED * self._poses * math.log(ratio) > _SETTINGS.certain
+        return ratio > THRESHOLDS.much_better and self.is_certain(math.log(ratio), MEASURED)
 
     def errors(self, q: FloatArray, x: FloatArray) -> FloatArray:
         """Return the distances (s,) [m] of sets of pairs q (s, n, d) and x (s, n, 3), with the columns as they are."""
@@ -195,15 +192,9 @@ class ReadingSearch:
         drawn = (p.positions(change, each) @ placed.rotations[0].T + placed.shifts[0] for each, _ in pairs)
         return np.stack([np.linalg.norm(at - seen, axis=1) for at, (_, seen) in zip(drawn, pairs, strict=True)])
 
-    def poses_apart(self, rows: NDArray[np.intp]) -> list[int]:
-        """Return those of some rows (m,) whose poses are `apart_rad` from each other, in at least one joint."""
-        q = self.q[rows] / np.where(self.chain.prismatic, A_RADIAN_M, 1.0)
-        apart = np.abs(q[:, None] - q).max(axis=2) > _SETTINGS.apart_rad
-        kept: list[int] = []
-        for pose, far in enumerate(apart):
-            if far[kept].all():
-                kept.append(pose)
-        return rows[kept].tolist()
+    def is_certain(self, gain: float, share: float = 1.0) -> bool:
+        """Return True if the poses are evidence enough for a reading that fits better, as in `Poses.nats`."""
+        return self.poses.nats(gain, self.chain.joints, share) > _SETTINGS.certain
 
     def placed_by(self, rows: NDArray[np.intp]) -> Placements:
         """Place the nominal chain to sets of rows (s, n), with the columns as they are."""
@@ -296,7 +287,7 @@ class ReadingSearch:
         slides = self.chain.prismatic
         read = [(each.angles(self.q, slides), each.positions(self.x), each.scale) for each in rivals]
         changes = np.array([reading.changes for reading in rivals])
-        probable = evidences(self.chain, read, self.apart) - _SETTINGS.a_change * changes
+        probable = evidences(self.chain, read, self.poses.rows) - _SETTINGS.a_change * changes
         # Where the columns as they are fit best, another reading has to be certain twice.
         probable[rivals.index(as_it_is)] += 2.0 * _SETTINGS.certain if nearest == as_it_is else 0.0
         best = rivals[int(probable.argmax())]
@@ -369,7 +360,7 @@ class ReadingSearch:
                 0.0 if r.mirrored else 0.5 * (turn / THRESHOLDS.turned_rad) ** 2
                 for r, turn in zip(new, turns, strict=True)
             ]
-        nats = 3.0 * MEASURED * self._poses * np.log(errors) + cost
+        nats = 3.0 * MEASURED * len(self.poses.rows) * np.log(errors) + cost
         fits: dict[Reading, ReadingFit] = {}
         for k, reading in enumerate(new):
             found = reading.turned(quarters[k].tolist())

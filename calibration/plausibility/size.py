@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.solvers.tolerance_selection import WORKMANSHIP
@@ -86,7 +87,7 @@ def of_another_size(size: Size, spread: float, before: float, best: float) -> Pl
     return Plausibility(warnings=(f"perhaps {text}. {remedy}",))
 
 
-def size_of(chain: RigidChain, q: FloatArray, x: FloatArray, apart: list[int], exact_m: float) -> Size:
+def size_of(chain: RigidChain, q: FloatArray, x: FloatArray, apart: NDArray[np.intp], exact_m: float) -> Size:
     """Estimate the size of positions x (n, 3) [m] at q (n, d) [rad, m].
 
     The links of an arm may be a little longer than nominal, by tolerances that the pairs show, but hardly all of them
@@ -105,7 +106,9 @@ def size_of(chain: RigidChain, q: FloatArray, x: FloatArray, apart: list[int], e
     return Size(math.exp(log), sigma, max(math.exp(log) * error, exact_m))
 
 
-def evidences(chain: RigidChain, readings: list[tuple[FloatArray, FloatArray, float]], apart: list[int]) -> FloatArray:
+def evidences(
+    chain: RigidChain, readings: list[tuple[FloatArray, FloatArray, float]], apart: NDArray[np.intp]
+) -> FloatArray:
     """Return the log evidence (m,) of readings of the same pairs; links and size may be off by tolerances.
 
     Args:

@@ -5,14 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chdtrc
+import numpy as np
+from scipy.special import fdtrc
 
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.search.held_out import Blocks
 from bodyschema.diagnosis.unnamed.rattle import Rattle
 from bodyschema.diagnosis.unnamed.sensitivity import joints_of
 from bodyschema.diagnosis.unnamed.smooth import SmoothModel, smooth_model
-from bodyschema.diagnosis.unnamed.unknown import Apart, Unknowns
+from bodyschema.diagnosis.unnamed.unknown import Apart, Unknowns, basis_of
 
 from .explanation import Explanation
 
@@ -91,6 +92,11 @@ def _of_families(explanation: Explanation, unknowns: Unknowns, blocks: Blocks, *
 
 
 def _chance(fit: Fit, apart: Apart, unknowns: Unknowns) -> float:
-    """Return the p-value of this structure arising by chance."""
-    gain = 2.0 * (apart.fit.log_likelihood - fit.log_likelihood)
-    return float(chdtrc(max(unknowns.told(apart).shape[2] + apart.choice, 1), max(gain, 0.0)))
+    """Return the p-value of this structure arising by chance: an F-test, since few rows do not tell the noise."""
+    count = max(unknowns.told(apart).shape[2] + apart.choice, 1)
+    coordinates = 3.0 * float(fit.noise.weights.sum())
+    free = coordinates - basis_of(fit).shape[1] - count
+    if free <= 0.0:
+        return 1.0
+    gain = 2.0 * max(apart.fit.log_likelihood - fit.log_likelihood, 0.0) / coordinates
+    return float(fdtrc(count, free, np.expm1(gain) * free / count))

@@ -225,6 +225,7 @@ class Unknowns:
         basis, left = self.beside(fit, others)
         rss, rows = float(left @ left), counted * float(fit.noise.weights.sum())
         directions, shares = fit.absorbed
+        free = 3.0 * float(fit.noise.weights.sum()) - basis.shape[1]
         twice = np.column_stack([directions * np.sqrt(shares), fit.unshared(np.column_stack([basis, left]))])
         seen = twice.reshape(*fit.left.shape, -1) * fit.root_weights[:, :, None]
         ranked: list[tuple[float, Way, FloatArray | None]] = []
@@ -241,6 +242,9 @@ class Unknowns:
             told = (values > _TOLD * max(float(values.max()), 1e-12)) & (values > _LEFT)
             explained = float(np.square(vectors[:, told].T @ toward / np.sqrt(values[told])).sum())
             most, numbers = _nats(explained, rss, rows) - self._doubt_of(way), int(told.sum())
+            if numbers >= free:
+                # As many numbers as residuals leave no noise, whatever the rows are.
+                most = -np.inf
             ranked.append((most - _NUMBER * numbers, way, None))
             for rank in (rank for rank in _RANKS if rank < min(way.moves, way.amounts)):
                 fewer = numbers_of(way.moves, way.amounts, rank)

@@ -365,6 +365,24 @@ def test_outliers_in_few_rows_are_no_shift(seed) -> None:
     assert "shifted" not in "".join(replace(right, x=x).seen().sentences)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_outliers_that_hide_the_arm_are_named(seed) -> None:
+    """Two of eight rows keep the others from placing the arm, also where no other reading fits."""
+    rng, right = np.random.default_rng(seed), pairs(seed, joints=3, count=8)
+    x, off = right.x.copy(), np.sort(rng.choice(8, 2, replace=False))
+    x[off] += 0.3 * rng.normal(size=(2, 3))
+    found = replace(right, x=x).seen()
+    assert found.refusal is None
+    assert all(f"rows {off[0] + 1} and {off[1] + 1} are outliers" in said for said in found.warnings)
+
+
+@pytest.mark.parametrize("rows", [8, 11])
+def test_few_rows_in_another_order_are_no_outliers(rows) -> None:
+    right = pairs(joints=3, count=rows)
+    found = replace(right, x=np.random.default_rng(1).permutation(right.x)).seen()
+    assert found.refusal is not None
+
+
 def test_few_rows_of_another_robot_are_refused() -> None:
     right = pairs(joints=4, count=30)
     found = replace(right, x=np.random.default_rng(1).permutation(right.x)).seen()
@@ -391,17 +409,28 @@ def test_a_marker_that_was_moved_once_is_not_several() -> None:
     assert "places" not in "".join(with_markers(np.arange(90) // 45, 0.07 * np.eye(3)).seen().sentences)
 
 
-@pytest.mark.parametrize("seed", [0, *rarely(range(1, 6))])
-def test_poses_that_come_back_are_not_several_markers(seed) -> None:
-    """The errors of a rough arm are the same in each row of a pose."""
+def cycle(seed: int, *, poses: int) -> Pairs:
+    """Return 60 pairs of an arm made to 1.1° and 10 mm that goes through a few poses again and again."""
     rng, parameters = np.random.default_rng(seed), ChainParameters(arm())
     made = ChainTolerances(axes=0.02, points=0.01, tool=0.02)
     change = parameters.standard_deviations(made) * rng.normal(size=parameters.size)
     change[parameters.zeros] = np.radians(3.0) * rng.normal(size=6)
-    poses = np.array([0.3, -0.8, 1.2, 0.4, 0.9, 0.0]) + rng.uniform(-1.2, 1.2, (10, 6))
-    q = np.tile(poses, (6, 1)) + rng.uniform(-0.003, 0.003, (60, 6))
-    x = parameters.positions(change, q) + 5e-4 * rng.normal(size=(60, 3))
-    assert "places" not in "".join(Pairs(q, x).seen().sentences)
+    few = np.array([0.3, -0.8, 1.2, 0.4, 0.9, 0.0]) + rng.uniform(-1.2, 1.2, (poses, 6))
+    q = few[np.arange(60) % poses] + rng.uniform(-0.003, 0.003, (60, 6))
+    return Pairs(q, parameters.positions(change, q) + 5e-4 * rng.normal(size=(60, 3)))
+
+
+@pytest.mark.parametrize("seed", [0, *rarely(range(1, 6))])
+def test_poses_that_come_back_are_not_several_markers(seed) -> None:
+    """The errors of a rough arm are the same in each row of a pose."""
+    assert "places" not in "".join(cycle(seed, poses=10).seen().sentences)
+
+
+# By rows, 17 of the first 50 seeds were refused, and these are the first three.
+@pytest.mark.parametrize("seed", [3, 5, 10, *rarely(range(11, 50))])
+def test_few_poses_that_come_back_are_not_refused(seed) -> None:
+    """Nearly as many numbers as coordinates fit some poses of a rough arm by chance, in all their rows."""
+    assert cycle(seed, poses=6).seen().refusal is None
 
 
 @pytest.mark.parametrize("seed", [0, *rarely(range(1, 6))])

@@ -99,3 +99,16 @@ def test_beside_a_loose_marker_the_noise_and_the_rows_left_out_stay(monkeypatch)
     assert begun[-1].rattling is not None
     assert begun[-1].stated_factor == 2.0
     assert (begun[-1].doubtful == left_out).all()
+
+
+@pytest.mark.parametrize("rows", [14, 20])
+def test_a_loose_marker_in_few_rows_has_noise(rows) -> None:
+    """Functions of three coordinates are as many as the coordinates of 20 rows."""
+    robot, rng = surveyed_arm(), np.random.default_rng(6)
+    motion = scattered(robot, 1, rows=rows)
+    run = Simulation(robot).run(motion)
+    sides = HALF_M * rng.choice([-1.0, 1.0], rows)
+    x = run.measured + sides[:, None] * (run.columns(Effect.at(robot, "tool_offset")) @ np.array([0.6, 0.0, 0.8]))
+    found = diagnose(measured(robot, motion, x + SIGMA_M * rng.normal(size=x.shape)), Simulation(robot))
+    assert found.extended.noise.sigma > 0.5
+    assert conclusion(found).causes == ()
