@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy as np
 from scipy.special import fdtrc
 
 from bodyschema.diagnosis.fit.fit import Fit
