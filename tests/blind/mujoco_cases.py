@@ -1,12 +1,15 @@
 """`python -m tests.blind.mujoco_cases --cases 21 --first-seed 0`: judge diagnoses of arms simulated by MuJoCo.
 
 Each seed is an arm with a hidden cause, and two cases: a walk and static poses. Print one line a case, and tables at
-the end.
+the end. `--models` takes other arms: URDFs, folders of them, or modules of the package robot_descriptions, which
+downloads them when they are imported (`--models ur10_description gen3_description folder/`). Of each, the longest chain
+of turning joints is taken. The arm of a seed depends on which are given, and in which order.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import tempfile
 from collections.abc import Sequence
@@ -23,6 +26,7 @@ from .arrays import FloatArray
 from .dense import HERE, LIMIT_S, Checkout, Ran
 from .dense_judge import LARGE_SHARE, NO_WORSE, OUTCOMES, ROUNDED_MM, SURE, Outcome, name, rms_mm, shares_of_causes
 from .mujoco_hide import KINDS, STYLES, Case, Style, Truth, hide
+from .mujoco_urdf import MODELS, Model, longest_arm
 
 # Cycles a turn by which a strain wave may be missed.
 SAME_CYCLES = 1.5
@@ -112,9 +116,26 @@ def _places(hidden: Truth) -> set[str]:
     return {*hidden.joints, hidden.name.partition("@")[2]}
 
 
-def run(seed: int, style: Style, folder: Path, checkout: Checkout, rows: int | None = None) -> Judgement:
+def models_of(source: str) -> list[Model]:
+    """Return the arms of a folder of URDFs, of one URDF, or of a module of the package robot_descriptions."""
+    path = Path(source)
+    if not path.exists():
+        path = Path(importlib.import_module(f"robot_descriptions.{source}").URDF_PATH)
+    files = sorted(path.rglob("*.urdf")) if path.is_dir() else [path]
+    return [longest_arm(file.resolve()) for file in files]
+
+
+def run(
+    seed: int,
+    style: Style,
+    folder: Path,
+    checkout: Checkout,
+    rows: int | None = None,
+    kind: str | None = None,
+    models: Sequence[Model] = MODELS,
+) -> Judgement:
     """Hide, diagnose and judge one case."""
-    return judged(hide(seed, style, folder, rows=rows), checkout)
+    return judged(hide(seed, style, folder, rows=rows, kind=kind, models=models), checkout)
 
 
 def judged(case: Case, checkout: Checkout) -> Judgement:
@@ -240,7 +261,8 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=len(KINDS), help="seeds, two cases each")
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--rows", type=int, help="of each recording")
-    parser.add_argument("--kinds", nargs="*", choices=list(KINDS), help="of these seeds only those with such a cause")
+    parser.add_argument("--kinds", nargs="*", choices=list(KINDS), default=list(KINDS), help="kinds of causes, in turn")
+    parser.add_argument("--models", nargs="*", help="other arms; see above")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--checkout", type=Path, default=HERE.parents[1], help="whose diagnosis is judged")
     parser.add_argument("--limit", type=float, default=LIMIT_S, help="seconds for each diagnosis")
@@ -250,21 +272,19 @@ def main() -> None:
     records = _read(given.json)
     done = {(record.seed, record.style) for record in records}
     checkout = Checkout(given.checkout.resolve(), given.limit)
-    kinds = list(KINDS)
+    models = [model for source in given.models for model in models_of(source)] if given.models else MODELS
     cases = [
         (seed, style)
         for seed in range(given.first_seed, given.first_seed + given.cases)
-        if not given.kinds or kinds[seed % len(kinds)] in given.kinds
         for style in STYLES
         if (seed, style) not in done
     ]
 
     def one(case: tuple[int, Style]) -> Judgement:
         seed, style = case
-        if given.keep is not None:
-            return run(seed, style, given.keep.resolve() / f"{seed}_{style}", checkout, given.rows)
-        with tempfile.TemporaryDirectory() as folder:
-            return run(seed, style, Path(folder), checkout, given.rows)
+        with tempfile.TemporaryDirectory() as temporary:
+            folder = Path(temporary) if given.keep is None else given.keep.resolve() / f"{seed}_{style}"
+            return run(seed, style, folder, checkout, given.rows, given.kinds[seed % len(given.kinds)], models)
 
     with ThreadPoolExecutor(given.jobs) as pool:
         for record in pool.map(one, cases):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -25,6 +25,7 @@ MARKER_XYZ = np.array([0.06, 0.04, 0.12])
 FARTHEST = 1.4
 NOISE_M = (0.1e-3, 0.5e-3)
 TIMES_NOISE = (4.0, 14.0)  # RMS of a cause's effect on the marker over that of the noise
+PAYLOADS = (0.07, 0.3)  # shares of the arm's mass
 LENGTH_M, ANGLE_RAD = 0.3e-3, math.radians(0.06)
 DENSE_SCALES = (0.3, 3.0)
 FRESH_ROWS = 120
@@ -197,7 +198,7 @@ def _spring(drawn: Drawn, payload: float = 0.0) -> None:
 
 
 def _payload(drawn: Drawn) -> None:
-    kilograms = float(drawn.rng.uniform(0.5, 2.0)) * (4.0 if drawn.urdf.model.name != "xarm6" else 1.5)
+    kilograms = float(drawn.rng.uniform(*PAYLOADS)) * drawn.urdf.kilograms
     at = drawn.rng.uniform([-0.05, -0.05, 0.03], [0.05, 0.05, 0.15])
     drawn.truth.append(Truth("payload", f"{kilograms:.2f} kg at the hand, {np.round(at, 3).tolist()} m"))
     for _ in range(2):
@@ -368,6 +369,7 @@ def hide(
     rows: int | None = None,
     kind: str | None = None,
     dense: float | None = None,
+    models: Sequence[Model] = MODELS,
 ) -> Case:
     """Draw an arm by its seed, hide causes in it, and record it.
 
@@ -375,9 +377,10 @@ def hide(
         rows: of the recording; random by default.
         kind: kind of causes; `seed` modulo the number of kinds by default.
         dense: scale of the tolerances; random by default.
+        models: of which one is drawn.
     """
     rng = np.random.default_rng([seed, 7])
-    model = MODELS[int(rng.integers(len(MODELS)))]
+    model = models[int(rng.integers(len(models)))]
     urdf = Urdf(model, MOUNTS[int(rng.integers(len(MOUNTS)))])
     nominal = World(urdf.text_for_mujoco, model.joints, {}, MARKER)
     middle, half = _range(urdf)

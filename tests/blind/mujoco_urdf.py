@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import math
+import re
 import xml.etree.ElementTree as ET
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +18,9 @@ from .arrays import FloatArray
 FLOOR, MOUNT, MARKER = "floor", "mount", "marker_plate"
 # A hinge needs some mass behind it; this does not show in any load.
 ROTOR_KG, ROTOR_KG_M2 = 1e-6, 1e-9
+# A link behind a joint that its URDF gives no mass [kg].
+MASSLESS_KG = 0.02
+OF_A_GRIPPER = re.compile("finger|grip|jaw|knuckle|thumb", re.IGNORECASE)
 EXTENSION = {"fusestatic": "false", "discardvisual": "true", "balanceinertia": "true"}
 
 
@@ -24,7 +29,7 @@ class Model:
     """A public arm.
 
     Attributes:
-        file: in pybullet_data.
+        file: in pybullet_data, or an absolute path.
         root, hand: link that is bolted down, and link that carries the marker.
         joints: those that are read.
     """
@@ -57,6 +62,27 @@ MODELS = (
     ),
     Model("xarm6", "xarm/xarm6_robot.urdf", "link_base", "link6", _numbered("joint", 6)),
 )
+
+
+def longest_arm(file: Path) -> Model:
+    """Return the longest chain of turning joints in a URDF, without those of a gripper or behind one that slides."""
+    onto = {_ends(joint)[1]: joint for joint in ET.parse(file).getroot().findall("joint")}
+    longest: list[ET.Element] = []
+    for link in onto:
+        chain: list[ET.Element] = []
+        while link in onto and onto[link].get("type") != "prismatic":
+            if onto[link].get("type") in ("revolute", "continuous"):
+                chain.insert(0, onto[link])
+            link = _ends(onto[link])[0]
+        chain = [joint for joint in chain if not OF_A_GRIPPER.search(joint.get("name", ""))]
+        longest = max(longest, chain, key=len)
+    return Model(
+        file.stem,
+        str(file),
+        _ends(longest[0])[0],
+        _ends(longest[-1])[1],
+        tuple(joint.get("name", "") for joint in longest),
+    )
 
 
 class Urdf:
@@ -95,6 +121,11 @@ class Urdf:
         ET.SubElement(extension, "compiler", EXTENSION)
         root.insert(0, extension)
         return ET.tostring(root, encoding="unicode")
+
+    @property
+    def kilograms(self) -> float:
+        """Mass of all links."""
+        return sum(float(mass.get("value", "0")) for mass in self.root.iter("mass"))
 
     def limits(self) -> FloatArray:
         """Return lower and upper limits [rad] of the joints that are read (d, 2)."""
@@ -149,7 +180,7 @@ class Urdf:
         element = self._joint("marker_mount")
         element.set("type", "continuous")
         ET.SubElement(element, "axis", {"xyz": _text(axis)})
-        self._weigh(next(link for link in self.root.findall("link") if link.get("name") == MARKER), kilograms, at)
+        self._weigh(self._link(MARKER), kilograms, at)
         return "marker_mount"
 
     def add_payload(self, kilograms: float, at: FloatArray) -> None:
@@ -165,16 +196,34 @@ class Urdf:
             for part in list(element):
                 if part.tag not in ("inertial", "parent", "child", "origin", "axis", "limit"):
                     element.remove(part)
-        for link in self.root.findall("link"):
-            if link.get("name") == "world":
-                self.root.remove(link)
+        self._keep_below(self.model.root)
         for joint in self.root.findall("joint"):
-            if _named(joint, "parent").get("link") == "world":
-                self.root.remove(joint)
-            elif joint.get("name") not in self.model.joints:
+            if joint.get("name") not in self.model.joints:
                 joint.set("type", "fixed")
-            else:
-                joint.set("type", "revolute")
+                continue
+            joint.set("type", "revolute")
+            _limit(joint)
+            link = self._link(_ends(joint)[1])
+            mass, inertial = link.find("inertial/mass"), link.find("inertial")
+            if mass is None or float(mass.get("value", "0")) <= 0.0:
+                if inertial is not None:
+                    link.remove(inertial)
+                self._weigh(link, MASSLESS_KG, np.zeros(3))
+
+    def _keep_below(self, root: str) -> None:
+        """Remove what a link does not carry."""
+        kept, onto = {root}, {joint: _ends(joint) for joint in self.root.findall("joint")}
+        while below := {child for parent, child in onto.values() if parent in kept} - kept:
+            kept |= below
+        for link in self.root.findall("link"):
+            if link.get("name") not in kept:
+                self.root.remove(link)
+        for joint, (parent, _) in onto.items():
+            if parent not in kept:
+                self.root.remove(joint)
+
+    def _link(self, name: str) -> ET.Element:
+        return next(link for link in self.root.findall("link") if link.get("name") == name)
 
     def _joint(self, name: str) -> ET.Element:
         return next(joint for joint in self.root.findall("joint") if joint.get("name") == name)
@@ -233,6 +282,20 @@ def _named(element: ET.Element, tag: str) -> ET.Element:
     found = element.find(tag)
     assert found is not None
     return found
+
+
+def _ends(joint: ET.Element) -> tuple[str, str]:
+    """Return the names of the links before and behind a joint."""
+    return _named(joint, "parent").get("link", ""), _named(joint, "child").get("link", "")
+
+
+def _limit(joint: ET.Element) -> None:
+    """Give a joint that turns without end a limit."""
+    limit = joint.find("limit")
+    limit = ET.SubElement(joint, "limit", {"effort": "100", "velocity": "3"}) if limit is None else limit
+    if float(limit.get("lower", "0")) >= float(limit.get("upper", "0")):
+        limit.set("lower", repr(-math.pi))
+        limit.set("upper", repr(math.pi))
 
 
 def _text(values: FloatArray) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from .dense import Checkout
-from .mujoco_cases import HERE, judged, outcome, placed_mm, run
+from .mujoco_cases import HERE, judged, models_of, outcome, placed_mm, run
 from .mujoco_hide import KINDS, STYLES, Truth, _beside_one_flank, hide
 from .mujoco_urdf import MARKER, MODELS, Urdf
 from .mujoco_world import STEP_S, Hinge, World
@@ -65,6 +66,46 @@ def test_late_images_of_static_poses_change_nothing(tmp_path: Path) -> None:
 def test_a_play_on_one_flank_is_an_offset_as_well(angles, same) -> None:
     world = SimpleNamespace(angles={"elbow_give": angles})
     assert _beside_one_flank(Truth("gravity_backlash@elbow", "play"), world).same == same
+
+
+def hinge(name: str, parent: str, child: str, kind: str = "continuous", limit: str = "") -> str:
+    return f"""<link name="{child}"/><joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>
+        <origin xyz="0 0 0.3" rpy="1 0 0"/><axis xyz="0 0 1"/>{limit}</joint>"""
+
+
+@pytest.fixture
+def lifted(tmp_path: Path) -> Path:
+    """Write an arm of three joints on a lift, with a gripper."""
+    parts = [
+        hinge("lift", "floor_plate", "column", "prismatic"),
+        hinge("turn", "column", "upper"),
+        hinge("elbow", "upper", "fore", "revolute", '<limit lower="-1" upper="2"/>'),
+        hinge("wrist", "fore", "palm"),
+        hinge("left_finger_joint", "palm", "left_finger", "revolute", '<limit lower="0" upper="1"/>'),
+        hinge("other", "column", "head"),
+    ]
+    file = tmp_path / "lifted.urdf"
+    file.write_text(f'<robot name="lifted"><link name="floor_plate"/>{"".join(parts)}</robot>', encoding="utf-8")
+    return file
+
+
+def test_the_arm_of_a_urdf_is_its_longest_chain_of_turning_joints(lifted) -> None:
+    (model,) = models_of(str(lifted.parent))
+    assert (model.root, model.hand, model.joints) == ("column", "palm", ("turn", "elbow", "wrist"))
+    np.testing.assert_allclose(Urdf(model, (0.0, 0.0, 0.0)).limits(), [[-np.pi, np.pi], [-1, 2], [-np.pi, np.pi]])
+
+
+def test_an_arm_may_come_from_robot_descriptions(lifted, monkeypatch) -> None:
+    monkeypatch.setitem(sys.modules, "robot_descriptions", SimpleNamespace(__path__=[]))
+    monkeypatch.setitem(sys.modules, "robot_descriptions.lift_description", SimpleNamespace(URDF_PATH=str(lifted)))
+    assert models_of("lift_description") == models_of(str(lifted))
+
+
+def test_a_cause_is_hidden_in_an_arm_that_was_given(lifted, tmp_path) -> None:
+    case = hide(1, "static", tmp_path / "case", rows=10, kind="marker_loose", models=models_of(str(lifted)))
+    assert case.model == "lifted"
+    assert case.taken.q.shape == (10, 3)
+    assert np.isfinite(case.taken.x).all()
 
 
 def told(*causes: dict, verdict: str = "explained", depends_on: tuple[str, ...] = ()) -> dict:
