@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.observations import Observations
+from bodyschema.diagnosis.search.together import tolerated
 from bodyschema.interfaces.records import FloatArray
 
 # Distance of the two sides in standard deviations about each, and the worth of two sides over one [nats], from which a
@@ -20,7 +21,10 @@ _BEYOND_NOISE = 2.5
 _LEAST_ACROSS = 1e-5
 _ROUNDS = 50
 # Most fits beside a play, and the gain in likelihood that ends them [nats].
-_FITS, _SAME = 8, 1.0
+_FITS, _SAME = 30, 1.0
+# Cost of a play [nats]: it has no name, and three numbers, as a slip has.
+_UNNAMED = 8.0 + 3.0 * 3.0
+_FEWEST_ROWS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +37,9 @@ class Rattle:
         axis: direction of the play in the marker's link (3,).
         ways: the same at each row (n, 3), in the measurement frame.
         sides: mean of the side, -1 or 1, on which the marker lies at each row (n,).
-        likelihood: log-likelihood of the residuals with two sides; comparable with `likelihood` of a fit [nats].
+        likelihood: log-likelihood of the residuals with two sides, less the cost of the tolerances beside it; comparable
+            with `likelihood` of a fit [nats].
+        is_clear: True if the sides are surely two, and farther apart than noise of any shape.
     """
 
     half_m: float
@@ -42,11 +48,7 @@ class Rattle:
     ways: FloatArray
     sides: FloatArray
     likelihood: float
-
-    @property
-    def is_small(self) -> bool:
-        """True for a play that is left to the noise."""
-        return self.ratio < _BEYOND_NOISE**2 - 1.0
+    is_clear: bool = True
 
     @property
     def what(self) -> str:
@@ -67,40 +69,64 @@ class Rattle:
 def rattle(fit: Fit) -> Rattle | None:
     """Return the play of the marker that the residuals of a fit show; None where they do not lie on two sides."""
     play = _two_sided(fit)
-    return None if play is None or play.is_small else play
+    return play if play is not None and play.is_clear else None
 
 
 def rattle_beside(fit: Fit) -> Rattle | None:
-    """Return the play of the marker beside a fit that goes with it; its numbers may have followed the sides."""
-    play, likelier = None, _two_sided(fit)
-    for _ in range(_FITS):
-        if likelier is None or (play is not None and likelier.likelihood < play.likelihood + _SAME):
-            break
-        play = likelier
+    """Return the play of the marker beside a fit that goes with it.
+
+    The numbers of the fit may have followed the sides, and tolerances may hide them. So sides that are not clear yet
+    are taken out as well, and the fit and its tolerances follow what is left.
+    """
+    play = _two_sided(fit)
+    for _ in range(_FITS if play is not None else 0):
+        assert play is not None
         fit = fit.to(play.taken_out_of(fit.observations))
-        likelier = _two_sided(fit)
-    return None if play is None or play.is_small else play
+        if not fit.is_exact:
+            fit = fit.tolerating(tolerated(fit).scales)
+        again = _two_sided(fit)
+        if again is None or again.likelihood < play.likelihood + _SAME:
+            break
+        play = again
+    return play if play is not None and play.is_clear else None
 
 
 def _two_sided(fit: Fit) -> Rattle | None:
-    if fit.is_exact:
+    """Return the most probable play, however small; None where the residuals are too few, or no noise."""
+    rows = fit.noise.weights > 0.0
+    if fit.is_exact or rows.sum() < _FEWEST_ROWS:
         # With the play taken out of them, positions of a simulation have no noise to compare it with.
         return None
-    rows, left = fit.noise.weights > 0.0, _on_link(fit)
+    left = _on_link(fit)
     variances, axes = np.linalg.eigh(np.cov(left[rows].T))
     means, sigma, worth, sides = _two_sides(left @ axes[:, 2], rows)
+    worth += _alike(sides, rows, fit.observations.motion.begins)
     half = 0.5 * float(means[1] - means[0])
-    if 2.0 * half < _APART * sigma or worth < _NAMED:
-        return None
     ratio = float(variances[2] / max(variances[:2].mean(), _LEAST_ACROSS**2 * variances[2])) - 1.0
     ways = np.einsum("nji,j->ni", _turns(fit), axes[:, 2])
-    return Rattle(half, ratio, axes[:, 2], ways, sides, likelihood(fit) + worth)
+    is_clear = 2.0 * half >= _APART * sigma and worth >= _NAMED and ratio >= _BEYOND_NOISE**2 - 1.0
+    return Rattle(half, ratio, axes[:, 2], ways, sides, likelihood(fit) + worth - _UNNAMED, is_clear)
+
+
+def _alike(sides: FloatArray, rows: NDArray[np.bool_], begins: NDArray[np.bool_]) -> float:
+    """Return what it is worth that neighbouring rows lie on the same side: their mutual information [nats]."""
+    follows = (rows & ~begins)[1:] & rows[:-1]
+    upper = 0.5 * (1.0 + sides)
+    before, after = (np.stack([1.0 - own, own]) for own in (upper[:-1][follows], upper[1:][follows]))
+    both = before @ after.T + 1e-9
+    apart = np.outer(both.sum(axis=1), both.sum(axis=0)) / both.sum()
+    # One more number: how often the side changes.
+    return max(float((both * np.log(both / apart)).sum() - 0.5 * np.log(max(both.sum(), 1.0))), 0.0)
 
 
 def likelihood(fit: Fit) -> float:
-    """Return the log-likelihood of a fit's residuals as normal noise of any shape on the marker's link [nats]."""
-    rows = fit.noise.weights > 0.0
-    return -0.5 * int(rows.sum()) * float(np.linalg.slogdet(np.cov(_on_link(fit)[rows].T))[1])
+    """Return the log-likelihood of a fit's residuals as normal noise of any shape on the marker's link [nats].
+
+    The prior cost of causes and tolerances is subtracted.
+    """
+    rows, scales = fit.noise.weights > 0.0, fit.background.scales
+    cost = fit.prior_cost + (0.0 if scales is None else scales.doubt)
+    return -0.5 * int(rows.sum()) * float(np.linalg.slogdet(np.cov(_on_link(fit)[rows].T))[1]) - cost
 
 
 def _on_link(fit: Fit) -> FloatArray:
@@ -121,7 +147,7 @@ def _two_sides(values: FloatArray, rows: NDArray[np.bool_]) -> tuple[FloatArray,
         Their means (2,), their width, the worth over a single one [nats], and the mean side of each value (n,).
     """
     counted, n = values[rows], int(rows.sum())
-    means, sigma, share = np.quantile(counted, [0.2, 0.8]), float(counted.std()) / 2.0, 0.5
+    means, sigma, share = _split(counted)
     total = -np.inf
     for _ in range(_ROUNDS):
         both, own = _shared(counted, means, sigma, share)
@@ -133,6 +159,22 @@ def _two_sides(values: FloatArray, rows: NDArray[np.bool_]) -> tuple[FloatArray,
     sides = _shared(values, means, sigma, share)[1] @ [-1.0, 1.0]
     # The two sides cost a distance and a share, each known to about one part in the root of n.
     return means, sigma, total - single - float(np.log(n)), sides
+
+
+def _split(values: FloatArray) -> tuple[FloatArray, float, float]:
+    """Return the means (2,) of the lower and the upper values (n,), cut where this is most probable; width, and share.
+
+    One side may have few rows, so none of the usual quantiles need lie on it.
+    """
+    ordered = np.sort(values - values.mean())
+    n, below = len(ordered), np.arange(1, len(ordered))
+    sums = np.cumsum(ordered)[:-1]
+    share = below / n
+    within = np.maximum(float(ordered @ ordered) / n - np.square(sums) / (n * n * share * (1.0 - share)), 1e-300)
+    cost = 0.5 * np.log(within) - share * np.log(share) - (1.0 - share) * np.log1p(-share)
+    cut = int(np.argmin(cost))
+    means = values.mean() + sums[cut] * np.array([1.0 / below[cut], -1.0 / (n - below[cut])])
+    return means, float(np.sqrt(within[cut])), 1.0 - float(share[cut])
 
 
 def _shared(values: FloatArray, means: FloatArray, sigma: float, share: float) -> tuple[FloatArray, FloatArray]:
