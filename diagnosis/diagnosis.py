@@ -464,8 +464,8 @@ def _found(
     explanation = explain(extended, search.path, unknowns, search, told)
     # What is loose does not slip, and changes of its side may have been named jumps and bumps.
     steady = [cause for cause in extended.causes if cause.kind.stage != "tool" and not cause.kind.begins]
-    fits = [] if start.is_exact else [start, begun.with_causes([]), extended.with_causes(steady)]
-    loose = _loose(explanation, fits, search)
+    fits = [start, begun.with_causes([]), *([extended.with_causes(steady)] if steady else [])]
+    loose = None if start.is_exact else _loose(explanation, fits, search)
     for _ in range(_RATTLED if loose is not None else 0):
         assert loose is not None
         told(loose.what)

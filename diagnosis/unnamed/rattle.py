@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,8 +37,8 @@ class Rattle:
         axis: direction of the play in the marker's link (3,).
         ways: the same at each row (n, 3), in the measurement frame.
         sides: mean of the side, -1 or 1, on which the marker lies at each row (n,).
-        likelihood: log-likelihood of the residuals with two sides, less the cost of the tolerances beside it; comparable
-            with `likelihood` of a fit [nats].
+        likelihood: log-likelihood of the residuals with two sides, less the cost of the tolerances beside it,
+            comparable with `likelihood` of a fit [nats].
         is_clear: True if the sides are surely two, and farther apart than noise of any shape.
     """
 
@@ -76,12 +76,15 @@ def rattle_beside(fit: Fit) -> Rattle | None:
     """Return the play of the marker beside a fit that goes with it.
 
     The numbers of the fit may have followed the sides, and tolerances may hide them. So sides that are not clear yet
-    are taken out as well, and the fit and its tolerances follow what is left.
+    are taken out as well, and the fit and its tolerances follow what is left. Tolerances are at first no larger than a
+    workshop's: larger ones are likely to have followed the sides.
     """
+    if fit.background.scales is not None and not fit.is_exact:
+        fit = fit.tolerating(fit.background.scales.no_larger)
     play = _two_sided(fit)
     for _ in range(_FITS if play is not None else 0):
         assert play is not None
-        fit = fit.to(play.taken_out_of(fit.observations))
+        fit = fit.to((_unfollowed(play, fit) if play.is_clear else play).taken_out_of(fit.observations))
         if not fit.is_exact:
             fit = fit.tolerating(tolerated(fit).scales)
         again = _two_sided(fit)
@@ -100,12 +103,30 @@ def _two_sided(fit: Fit) -> Rattle | None:
     left = _on_link(fit)
     variances, axes = np.linalg.eigh(np.cov(left[rows].T))
     means, sigma, worth, sides = _two_sides(left @ axes[:, 2], rows)
-    worth += _alike(sides, rows, fit.observations.motion.begins)
+    alike = _alike(sides, rows, fit.observations.motion.begins)
+    if alike > 0.0:
+        sides = np.where(_on_their_way(sides), 0.0, sides)
+    worth += alike
     half = 0.5 * float(means[1] - means[0])
     ratio = float(variances[2] / max(variances[:2].mean(), _LEAST_ACROSS**2 * variances[2])) - 1.0
     ways = np.einsum("nji,j->ni", _turns(fit), axes[:, 2])
     is_clear = 2.0 * half >= _APART * sigma and worth >= _NAMED and ratio >= _BEYOND_NOISE**2 - 1.0
     return Rattle(half, ratio, axes[:, 2], ways, sides, likelihood(fit) + worth - _UNNAMED, is_clear)
+
+
+def _unfollowed(play: Rattle, fit: Fit) -> Rattle:
+    """Return the play of these sides, as large as it is where the fit and its tolerances no longer follow it."""
+    n, observations = len(play.sides), fit.observations
+    by_link = np.swapaxes(_turns(fit), 1, 2) * play.sides[:, None, None]
+    taken_out = np.broadcast_to(observations.play, observations.x.shape)[:, :, None]
+    moved = fit.unshared(fit.weighted(np.concatenate([by_link, taken_out], axis=2)).reshape(3 * n, 4))
+    basis = fit.orthogonal.reshape(3 * n, -1)
+    columns = moved[:, :3] - basis @ (basis.T @ moved[:, :3])
+    to_side = np.linalg.lstsq(columns, fit.evident.ravel() + moved[:, 3], rcond=None)[0]
+    half = float(np.linalg.norm(to_side))
+    if half == 0.0:
+        return play
+    return replace(play, half_m=half, axis=to_side / half, ways=np.einsum("nji,j->ni", _turns(fit), to_side / half))
 
 
 def _alike(sides: FloatArray, rows: NDArray[np.bool_], begins: NDArray[np.bool_]) -> float:
@@ -117,6 +138,12 @@ def _alike(sides: FloatArray, rows: NDArray[np.bool_], begins: NDArray[np.bool_]
     apart = np.outer(both.sum(axis=1), both.sum(axis=0)) / both.sum()
     # One more number: how often the side changes.
     return max(float((both * np.log(both / apart)).sum() - 0.5 * np.log(max(both.sum(), 1.0))), 0.0)
+
+
+def _on_their_way(sides: FloatArray) -> NDArray[np.bool_]:
+    """Return the rows (n,) beside a change of the side, at which the marker may lie between the two."""
+    changes = sides[1:] * sides[:-1] < 0.0
+    return np.append(changes, False) | np.append(False, changes)
 
 
 def likelihood(fit: Fit) -> float:
