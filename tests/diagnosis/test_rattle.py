@@ -10,11 +10,12 @@ from planted_cases import SIGMA_M, measured, scattered, surveyed_arm, walk
 
 from bodyschema.diagnosis import diagnosis
 from bodyschema.diagnosis.diagnosis import diagnose
+from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.report.conclusion import conclusion
 from bodyschema.diagnosis.report.result import DiagnosisFile
-from bodyschema.diagnosis.unnamed.rattle import Rattle
+from bodyschema.diagnosis.unnamed.rattle import Rattle, rattle
 from bodyschema.effects import Effect, Simulation
 
 HALF_M = 2e-3
@@ -80,6 +81,19 @@ def test_a_marker_seldom_on_its_other_side_is_loose(seed) -> None:
 def test_a_marker_that_slips_once_is_not_loose(seed) -> None:
     found = beside_tolerances(seed, changes=(200,))
     assert (found.verdict, [cause.effect for cause in found.causes]) == ("explained", ["tool_slip"])
+
+
+def test_a_marker_may_lie_anywhere_beside_a_change_of_side() -> None:
+    robot, rng = surveyed_arm(), np.random.default_rng(3)
+    motion = walk(robot, 3)
+    run = Simulation(robot).run(motion)
+    sides = np.where(np.arange(len(motion)) // 50 % 2, HALF_M, -HALF_M)
+    ways = run.columns(Effect.at(robot, "tool_offset")) @ np.array([0.6, 0.0, 0.8])
+    x = run.measured + sides[:, None] * ways + SIGMA_M * rng.normal(size=ways.shape)
+    play = rattle(aligned(Observations.of(measured(robot, motion, x), Simulation(robot)), Simulation(robot)))
+    assert play is not None
+    changes = np.arange(50, 300, 50)
+    assert np.flatnonzero(play.sides == 0.0).tolist() == sorted([*changes - 1, *changes])
 
 
 @pytest.mark.parametrize("seed", [1, 2])
