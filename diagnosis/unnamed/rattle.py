@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import xlogy
 
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.observations import Observations
@@ -24,7 +25,8 @@ _ROUNDS = 50
 _FITS, _SAME = 30, 1.0
 # Cost of a play [nats]: it has no name, and three numbers, as a slip has.
 _UNNAMED = 8.0 + 3.0 * 3.0
-_FEWEST_ROWS = 8
+# A side with fewer rows may be of outliers.
+_FEWEST = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +99,7 @@ def rattle_beside(fit: Fit) -> Rattle | None:
 def _two_sided(fit: Fit) -> Rattle | None:
     """Return the most probable play, however small; None where the residuals are too few, or no noise."""
     rows = fit.noise.weights > 0.0
-    if fit.is_exact or rows.sum() < _FEWEST_ROWS:
+    if fit.is_exact or rows.sum() < 2 * _FEWEST:
         # With the play taken out of them, positions of a simulation have no noise to compare it with.
         return None
     left = _on_link(fit)
@@ -110,8 +112,10 @@ def _two_sided(fit: Fit) -> Rattle | None:
     half = 0.5 * float(means[1] - means[0])
     ratio = float(variances[2] / max(variances[:2].mean(), _LEAST_ACROSS**2 * variances[2])) - 1.0
     ways = np.einsum("nji,j->ni", _turns(fit), axes[:, 2])
+    rarer = min(int((sides[rows] < 0.0).sum()), int((sides[rows] > 0.0).sum()))
     is_clear = 2.0 * half >= _APART * sigma and worth >= _NAMED and ratio >= _BEYOND_NOISE**2 - 1.0
-    return Rattle(half, ratio, axes[:, 2], ways, sides, likelihood(fit) + worth - _UNNAMED, is_clear)
+    whole = _likelihood(fit, rows) + worth - _UNNAMED
+    return Rattle(half, ratio, axes[:, 2], ways, sides, whole, is_clear and rarer >= _FEWEST)
 
 
 def _unfollowed(play: Rattle, fit: Fit) -> Rattle:
@@ -147,13 +151,24 @@ def _on_their_way(sides: FloatArray) -> NDArray[np.bool_]:
 
 
 def likelihood(fit: Fit) -> float:
-    """Return the log-likelihood of a fit's residuals as normal noise of any shape on the marker's link [nats].
+    """Return the log-likelihood of a fit's residuals as outliers, and normal noise of any shape on the marker's link.
 
-    The prior cost of causes and tolerances is subtracted.
+    The prior cost of causes and tolerances is subtracted [nats].
     """
-    rows, scales = fit.noise.weights > 0.0, fit.background.scales
-    cost = fit.prior_cost + (0.0 if scales is None else scales.doubt)
-    return -0.5 * int(rows.sum()) * float(np.linalg.slogdet(np.cov(_on_link(fit)[rows].T))[1]) - cost
+    return max(_likelihood(fit, fit.noise.weights > least) for least in (0.0, 0.5))
+
+
+def _likelihood(fit: Fit, rows: NDArray[np.bool_]) -> float:
+    """Return the same [nats] where some rows (n,) are the marker, and the other trusted ones outliers."""
+    observations, scales = fit.observations, fit.background.scales
+    total, count = int(observations.trusted.sum()), int(rows.sum())
+    off = max(total - count, 0)
+    spread = observations.outlier_density[0] + np.linalg.slogdet(observations.whitening[0])[1]
+    noise = (
+        -0.5 * count * (float(np.linalg.slogdet(np.cov(_on_link(fit)[rows].T))[1]) + 3.0 * np.log(2.0 * np.pi * np.e))
+    )
+    outliers = off * float(spread) + float(xlogy(off, off / total) + xlogy(count, count / total))
+    return noise + outliers - fit.prior_cost - (0.0 if scales is None else scales.doubt)
 
 
 def _on_link(fit: Fit) -> FloatArray:
@@ -194,8 +209,8 @@ def _split(values: FloatArray) -> tuple[FloatArray, float, float]:
     One side may have few rows, so none of the usual quantiles need lie on it.
     """
     ordered = np.sort(values - values.mean())
-    n, below = len(ordered), np.arange(1, len(ordered))
-    sums = np.cumsum(ordered)[:-1]
+    n, below = len(ordered), np.arange(_FEWEST, len(ordered) - _FEWEST + 1)
+    sums = np.cumsum(ordered)[below - 1]
     share = below / n
     within = np.maximum(float(ordered @ ordered) / n - np.square(sums) / (n * n * share * (1.0 - share)), 1e-300)
     cost = 0.5 * np.log(within) - share * np.log(share) - (1.0 - share) * np.log1p(-share)

@@ -83,6 +83,15 @@ def test_a_marker_that_slips_once_is_not_loose(seed) -> None:
     assert (found.verdict, [cause.effect for cause in found.causes]) == ("explained", ["tool_slip"])
 
 
+@pytest.mark.parametrize("count", [1, 3, 12])
+def test_outliers_are_no_second_side(count) -> None:
+    robot, rng = surveyed_arm(), np.random.default_rng(5)
+    motion = walk(robot, 5, rows=150)
+    x = Simulation(robot).positions(motion) + SIGMA_M * rng.normal(size=(150, 3))
+    x[rng.choice(150, count, replace=False)] += 6e-3 * rng.normal(size=(count, 3))
+    assert diagnose(measured(robot, motion, x), Simulation(robot)).left.rattle is None
+
+
 def test_a_marker_may_lie_anywhere_beside_a_change_of_side() -> None:
     robot, rng = surveyed_arm(), np.random.default_rng(3)
     motion = walk(robot, 3)
