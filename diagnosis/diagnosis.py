@@ -464,7 +464,9 @@ def _found(
     explanation = explain(extended, search.path, unknowns, search, told)
     # What is loose does not slip, and changes of its side may have been named jumps and bumps.
     steady = [cause for cause in extended.causes if cause.kind.stage != "tool" and not cause.kind.begins]
-    fits = [start, begun.with_causes([]), *([extended.with_causes(steady)] if steady else [])]
+    # Likelihoods compare over the same rows alone.
+    bare = begun.with_causes([]).to(start.observations)
+    fits = [start, bare, *([extended.with_causes(steady)] if steady else [])]
     loose = None if start.is_exact else _loose(explanation, fits, search)
     for _ in range(_RATTLED if loose is not None else 0):
         assert loose is not None

@@ -23,8 +23,8 @@ _LEAST_ACROSS = 1e-5
 _ROUNDS = 50
 # Most fits beside a play, and the gain in likelihood that ends them [nats].
 _FITS, _SAME = 30, 1.0
-# Cost of a play [nats]: it has no name, and three numbers, as a slip has. From 5 to 90 nats, 17 recordings have the same
-# verdict.
+# Cost of a play [nats]: it has no name, and three numbers, as a slip has. From 5 to 90, the verdicts on 17 recordings
+# are the same.
 _UNNAMED = 8.0 + 3.0 * 3.0
 # A side with fewer rows may be of outliers.
 _FEWEST = 5

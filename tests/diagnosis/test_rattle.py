@@ -152,6 +152,30 @@ def test_beside_a_loose_marker_the_noise_and_the_rows_left_out_stay(monkeypatch)
     assert (begun[-1].doubtful == left_out).all()
 
 
+def test_two_sides_and_causes_are_compared_over_the_same_rows(monkeypatch) -> None:
+    robot, rng = surveyed_arm(), np.random.default_rng(0)
+    simulation, motion = Simulation(robot), scattered(robot, 1, rows=40)
+    x = simulation.run(motion).measured + SIGMA_M * rng.normal(size=(40, 3))
+    left_out, compared = iter([np.zeros(40, dtype=bool), np.arange(40) < 4]), []
+
+    class Compared(Exception):
+        pass
+
+    def loose(_: object, fits: list[Fit], *__: object) -> None:
+        compared.extend(fits)
+        raise Compared
+
+    monkeypatch.setattr(diagnosis, "together", lambda start, *_: start.tolerating(diagnosis.Scales()))
+    monkeypatch.setattr(diagnosis, "_searched", lambda begun, *_: begun)
+    monkeypatch.setattr(diagnosis, "_left_out", lambda _: next(left_out))
+    monkeypatch.setattr(diagnosis, "reshaped", lambda _: None)
+    monkeypatch.setattr(diagnosis, "explain", lambda *_: SimpleNamespace(unknown=None))
+    monkeypatch.setattr(diagnosis, "_loose", loose)
+    with pytest.raises(Compared):
+        diagnosis.diagnose(measured(robot, motion, x), simulation)
+    assert {int(fit.observations.trusted.sum()) for fit in compared} == {36}
+
+
 @pytest.mark.parametrize("rows", [14, 20])
 def test_a_loose_marker_in_few_rows_has_noise(rows) -> None:
     """Functions of three coordinates are as many as the coordinates of 20 rows."""
