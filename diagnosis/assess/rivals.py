@@ -9,7 +9,7 @@ import numpy as np
 
 from bodyschema.diagnosis.fit.fit import Fit, amount_columns, solved
 from bodyschema.diagnosis.fit.scatter import beyond_single_rows, limited_rows, remembers
-from bodyschema.diagnosis.fit.worth import SAME, nats
+from bodyschema.diagnosis.fit.worth import SAME
 from bodyschema.diagnosis.search.held_out import Blocks, beside_fit
 from bodyschema.diagnosis.search.scan import Candidate
 from bodyschema.diagnosis.search.search import Search
@@ -116,7 +116,7 @@ def _standing(
             continue
         rival = beside.exchanged(candidate, fit.log_likelihood - _HOPELESS)
         doubt = float(np.log(max(candidate.trials / max(itself.trials, 1), 1e-3)))
-        more = nats(2.0 * (rival.log_likelihood - fit.log_likelihood), candidate.dof - itself.dof) - doubt
+        more = rival.log_likelihood - fit.log_likelihood - beside.cost_of(candidate) - doubt
         more += search.for_zero(fit, itself, candidate)
         alike = remembers(cause) and remembers(candidate.effect)
         tried.append((rival, candidate.effect))

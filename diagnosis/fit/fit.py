@@ -503,6 +503,12 @@ class Fit:
             simulation = simulation.with_effects(stays).with_background((*simulation.background, *moved))
         return improved(self._about(simulation, scales))
 
+    def tolerating_anew(self, scales: Scales) -> Fit:
+        """Refit with tolerances of these scales, linearised about an arm that has none."""
+        before = self.background
+        bare = self.simulation.with_background(before.with_amounts(np.zeros_like(before.start)))
+        return improved(self._about(bare, scales))
+
     def settled(self) -> Fit:
         """Return the same fit with its tolerances moved into the simulation."""
         if self.background.scales is None:

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from bodyschema.effects import Effect
+from bodyschema.interfaces.records import FloatArray
 
 # Signals that differ by less than this, twice the log-likelihood that the right one is expected to gain, are one.
 SAME = 6.0
@@ -21,16 +22,19 @@ _ROUNDS = 30
 
 
 def nats(gain: float, dof: int) -> float:
-    """Return the evidence gain of `dof` more parameters that raise twice the log-likelihood by `gain` [nats].
+    """Return the evidence gain of `dof` more parameters that raise twice the log-likelihood by `gain` [nats]."""
+    if dof < 0:
+        return -nats(-gain, -dof)
+    return 0.5 * gain - cost(gain, dof)
+
+
+def cost(gain: float, dof: int) -> float:
+    """Return the cost of `dof` parameters that raise twice the log-likelihood by `gain` [nats].
 
     The prior is Gaussian and scaled by empirical Bayes: the size that best explains the gain (George and Foster 2000,
         equation 5). It is never so narrow that a parameter costs less than `_CHEAPEST`.
     """
-    if dof < 0:
-        return -nats(-gain, -dof)
-    if dof == 0:
-        return 0.5 * gain
-    return 0.5 * gain - dof * max(0.5 + 0.5 * float(np.log(max(gain, 1e-300) / dof)), _CHEAPEST)
+    return dof * max(0.5 + 0.5 * math.log(max(gain, 1e-300) / dof), _CHEAPEST) if dof else 0.0
 
 
 def rise_for(worth: float, dof: int) -> float:
@@ -39,17 +43,35 @@ def rise_for(worth: float, dof: int) -> float:
         return -rise_for(-worth, -dof)
     rise = worth + _CHEAPEST * dof
     for _ in range(_ROUNDS if dof else 0):
-        rise = worth + dof * max(0.5 + 0.5 * float(np.log(max(2.0 * rise, 1e-300) / dof)), _CHEAPEST)
+        rise = worth + cost(2.0 * rise, dof)
     return rise
 
 
-def choices(effect: Effect) -> int:
-    """Return the number of ways in which the amounts of an effect could have been chosen."""
+def choices(effect: Effect) -> float:
+    """Return the number of ways in which the amounts of an effect could have been chosen, equally probable ones."""
     if not effect.kind.in_parts or effect.free is None:
-        return 1
-    return ways_to_choose(len(effect.amounts), len(effect.freeing(None).amounts))
+        return 1.0
+    return float(ways_to_choose(effect)[sum(1 << k for k in effect.amounts)])
 
 
-def ways_to_choose(some: int, of: int) -> int:
-    """Return the number of sets of this size, times the number of sizes: any size is equally probable."""
-    return of * math.comb(of, some)
+def ways_to_choose(effect: Effect) -> FloatArray:
+    """Return the number of equally probable ways in which each set of an effect's numbers could have been chosen.
+
+    In half of the cases it is a whole: all its shifts, all its turns, or both, as a part is mounted askew. In the
+    other half it is any number of them, and any such set.
+
+    Returns:
+        One number for each sum of 2ᵏ over the free numbers k.
+    """
+    amounts = effect.freeing(None).amounts
+    units: dict[str, int] = {}
+    for k in amounts:
+        unit = effect.parameters[k].name.rpartition("_")[2]
+        units[unit] = units.get(unit, 0) + (1 << k)
+    wholes = {*units.values(), sum(units.values())}
+    ways = np.full(1 << len(amounts), np.inf)
+    for chosen in range(1, len(ways)):
+        size = chosen.bit_count()
+        any_set = 1.0 / (len(amounts) * math.comb(len(amounts), size))
+        ways[chosen] = 2.0 / (any_set + (1.0 / len(wholes) if chosen in wholes else 0.0))
+    return ways

@@ -51,14 +51,14 @@ class Candidate:
         effect: with the amounts of the linear fit, and the moment or period found.
         gain: Δχ².
         dof: number of its amounts that the data determine.
-        trials: number of moments or periods tried.
+        trials: number of moments, periods or choices of its numbers tried.
         interval: 95 % interval of the moment; None for an effect that has none.
     """
 
     effect: Effect
     gain: float
     dof: int
-    trials: int = 1
+    trials: float = 1
     interval: tuple[float, float] | None = None
 
 
@@ -132,10 +132,10 @@ class Scan:
         inners, gradients = np.where(both, inner, 0.0), np.where(chosen, gradient, 0.0)
         gains, amounts = self._gains(inners, gradients, effect)
         dofs = self._dofs(inners, np.broadcast_to(raw, chosen.shape), effect)
-        sizes = chosen.sum(axis=1)
+        ways = ways_to_choose(effect)[(chosen << np.array(effect.amounts)).sum(axis=1)]
         worths = [
-            nats(float(gain), int(dof)) - np.log(ways_to_choose(int(size), chosen.shape[1])) if dof == size else -np.inf
-            for gain, dof, size in zip(gains, dofs, sizes, strict=True)
+            nats(float(gain), int(dof)) - np.log(way) if dof == size else -np.inf
+            for gain, dof, size, way in zip(gains, dofs, chosen.sum(axis=1), ways, strict=True)
         ]
         best = int(np.argmax(worths))
         if not np.isfinite(worths[best]):

@@ -13,7 +13,7 @@ from scipy.special import chdtri
 from bodyschema.diagnosis.fit.fit import Fit, amount_columns, improved, solved
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.fit.scatter import beyond_single_rows, instruments, remembers
-from bodyschema.diagnosis.fit.worth import ANOTHER, NAMED, SAME, choices, nats, rise_for
+from bodyschema.diagnosis.fit.worth import ANOTHER, NAMED, SAME, choices, cost, nats, rise_for
 from bodyschema.effects import Effect, Identity
 
 from .held_out import Blocks, block_p_value
@@ -84,6 +84,14 @@ class Beside:
         """First-order lead of the cause over the best candidate for its place [nats]."""
         return 0.5 * (self.itself.gain - max((one.gain for one in self.candidates), default=0.0))
 
+    def cost_of(self, candidate: Candidate) -> float:
+        """Return what the numbers of a candidate cost beyond those of the cause [nats].
+
+        Each number of an effect is known to a small part of the effect's size, so that the simpler one is favoured by
+        more than by the number of its parameters.
+        """
+        return cost(candidate.gain, candidate.dof) - cost(self.itself.gain, self.itself.dof)
+
     def is_lost_for(self, worth: float) -> bool:
         """Return True if the cause is worth less than `worth` [nats]."""
         rise = rise_for(worth, self.itself.dof)
@@ -121,7 +129,7 @@ class Search:
     def __init__(self, hypotheses: Sequence[Effect], tell: Callable[[str], None]) -> None:
         self._hypotheses, self._tell = hypotheses, tell
         self.multiplicity = float(np.log(max(len(hypotheses), 1)))
-        self._trials: dict[Key, int] = {}
+        self._trials: dict[Key, float] = {}
         self._known: tuple[Fit | None, Scan | None, dict[Identity, Beside]] = (None, None, {})
         # Lead of each cause when it was last reviewed, the log-likelihood then, and the observations [nats].
         self._leads: dict[Identity, tuple[float, float, Observations]] = {}
@@ -175,13 +183,13 @@ class Search:
 
     def _exchanged(self, fit: Fit, beside: Beside, candidate: Candidate, least: float) -> tuple[Fit, float]:
         """Exchange a cause for a candidate, and return the evidence gain [nats]; approximate if below `least`."""
-        dof = candidate.dof - beside.itself.dof
+        costs = beside.cost_of(candidate)
         doubts = self.doubt(beside.itself, beside.others) - self.doubt(candidate, beside.others)
         doubts += self.for_zero(fit, beside.itself, candidate)
         alike = remembers(beside.itself.effect) and remembers(candidate.effect)
         least -= _OF_SINGLE_ROWS if alike else 0.0
-        tried = beside.exchanged(candidate, fit.log_likelihood + rise_for(least - doubts, dof))
-        worth = nats(2.0 * (tried.log_likelihood - fit.log_likelihood), dof) + doubts
+        tried = beside.exchanged(candidate, fit.log_likelihood + least - doubts + costs)
+        worth = tried.log_likelihood - fit.log_likelihood - costs + doubts
         return tried, worth + (beyond_single_rows(fit, tried) if alike else 0.0)
 
     def for_zero(self, fit: Fit, cause: Candidate, other: Candidate) -> float:
@@ -211,8 +219,10 @@ class Search:
     def doubt(self, candidate: Candidate, beside: Iterable[Effect] = ()) -> float:
         """Return the multiplicity penalty for the number of places searched, beside other causes [nats]."""
         self._trials[candidate.effect.key] = candidate.trials
-        is_another = candidate.effect.kind.is_zero and any(one.kind.is_zero for one in beside)
-        return float((min(self.multiplicity, ANOTHER) if is_another else self.multiplicity) + np.log(candidate.trials))
+        others = list(beside)
+        first = self.multiplicity - float(np.log(1 + _names(others)))
+        is_another = candidate.effect.kind.is_zero and any(one.kind.is_zero for one in others)
+        return (min(first, ANOTHER) if is_another else first) + float(np.log(candidate.trials))
 
     def doubt_of(self, effect: Effect) -> float:
         """Return the multiplicity penalty of an effect that was a candidate [nats]."""
@@ -386,6 +396,12 @@ def are_a_description(causes: Sequence[Effect]) -> bool:
 def simplicity(effect: Effect) -> int:
     """Return a complexity score; of equally probable causes the one with the lowest is named."""
     return len(effect.amounts) + len(effect.shapes) + (_OF_A_LINK if effect.kind.in_parts else 0)
+
+
+def _names(causes: Sequence[Effect]) -> int:
+    """Return the number of names among causes; all joint offsets together have one."""
+    zeros = [cause for cause in causes if cause.kind.is_zero]
+    return len(causes) - max(len(zeros) - 1, 0)
 
 
 def describe(effect: Effect) -> str:

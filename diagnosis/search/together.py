@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -146,6 +146,7 @@ class Sets:
         self._outliers = fit.noise.log_likelihood + self._rows * math.log(fit.noise.sigma) + 0.5 * left
         self._kinds, self._keys = [one.kind for one in self.effects], [one.key for one in self.effects]
         self._trials = [float(np.log(candidate.trials)) for candidate in candidates]
+        self._bits = [sum(1 << k for k in one.amounts) for one in self.effects]
         self._first = doubt + NAMED
         ends = np.cumsum([0, *(len(effect.amounts) for effect in self.effects)])
         first = self._nuisances + self._tolerances
@@ -278,11 +279,12 @@ class Sets:
         for k in chosen:
             kind = self._kinds[k]
             if kind.in_parts:
-                numbers[self._keys[k]] += len(self._places[k])
+                numbers[self._keys[k]] += self._bits[k]
                 continue
-            total += self._trials[k] + (min(self._first, ANOTHER) if kind in kinds else self._first)
+            total += self._trials[k] + (ANOTHER if kind in kinds else self._first)
             kinds.add(kind)
-        return total + sum(self._cost_of_numbers(key, count) for key, count in numbers.items())
+        total += sum(self._first + self._of_numbers[key][bits] for key, bits in numbers.items())
+        return total - math.lgamma(len(kinds) + len(numbers) + 1)
 
     def _places_of(self, group: tuple[int, ...]) -> NDArray[np.intp]:
         """Return the columns of some candidates (p,)."""
@@ -291,9 +293,9 @@ class Sets:
         return self._known_places[group]
 
     @cached_property
-    def _numbers(self) -> dict[Key, int]:
-        """Number of all amounts, free or not, of each cause."""
-        return {effect.key: len(effect.freeing(None).amounts) for effect in self.effects}
+    def _of_numbers(self) -> dict[Key, FloatArray]:
+        """Cost of each choice of the numbers of each cause that may have only some of them [nats]."""
+        return {effect.key: np.log(ways_to_choose(effect)) for effect in self.effects if effect.kind.in_parts}
 
     def _promising(self, here: Together, least: float) -> list[tuple[int, ...]]:
         """Return the groups of candidates that may reach the worth `least`, the best first.
@@ -323,21 +325,23 @@ class Sets:
     def _costs_of(self, chosen: Sequence[int], groups: Sequence[tuple[int, ...]], *, are_in: bool) -> FloatArray:
         """Return the part of each of some groups in the cost of naming a set [nats], or what it would add to it."""
         kinds = Counter(self._kinds[k] for k in chosen if not self._kinds[k].in_parts)
-        numbers = Counter(self._keys[k] for k in chosen if self._kinds[k].in_parts)
+        numbers: Counter[Key] = Counter()
+        for k in chosen:
+            if self._kinds[k].in_parts:
+                numbers[self._keys[k]] += self._bits[k]
+        # Names have no order: so many ways to write the same set.
+        first = self._first - math.log(max(len(kinds) + len(numbers) + (not are_in), 1))
         costs = []
         for group in groups:
             kind, key = self._kinds[group[0]], self._keys[group[0]]
             if kind.in_parts:
-                before = numbers[key] - (len(group) if are_in else 0)
-                costs.append(self._cost_of_numbers(key, before + len(group)) - self._cost_of_numbers(key, before))
+                own = sum(self._bits[k] for k in group)
+                before = numbers[key] - (own if are_in else 0)
+                of_numbers = self._of_numbers[key]
+                costs.append(of_numbers[before + own] + (first if before == 0 else -of_numbers[before]))
             else:
-                first = min(self._first, ANOTHER) if kinds[kind] > are_in else self._first
-                costs.append(self._trials[group[0]] + first)
+                costs.append(self._trials[group[0]] + (ANOTHER if kinds[kind] > are_in else first))
         return np.array(costs)
-
-    def _cost_of_numbers(self, key: Key, count: int) -> float:
-        """Return the cost of naming some numbers of a cause [nats]."""
-        return self._first + math.log(ways_to_choose(count, self._numbers[key])) if count else 0.0
 
     def of(self, chosen: tuple[int, ...], near: Together | None = None) -> Together:
         """Fit the scales and the noise of a set of causes by maximum evidence; each set once, whatever is near."""
@@ -532,7 +536,11 @@ def together(start: Fit, hypotheses: Sequence[Effect], tell: Callable[[str], Non
         if worth < best.here.worth - _COMES_NEAR:
             place, one = best, best.with_all_zeros
             if best.here.scales.angles <= 1.0 or place.name_of(one) in looked_at:
-                break
+                fewer = best.with_one_less(looked_at)
+                if fewer is None:
+                    break
+                known.append(_Place(fewer, hypotheses, known))
+                continue
         known.append(_Place(place.refitted(one), hypotheses, known))
         tell(f"{len(known)} fitted")
     return max(known, key=lambda place: place.here.worth).fit
@@ -595,7 +603,8 @@ class _Place:
         scanned = _beside_links(fit, absent)
         candidates = [Candidate(cause, 0.0, 1) for cause in fit.causes] + [_at_rest(one) for one in scanned]
         candidates = [part for candidate in candidates for part in _in_parts(candidate)]
-        self._sets = Sets(fit, candidates, float(np.log(max(len(hypotheses), 1))))
+        self._doubt = float(np.log(max(len(hypotheses), 1)))
+        self._sets = Sets(fit, candidates, self._doubt)
         own = self._sets.again(fit.causes)
         self.here = self._sets.of(own)
         if self.here.worth > max((place.here.worth for place in others), default=-np.inf) + _COMES_NEAR:
@@ -623,13 +632,50 @@ class _Place:
         zeros = [k for k, effect in enumerate(self._sets.effects) if effect.kind.is_zero]
         return self._sets.possible(self._sets.of(tuple(dict.fromkeys((*self.here.chosen, *zeros)))))
 
+    def with_one_less(self, known: Collection[frozenset[Key]]) -> Fit | None:
+        """Refit without one link or joint offset, where that is more probable; None where all are needed.
+
+        Without it tolerances may be larger, at angles where what is linear about this fit is so no more.
+
+        Args:
+            known: names of sets that are not tried.
+        """
+        for cause in self.fit.causes:
+            one = self._sets.of(self._sets.again([other for other in self.fit.causes if other is not cause]), self.here)
+            if not cause.kind.rigid or self.name_of(one) in known:
+                continue
+            fit = self.refitted(one)
+            if _worth(fit, self._doubt) > self.here.worth + _STILL:
+                return fit
+        return None
+
     def numbers_of(self, one: Together) -> list[Effect]:
         """Return the causes of a set, those of which some numbers may be free once for each."""
         return [self._sets.effects[k] for k in one.chosen]
 
     def refitted(self, one: Together) -> Fit:
-        """Refit one of the sets about its own parameters."""
-        return self.fit.starting(self._sets.causes(one)).tolerating(one.scales).tolerating(one.scales)
+        """Refit one of the sets about its own parameters.
+
+        Tolerances larger than a workshop's may have followed what other causes explain to angles where nothing is
+        linear any more. So the set is also fitted from an arm without tolerances, and the more probable fit returned.
+        """
+        start = self.fit.starting(self._sets.causes(one))
+        fits = [start.tolerating(one.scales).tolerating(one.scales)]
+        if max(one.scales.lengths, one.scales.angles) > 1.0:
+            least = one.scales.no_larger
+            fits.append(start.tolerating_anew(least).tolerating(least))
+        return max(fits, key=lambda fit: _worth(fit, self._doubt))
+
+
+def _worth(fit: Fit, doubt: float) -> float:
+    """Return the evidence of a fit's own causes less the cost of naming them [nats].
+
+    Args:
+        doubt: minimum cost of naming one of them [nats].
+    """
+    parts = [part for cause in fit.causes for part in _in_parts(Candidate(cause, 0.0, 1))]
+    sets = Sets(fit, parts, doubt)
+    return sets.of(sets.again(fit.causes)).worth
 
 
 def _beside_links(fit: Fit, absent: Sequence[Effect]) -> list[Candidate]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -117,7 +118,25 @@ def test_the_zero_of_another_joint_needs_less_evidence_than_the_first(robot) -> 
     first, offset = (Effect.at(robot, "joint_offset", joint, values=[0.02]) for joint in (ELBOW, SHOULDER))
     scale = Effect.at(robot, "joint_scale", ELBOW)
     search, candidate = Search([offset] * 100, lambda _: None), Candidate(offset, 10.0, 1)
-    assert search.doubt(candidate, [first]) < search.doubt(candidate, [scale]) == search.doubt(candidate)
+    assert search.doubt(candidate, [first]) < search.doubt(candidate, [scale])
+
+
+def test_a_jump_of_the_last_joint_is_named_rather_than_a_slip_of_three_numbers(robot) -> None:
+    motion = walk(robot, 6)
+    jump = Effect.at(robot, "encoder_jump", WRIST, values={"jump_rad": 0.15, "t0": float(motion.clock[150])})
+    slip = Effect.at(robot, "tool_slip", None, values={"t0": float(motion.clock[150])})
+    search = Search([jump, slip], lambda _: None)
+    fit = start_of(robot, motion, (jump,), 6).with_causes([slip])
+    beside = search.beside(fit, fit.causes[0])
+    # Three numbers of a large slip have to explain far more than one of a jump.
+    assert beside.cost_of(beside.candidates[0]) < -6.0
+
+
+def test_names_are_charged_as_a_set_and_not_as_an_order(robot) -> None:
+    offset, scale = (Effect.at(robot, name, ELBOW) for name in ("joint_offset", "joint_scale"))
+    search = Search([offset] * 100, lambda _: None)
+    alone, beside = search.doubt(Candidate(scale, 10.0, 1)), search.doubt(Candidate(scale, 10.0, 1), [offset])
+    assert alone + beside == pytest.approx(np.log(100 * 100 / 2))
 
 
 def test_a_link_gives_way_to_the_offsets_that_it_contains(robot) -> None:

@@ -6,14 +6,15 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from planted_cases import ELBOW, SHOULDER, desk_arm, measured, scattered, surveyed_arm
+from planted_cases import BASE, ELBOW, SHOULDER, WRIST, desk_arm, measured, motion_of, scattered, surveyed_arm
 
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.background import Scales
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.observations import Observations
+from bodyschema.diagnosis.fit.worth import ways_to_choose
 from bodyschema.diagnosis.search.scan import Candidate
-from bodyschema.diagnosis.search.together import Sets
+from bodyschema.diagnosis.search.together import Sets, _Place, _worth
 from bodyschema.effects import Effect, Simulation
 from bodyschema.robot.description import RobotDescription
 
@@ -57,3 +58,51 @@ def test_a_cause_that_would_be_negative_and_cannot_be_leaves_its_set() -> None:
     assert not hidden.is_possible
     compared = sets(fit_of(robot, hidden), hidden)
     assert [one.chosen for one in compared.climbed([(0,)])] == [()]
+
+
+def rough(robot: RobotDescription, seed: int, angle: float, *causes: Effect) -> Fit:
+    """Return the fit without any cause of an arm whose links are off by 0.1 mm and some angle, to 0.02 mm."""
+    rng = np.random.default_rng([11, seed])
+    links = [np.concatenate([1e-4 * rng.normal(size=3), angle * rng.normal(size=3)]) for _ in robot.joints]
+    parts = zip(robot.joints, links, strict=True)
+    made = (Effect.at(robot, "link_geometry", joint, values=values) for joint, values in parts)
+    motion = motion_of(rng.uniform(0.8 * robot.lower, 0.8 * robot.upper, (150, len(robot.joints))))
+    x = Simulation(robot, causes, None, tuple(made)).positions(motion) + 2e-5 * rng.normal(size=(150, 3))
+    return aligned(Observations.of(measured(robot, motion, x), Simulation(robot)), Simulation(robot))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_set_is_fitted_as_well_from_tolerances_that_were_far_too_large(seed) -> None:
+    robot = desk_arm()
+    places = zip((SHOULDER, ELBOW, WRIST), (0.1, -0.1, 0.1), strict=True)
+    offsets = [Effect.at(robot, "joint_offset", joint, values=[size]) for joint, size in places]
+    start = rough(robot, seed, 5e-4, *offsets)
+    hypotheses = [Effect.at(robot, "joint_offset", joint) for joint in robot.joints]
+    afar = _Place(start.tolerating(Scales(10.0, 10.0, 10.0)), hypotheses, ())
+    near = start.with_causes(offsets).tolerating(Scales()).tolerating(Scales())
+    again = afar.refitted(afar._sets.of(afar._sets.again(offsets)))
+    assert _worth(again, 2.0) == pytest.approx(_worth(near, 2.0), abs=3.0)
+
+
+@pytest.mark.parametrize(("bent", "stays"), [(0.0, False), (0.1, True)])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_link_leaves_a_roughly_made_arm_unless_it_is_bent_far_more(seed, bent, stays) -> None:
+    robot = desk_arm()
+    link = Effect.at(robot, "link_geometry", WRIST, values=[0.0, 0.0, 0.0, bent, -bent, bent])
+    hypotheses = [Effect.at(robot, "link_geometry", joint) for joint in robot.joints]
+    fit = (
+        rough(robot, seed, 5e-3, *([link] if bent else [])).tolerating(Scales()).with_causes([link.freeing((3, 4, 5))])
+    )
+    place = _Place(fit.tolerating(Scales()), hypotheses, ())
+    place = _Place(place.refitted(place.here), hypotheses, ())
+    assert (place.with_one_less([]) is None) is stays
+
+
+def test_the_choices_of_a_links_numbers_are_as_probable_together_as_one() -> None:
+    ways = ways_to_choose(Effect.at(desk_arm(), "link_geometry", BASE))
+    assert (1.0 / ways[1:]).sum() == pytest.approx(1.0)
+
+
+def test_all_shifts_are_more_probable_than_two_of_them_and_a_turn() -> None:
+    ways = ways_to_choose(Effect.at(desk_arm(), "link_geometry", BASE))
+    assert ways[0b000111] == ways[0b111000] < 0.1 * ways[0b100011]
