@@ -17,6 +17,7 @@ from bodyschema.diagnosis.fit.worth import ANOTHER, NAMED, SAME, choices, cost, 
 from bodyschema.effects import Effect, Identity
 
 from .held_out import Blocks, block_p_value
+from .hypotheses import has_simpler_name
 from .scan import Candidate, Scan
 
 # Candidates within this share of the best gain are refitted, up to this number.
@@ -168,7 +169,8 @@ class Search:
         """Add one more cause; None if no candidate is probable enough."""
         best, most = None, NAMED
         known = self._known[1] if self._known[0] is fit else None
-        for candidate in self.shortlist(known or Scan(fit), self._open(fit)):
+        named_so = [one for one in self._open(fit) if not has_simpler_name(one, self._hypotheses, fit.simulation)]
+        for candidate in self.shortlist(known or Scan(fit), named_so):
             if self.agreed(fit, candidate) < NAMED:
                 continue
             doubt = self.doubt(candidate, fit.causes)
@@ -334,6 +336,8 @@ class Search:
             return beside.without
         for candidate in beside.candidates:
             if candidate.gain < _COMES_NEAR * beside.itself.gain:
+                continue
+            if has_simpler_name(candidate.effect, self._hypotheses, fit.simulation):
                 continue
             simpler = simplicity(candidate.effect) < simplicity(cause)
             tried, worth = self._exchanged(fit, beside, candidate, -_EQUAL if simpler else _EQUAL)
