@@ -47,14 +47,11 @@ _EDGE_SIGMA_PX = 0.06
 # Where the background makes a larger one [px], an edge elsewhere hides nothing.
 _UNEVEN_PX = 0.4
 # Residuals beyond this are no longer edge noise [px], whatever the spread is.
-_LEAST_GATE_PX, _LARGEST_GATE_PX, _GATE_SIGMAS = 0.8, 2.0, 3.5
-# An arc is not the ball's edge if its mean is off by more than this: arc's share of the outline, least number of rays
-# to either side, limit [px], and limit as a share of the radius: real balls have seams, dimples and dark undersides.
-_ARC, _LEAST_HALF_ARC, _OFF_PX, _OFF_SHARE = 0.1, 3, 0.35, 0.05
+_LEAST_GATE_PX, _GATE_SIGMAS = 0.8, 3.5
 # Number of arcs of the outline; any three give a candidate circle.
 _ARCS = 10
-# If this share of the points is no farther than this from the circle through all [px], they are the ones.
-_NEARLY_ALL, _AGREED_PX = 0.9, 0.4
+# An arc is not the ball's edge if its mean is off by a larger share of the radius: real balls have seams and dimples.
+_OFF_SHARE = 0.05
 _TRIPLES = np.array(list(combinations(range(_ARCS), 3)))
 # Systematic error that averaging does not reduce [px].
 _FLOOR_PX = 0.001
@@ -254,7 +251,7 @@ def _fit(edges: _Edges) -> _Fit | None:
             return None
         residual = edges.distance_px - edges.rays @ fitted[0]
         spread = 1.4826 * median(np.abs(residual[told]))
-        gate = min(max(_GATE_SIGMAS * spread, _LEAST_GATE_PX), _LARGEST_GATE_PX)
+        gate = min(max(_GATE_SIGMAS * spread, _LEAST_GATE_PX), _NARROW_PX)
         agreeing = np.where(np.abs(residual) < gate, edges.weight, 0.0)
         fit = _Fit(edges, *fitted, residual, weight, agreeing == 0)
         if np.array_equal(weight, agreeing):
@@ -276,7 +273,7 @@ def _outline(fit: _Fit, centre_px: FloatArray, shape: FloatArray) -> Outline:
         radius_sigma_px=math.sqrt(inverse[2, 2]),
         visible=1.0 - np.count_nonzero(hidden) / len(hidden),
         uneven=np.count_nonzero(edges.uneven | (apart & ~hidden)) / len(hidden),
-        off=_share_off(edges.weight, residual, max(_OFF_PX, _OFF_SHARE * radius_px)),
+        off=_share_off(edges.weight, residual, max(0.35, _OFF_SHARE * radius_px)),
     )
 
 
@@ -285,8 +282,8 @@ def _share_off(weight: FloatArray, residual: FloatArray, limit_px: float) -> flo
 
     Noise and aliasing change from ray to ray; an object that covers part of the ball moves the edge in a whole arc.
     """
-    half = max(_LEAST_HALF_ARC, round(len(weight) * _ARC / 2))
-    clipped = weight * np.clip(residual, -_LARGEST_GATE_PX, _LARGEST_GATE_PX)
+    half = round(len(weight) / (2 * _ARCS))
+    clipped = weight * np.clip(residual, -_NARROW_PX, _NARROW_PX)
     moved, among = _arc_sums(clipped, half), _arc_sums(weight, half)
     return float(weight @ (np.abs(moved) > limit_px * among) / weight.sum())
 
@@ -304,11 +301,6 @@ def _agreeing(edges: _Edges) -> FloatArray:
     nearly half of the outline, and all of them pull inwards: plain least squares would follow them.
     """
     told = np.flatnonzero(edges.weight > 0)
-    fitted = fit_circle(edges.distance_px, edges.weight)
-    if fitted is not None:
-        agree = np.abs(edges.distance_px - edges.rays @ fitted[0]) < _AGREED_PX
-        if np.count_nonzero(agree[told]) >= _NEARLY_ALL * len(told):
-            return np.where(agree, edges.weight, 0.0)
     if len(told) < 2 * _ARCS:
         return edges.weight
     points = np.column_stack([edges.rays[told], edges.distance_px[told]])
@@ -320,5 +312,5 @@ def _agreeing(edges: _Edges) -> FloatArray:
     middle = len(told) // 2
     spread = np.partition(off, middle, axis=1)[:, middle]
     best = int(np.argmin(spread))
-    gate = min(max(_GATE_SIGMAS * 1.4826 * float(spread[best]), _LEAST_GATE_PX), _LARGEST_GATE_PX)
+    gate = min(max(_GATE_SIGMAS * 1.4826 * float(spread[best]), _LEAST_GATE_PX), _NARROW_PX)
     return np.where(np.abs(edges.distance_px - edges.rays @ circles[best]) < gate, edges.weight, 0.0)
