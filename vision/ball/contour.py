@@ -36,7 +36,7 @@ _BEST_SIGMA_PX, _WORST_SIGMA_PX = 0.03, 0.5
 # The channels' disagreement (chi-squared, 2 degrees of freedom): more than this, and than this times the median of the
 # ball's rays, is no noise, and makes a ray's variance larger by that power of it; what its median is of noise alone.
 _LEAST_DISAGREEMENT, _USUAL_DISAGREEMENT, _DISAGREEMENT_POWER, _OF_NOISE = 2.0, 1.5, 3, 3.0
-_NOTHING = 1e-12  # keeps from dividing by information that is 0
+_NOTHING = np.finfo(np.float64).tiny  # keeps from dividing by information that is 0
 # Largest factor of the blur's change from one iteration to the next.
 _LARGEST_WIDENING = 1.5
 

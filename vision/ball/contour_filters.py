@@ -38,10 +38,6 @@ _GLOSS, _EDGE_BLURS = 2.0, 1.4
 _FINE_PX = 0.05
 
 
-# Directions in which two textures' precisions differ by less tell them apart by less than thousandths.
-_SAME = 1e-9
-
-
 @dataclass(frozen=True, slots=True)
 class Filters:
     """One filter for each of k textures of the background, over m samples of a ray in units of their noise.
@@ -134,7 +130,7 @@ def _filters(at: tuple[float, ...], radius_px: float, blur_px: float, own_colour
 def _root(matrix: FloatArray) -> FloatArray:
     """Return a (m, l) whose product with its transpose is a positive semidefinite matrix (m, m)."""
     values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
-    kept = values > _SAME
+    kept = values > np.sqrt(np.finfo(np.float64).eps)  # less tells two textures apart by less than thousandths
     return np.asarray(vectors[:, kept] * np.sqrt(values[kept]), np.float64)
 
 

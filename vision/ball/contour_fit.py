@@ -15,8 +15,8 @@ from .contour_filters import USUAL_BLUR_PX
 from .contour_spectrum import waves
 from .polar import fit_circle, median
 
-# Most iterations; converged when the limb and its blur changed by less than these [px].
-_LOOKS, _SETTLED_PX, _SETTLED_BLUR_PX = 4, 0.06, 0.05
+# Most iterations; converged when the limb and its blur changed by less than this [px].
+_LOOKS, _SETTLED_PX = 4, 0.06
 # An edge sharper than this after interpolation [px] was not anti-aliased: coverage is then the better measure.
 _ALIASED_PX = 0.55
 # Student's degrees of freedom of an edge's error, which set the weight of outliers; residual limit [px]; iterations.
@@ -95,7 +95,7 @@ def fit_limb(
         centre_px, radius_px = centre_px + shape @ fit.solution[:2], radius_px + growth
         moved_px, widened_px = max(math.hypot(u, v), abs(growth)), limb.blur_px - blur_px
         blur_px, looks = limb.blur_px, looks + 1
-        settled = moved_px < _SETTLED_PX and abs(widened_px) < _SETTLED_BLUR_PX
+        settled = moved_px < _SETTLED_PX and abs(widened_px) < _SETTLED_PX
         if settled or looks == _LOOKS:
             break
     excess, fewer = limb.excess, max(1.0, _LEAST_EVENNESS / limb.evenness)
