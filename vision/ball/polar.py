@@ -13,9 +13,7 @@ from numpy.typing import NDArray
 from bodyschema.interfaces.records import FloatArray, frozen_array
 
 from .colour import Float32Array, Gate
-
-# Rays that suffice for the ball's colour, and to find the circle that most of them agree on.
-ENOUGH_RAYS = 60
+from .settings import OutlineSettings as _Settings
 
 
 def rays_round(radius_px: float) -> FloatArray:
@@ -64,7 +62,7 @@ def sample(
 
 def ball_colour(inside: Float32Array, gate: Gate) -> FloatArray | None:
     """Return the ball's colour (3,) per unit of its amount; the median excludes highlights."""
-    samples = inside[:: max(1, len(inside) // ENOUGH_RAYS)].reshape(-1, 3)
+    samples = inside[:: max(1, len(inside) // _Settings.enough_rays)].reshape(-1, 3)
     amount = gate.amount(samples)
     coloured = amount > 1.0
     if np.count_nonzero(coloured) < len(amount) // 2:
