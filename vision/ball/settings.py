@@ -21,8 +21,7 @@ class OutlineSettings:
     # A fit in the narrow ring is final if it moved the circle by less than the first of these [px]; a rough circle that
     # is off by more than the second one is fitted in the wide ring.
     settled_px, rough_px = 0.5, 1.0
-    # Between samples along a ray, and length of the background's [px].
-    step_px, background_px = 0.5, 2.0
+    step_px, background_px = 0.5, 2.0  # between samples along a ray, and length of the background's [px]
     inner = np.linspace(0.0, 1.0, 6)  # places on the ball that show its colour
     # Difference of any channel between the limb and a little inside, apart from brightness (1-sigma, grey levels).
     # A ray shows the edge if ball and background differ by so many of these sigmas.
@@ -39,8 +38,7 @@ class OutlineSettings:
     floor_px = 0.001  # systematic error that averaging does not reduce
     # A larger disagreement between coverage and limb, in sigmas, is added to the covariance.
     largest_contradiction = 4.0
-    # Rays that suffice for the ball's colour, and to find the circle that most of them agree on.
-    enough_rays = 60
+    enough_rays = 60  # rays that suffice for the ball's colour, and to find the circle that most of them agree on
 
 
 class LimbSettings:
@@ -74,8 +72,7 @@ class LimbSettings:
     # the ball's rays, is no noise, and makes a ray's variance larger by that power of it; what its median is of noise.
     least_disagreement, usual_disagreement, disagreement_power, of_noise = 2.0, 1.5, 3, 3.0
     largest_widening = 1.5  # factor of the blur from one iteration to the next
-    # Most iterations; converged when the limb and its blur changed by less than this [px].
-    looks, settled_px = 4, 0.06
+    looks, settled_px = 4, 0.06  # most iterations; converged when the limb and its blur changed by less than this [px]
     # An edge sharper than this after interpolation [px] was not anti-aliased: coverage is then the better measure.
     aliased_px = 0.55
     # Student's degrees of freedom of an edge's error, which set the weight of outliers; residual limit [px]; rounds.
@@ -108,8 +105,7 @@ class PatchSettings:
     """
 
     least_fill = 0.45  # a patch that fills a smaller share of its enclosing circle is not a ball
-    # Below this share a patch may be the ball joined with a background of similar hue.
-    whole_disc_fill = 0.8
+    whole_disc_fill = 0.8  # below this share a patch may be the ball joined with a background of similar hue
     strong_shares = (0.5, 0.7)  # of the strongest colour, that separate the ball from its background
     # Part of a ball or a brick has an edge on some sides only; on the others its surroundings are as colourful.
     most_uneven = 0.3
@@ -132,10 +128,8 @@ class ColourSettings:
     room = 0.6  # lower limits of saturation and brightness, relative to the ball's own
     # Radius around a click for the first colour [px]; the ball is the connected region of nearly that colour.
     seed_px, hues_of_a_click_deg = 3, 25.0
-    # Pixels nearer to grey or black than this have no usable hue (parts of 255).
-    least_saturation, least_value = 64, 40
-    # Quantile of the ball's hues cut off on either side, and margin for other light [°].
-    share, margin_deg = 0.02, 8.0
+    least_saturation, least_value = 64, 40  # pixels nearer to grey or black than this have no usable hue (parts of 255)
+    share, margin_deg = 0.02, 8.0  # quantile of the ball's hues cut off on either side, and margin for other light [°]
     # Lowest saturation and brightness of the ball in other light, relative to those seen here.
     dimmer_saturation, dimmer_value = 0.6, 0.35
     # Change that marks a moving pixel [grey levels], and the fewest moving pixels of a ball.
@@ -157,8 +151,7 @@ class TrackSettings:
     least_shown = 0.6  # how much of a thing's place has to show its colour
     # Relative 1-sigma of a ball's radius measured by hand, and of the size from one place to another after calibration.
     radius_sigma, place_tolerance = 0.03, 0.004
-    # Number of fixes whose size is remembered; a size error of fewer sigmas is ignored.
-    memory, free_sigmas = 31, 1.5
+    memory, free_sigmas = 31, 1.5  # number of fixes whose size is remembered; a size error of fewer sigmas is ignored
     # After this many fixes a size that differs by more sigmas, and by more than this share, is another object.
     fewest, most_sigmas, most_off = 5, 4.0, 0.06
     # Distances that follow from the ball's size, each better than the last by a factor of its squared size in the
