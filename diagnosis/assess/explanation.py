@@ -19,7 +19,10 @@ from bodyschema.interfaces.records import FloatArray
 
 
 class _Settings:
-    """Settings of the explanation."""
+    """Settings of the explanation.
+
+    Sensitivity: each at 0.3 and 3 times changes nothing in three recordings with hidden errors, all of which are named.
+    """
 
     margin = 8.0  # unnamed causes are accepted if they are more probable than named ones alone by this [nats]
     most_unknowns = 3

