@@ -24,7 +24,7 @@ class _Settings:
     """Settings of rivals.
 
     Sensitivity, each at 0.3 and 3 times over three recordings with hidden errors: `comes_near` changes who is a rival,
-    and with it probabilities; `poses` a word of advice. The others change nothing.
+    and with it probabilities; `bagged` a probability by up to 0.03; `poses` a word of advice. The rest changes none.
     """
 
     same_share = 1e-3  # predictions are the same if their expected Δχ² is smaller
