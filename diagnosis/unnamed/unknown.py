@@ -15,7 +15,8 @@ import numpy as np
 from scipy.special import chdtri
 
 from bodyschema.diagnosis.fit.background import rows_in_part
-from bodyschema.diagnosis.fit.fit import Fit, Noise, solved
+from bodyschema.diagnosis.fit.fit import Fit, solved
+from bodyschema.diagnosis.fit.noise import Noise
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.fit.worth import nats
 from bodyschema.diagnosis.search.held_out import FEWEST_ROWS_A_BLOCK, Blocks, held_out_square, scores_p_value

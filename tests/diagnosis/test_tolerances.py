@@ -105,7 +105,7 @@ def test_an_interval_allows_for_other_sizes_of_the_tolerances(robot: RobotDescri
     fit = start.with_causes([offset]).tolerating(Scales(0.5, 0.5, 0.5))
     (place,) = fit.places(fit.causes[0])
     integrated = fit.covariance[place, place]
-    monkeypatch.setattr("bodyschema.diagnosis.fit.fit._NODES", np.zeros(1))
+    monkeypatch.setattr("bodyschema.diagnosis.fit.fit._Settings.nodes", np.zeros(1))
     assert integrated > 1.2 * replace(fit).covariance[place, place]
 
 

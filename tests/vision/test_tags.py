@@ -195,7 +195,7 @@ def test_a_covered_pattern_leaves_bleeding_unknown() -> None:
 def test_the_least_error_of_an_edge_is_not_added_to_noise(monkeypatch) -> None:
     answers = []
     for least_px in (0.0, 0.0007):
-        monkeypatch.setattr("bodyschema.vision.tags.edge._FLOOR_PX", least_px)
+        monkeypatch.setattr("bodyschema.vision.tags.edge._Settings.floor_px", least_px)
         answers.append(measured(sheet()))
     first, then = answers
     assert isinstance(first, TagImage)
