@@ -27,8 +27,8 @@ class _Settings:
     """Settings of the fit.
 
     Sensitivity, each at 0.3 and 3 times over seven recordings with hidden errors: `rounds`, `enough`, `not_tried` and
-    `left_over` end fits earlier or later, which changes figures of rejected causes by up to 90 % and texts of up to
-    three reports; `slack` and `little` change probabilities of rivals by up to 9 %. The others change 2 % at most.
+    `left_over` end fits earlier or later, which changes texts of up to three reports, and a figure by 90 % at most, of
+    a rejected cause; `slack` and `little` change one by 9 % at most, a rival's probability. The others: 2 % at most.
     """
 
     # Maximum of steps, and the rise of the likelihood below which the fit has converged [nats].
