@@ -25,8 +25,8 @@ from .unknown import Apart
 class _Settings:
     """Settings of the smooth model.
 
-    Sensitivity, each at 0.3 and 3 times in a recording with a smooth unnamed error: one round, or `worse` below 1, which
-    ends them, changes the gain by 0.4 % and figures of rejected causes; `wide` and more rounds 1 % at most.
+    Sensitivity, each at 0.3 and 3 times in a recording with a smooth unnamed error: one round, or `worse` below 1,
+    changes the gain by 0.4 % and figures of rejected causes; `wide` and more rounds 1 % at most.
     """
 
     # Prior sizes of a function's displacement, in units of the noise; held-out rows choose among them.

@@ -33,9 +33,9 @@ SPECIFIC = 5.0
 class _Settings:
     """Settings of unnamed families.
 
-    Sensitivity, each at 0.3 and 3 times over three recordings, one with a smooth unnamed error: with `number` at 3 times
-    and `no_worse` below 1 wrong causes are named in its place; `no_name` at 0.3 times and a single nearest family change
-    what is rejected. The others change figures by 2 % at most; other `ranks` were not measured.
+    Sensitivity, each at 0.3 and 3 times over three recordings, one with a smooth unnamed error: `number` at 3 times
+    and `no_worse` below 1 name wrong causes instead; `no_name` at 0.3 times and a single nearest family change what is
+    rejected. The others change figures by 2 % at most; other `ranks` were not measured.
     """
 
     no_name, number = 8.0, 2.0  # prior penalty of a family that is less specific, and cost of one parameter [nats]
