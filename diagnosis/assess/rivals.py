@@ -9,6 +9,7 @@ import numpy as np
 
 from bodyschema.diagnosis.fit.fit import Fit, amount_columns, solved
 from bodyschema.diagnosis.fit.scatter import beyond_single_rows, limited_rows, remembers
+from bodyschema.diagnosis.fit.tangent import TOLD_APART
 from bodyschema.diagnosis.fit.worth import SAME
 from bodyschema.diagnosis.search.held_out import Blocks, beside_fit
 from bodyschema.diagnosis.search.scan import Candidate
@@ -28,7 +29,6 @@ class _Settings:
     """
 
     same_share = 1e-3  # predictions are the same if their expected Δχ² is smaller
-    told = 1e-7  # share of a column's squares below which it is not told from the fit's own parameters
     bagged = 400  # number of resamplings for probabilities; 0.3 to 3 times this changes them by less than 0.03
     comes_near = 0.7  # smallest share of a cause's gain that a rival must explain
     hopeless = 40.0  # a rival less probable by this is not fitted to convergence [nats]
@@ -170,7 +170,7 @@ def is_like_sag(without: Fit, cause: Effect, least: float) -> bool:
     left = without.evident.ravel()
     toward, squares = beside.T @ left, np.square(beside).sum(axis=0)
     # The share of a column that the fit's own parameters leave may be rounding alone.
-    told = (toward > 0.0) & (squares > _Settings.told * np.square(columns).sum(axis=(0, 1)))
+    told = (toward > 0.0) & (squares > TOLD_APART * np.square(columns).sum(axis=(0, 1)))
     explained = np.square(toward[told]) / squares[told]
     rows = 3.0 * float(without.noise.weights.sum())
     share = float(explained.max(initial=0.0)) / max(float(left @ left), 1e-300)

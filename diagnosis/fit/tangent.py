@@ -16,6 +16,8 @@ from .background import Background
 
 # Columns of unit length with a smaller part beside the others are collinear, for a Cholesky factor [squared length].
 _COLLINEAR = 1e-11
+# A column that keeps a smaller share of its squares beside the others is not identifiable: it is of their rounding.
+TOLD_APART = 1e-7
 
 dpotrf, dpotrs = get_lapack_funcs(("potrf", "potrs"), dtype=np.float64)
 

@@ -16,6 +16,7 @@ from scipy.special import chdtri
 
 from bodyschema.diagnosis.fit.fit import LARGEST, Fit
 from bodyschema.diagnosis.fit.products import Products, System
+from bodyschema.diagnosis.fit.tangent import TOLD_APART
 from bodyschema.diagnosis.fit.worth import choices, nats, ways_to_choose
 from bodyschema.effects import Effect, Identity
 from bodyschema.effects.motion import flanks
@@ -38,7 +39,6 @@ class _Settings:
     most_moments = 1000  # number of moments tried first, before all those next to the best
     beside = 8  # minimum of rows on either side of a moment
     bent = 0.1  # share of the noise by which an effect has to differ from its first order to be evaluated beyond it
-    told_apart = 1e-7  # a column with a smaller share left beside the fit is not identifiable
 
 
 # Index of the best choice, gains (m,), its amounts (k,) and degrees of freedom.
@@ -376,7 +376,7 @@ class Scan:
         unit = _units(effect)
         shares = _eigenvalues(inner / np.sqrt(np.maximum(raw[:, :, None] * raw[:, None, :], 1e-300)))
         told = _eigenvalues(inner * unit[:, None] * unit) > 10.0 * self._fit.noise.sigma**2
-        return ((shares > _Settings.told_apart) & told).sum(axis=1)
+        return ((shares > TOLD_APART) & told).sum(axis=1)
 
 
 @cache

@@ -28,7 +28,9 @@ def _link(untold_m: float) -> Cause:
 
 
 def test_a_link_that_only_turns_is_off_by_an_angle_alone():
-    assert finding("link_geometry", "elbow", None, TURN) == "the link before joint elbow is off by 0.57°, mainly about y"
+    assert (
+        finding("link_geometry", "elbow", None, TURN) == "the link before joint elbow is off by 0.57°, mainly about y"
+    )
 
 
 def test_a_link_that_is_off_in_some_directions_has_them_named():

@@ -120,7 +120,8 @@ class PatchSettings:
 class ColourSettings:
     """Settings of the ball's colour: how it is learnt from images, and followed.
 
-    No outcome depends on how it is followed. What is learnt from images is a range, which people see and can change.
+    `followed`, `farthest` and `room` change no outcome. The others, with which it is learnt, were not measured: what is
+    learnt is a range, which people see and can change.
     """
 
     # Share of the way to the ball's present colour that the band moves at a fix; limit of its shift (half-widths).

@@ -10,9 +10,7 @@ from scipy.spatial.distance import pdist
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.vision.board import Board
 from bodyschema.vision.rig.rectified import Rectification
-from bodyschema.vision.rig.spread import covariance_of
-from bodyschema.vision.rig.stereo_rig import CalibrationError, StereoRig
-from bodyschema.vision.rig.triangulated import triangulated
+from bodyschema.vision.rig.stereo_rig import CalibrationError, StereoRig, covariance_of, triangulated
 
 from .view import View
 
