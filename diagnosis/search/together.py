@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -527,16 +527,20 @@ def together(start: Fit, hypotheses: Sequence[Effect], tell: Callable[[str], Non
     """
     known = [_Place(start.tolerating(Scales()), hypotheses, ())]
     while len(known) < _MOST_REFITTED:
-        looked_at = {place.name for place in known}
+        looked_at = Counter(place.name for place in known)
+        best = max(known, key=lambda place: place.here.worth)
+        # A set that was fitted far from its own parameters is fitted once more, from where it seems better than all.
         proposals = [
-            (one.worth, place, one) for place in known for one in place.reached if place.name_of(one) not in looked_at
+            (one.worth, place, one)
+            for place in known
+            for one in place.reached
+            if not (times := looked_at[place.name_of(one)]) or (times == 1 and one.worth > best.here.worth + _STILL)
         ]
         worth, place, one = max(proposals, key=lambda proposal: proposal[0], default=(-np.inf, known[0], known[0].here))
-        best = max(known, key=lambda place: place.here.worth)
         if worth < best.here.worth - _COMES_NEAR:
             place, one = best, best.with_all_zeros
             if best.here.scales.angles <= 1.0 or place.name_of(one) in looked_at:
-                fewer = best.with_one_less(looked_at)
+                fewer = best.with_one_less()
                 if fewer is None:
                     break
                 known.append(_Place(fewer, hypotheses, known))
@@ -632,22 +636,19 @@ class _Place:
         zeros = [k for k, effect in enumerate(self._sets.effects) if effect.kind.is_zero]
         return self._sets.possible(self._sets.of(tuple(dict.fromkeys((*self.here.chosen, *zeros)))))
 
-    def with_one_less(self, known: Collection[frozenset[Key]]) -> Fit | None:
-        """Refit without one link or joint offset, where that is more probable; None where all are needed.
+    def with_one_less(self) -> Fit | None:
+        """Refit without the rigid cause that is needed least, where that is more probable; None where all are needed.
 
-        Without it tolerances may be larger, at angles where what is linear about this fit is so no more.
-
-        Args:
-            known: names of sets that are not tried.
+        Without it tolerances may be larger, at angles where what is linear about this fit is so no more. The set may
+        have been fitted before, about other parameters.
         """
+        fewer = []
         for cause in self.fit.causes:
-            one = self._sets.of(self._sets.again([other for other in self.fit.causes if other is not cause]), self.here)
-            if not cause.kind.rigid or self.name_of(one) in known:
-                continue
-            fit = self.refitted(one)
-            if _worth(fit, self._doubt) > self.here.worth + _STILL:
-                return fit
-        return None
+            if cause.kind.rigid:
+                others = self._sets.again([other for other in self.fit.causes if other is not cause])
+                fewer.append(self.refitted(self._sets.of(others, self.here)))
+        best = max(fewer, key=self._worth, default=None)
+        return best if best is not None and self._worth(best) > self.here.worth + _STILL else None
 
     def numbers_of(self, one: Together) -> list[Effect]:
         """Return the causes of a set, those of which some numbers may be free once for each."""
@@ -662,20 +663,24 @@ class _Place:
         start = self.fit.starting(self._sets.causes(one))
         fits = [start.tolerating(one.scales).tolerating(one.scales)]
         if max(one.scales.lengths, one.scales.angles) > 1.0:
-            least = one.scales.no_larger
-            fits.append(start.tolerating_anew(least).tolerating(least))
-        return max(fits, key=lambda fit: _worth(fit, self._doubt))
+            near = start.tolerating_anew(one.scales.no_larger)
+            fits.append(near.tolerating(_own(near, self._doubt).scales))
+        return max(fits, key=self._worth)
+
+    def _worth(self, fit: Fit) -> float:
+        """Return the evidence of a fit's own causes less the cost of naming them [nats]."""
+        return _own(fit, self._doubt).worth
 
 
-def _worth(fit: Fit, doubt: float) -> float:
-    """Return the evidence of a fit's own causes less the cost of naming them [nats].
+def _own(fit: Fit, doubt: float) -> Together:
+    """Return the set of a fit's own causes.
 
     Args:
         doubt: minimum cost of naming one of them [nats].
     """
     parts = [part for cause in fit.causes for part in _in_parts(Candidate(cause, 0.0, 1))]
     sets = Sets(fit, parts, doubt)
-    return sets.of(sets.again(fit.causes)).worth
+    return sets.of(sets.again(fit.causes))
 
 
 def _beside_links(fit: Fit, absent: Sequence[Effect]) -> list[Candidate]:
