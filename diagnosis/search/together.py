@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import get_blas_funcs, get_lapack_funcs
 
-from bodyschema.diagnosis.fit.background import MOST, SPREAD, Scales
+from bodyschema.diagnosis.fit.background import MOST, SMALLEST, SPREAD, Scales
 from bodyschema.diagnosis.fit.fit import Fit, solved
 from bodyschema.diagnosis.fit.worth import ANOTHER, NAMED, ways_to_choose
 from bodyschema.effects import Effect, EffectType, Identity
@@ -33,8 +33,8 @@ from .search import Key
 _ROUNDS, _ROUNDS_NEAR, _STILL = 25, 8, 0.02
 # Limit of a step in the logarithms.
 _FARTHEST = 1.0
-# Lower limits of the scales, and of the noise as a share of that of the fit.
-_SMALLEST, _QUIETEST = 1e-3, 1e-3
+# Lower limit of the noise as a share of that of the fit.
+_QUIETEST = 1e-3
 # Number of the most promising moves that are tried with their own scales.
 _TRIED = 4
 # With all scales below this, also try an arm exactly as described, such as a simulated one.
@@ -55,7 +55,7 @@ _MOST_REFITTED, _COMES_NEAR = 8, 15.0
 # Tolerances may stand for a cause of which they leave less than this share of the squares; a third is left of a jump.
 _FOLLOWED = 0.1
 
-_LOG_SMALLEST, _LOG_MOST, _SCALES = math.log(_SMALLEST), math.log(MOST), len(Scales())
+_LOG_SMALLEST, _LOG_MOST, _SCALES = math.log(SMALLEST), math.log(MOST), len(Scales())
 
 dpotrf, dpotri, dpotrs = get_lapack_funcs(("potrf", "potri", "potrs"), dtype=np.float64)
 (dtrsm,) = get_blas_funcs(("trsm",), dtype=np.float64)
@@ -384,7 +384,7 @@ class Sets:
         if math.exp(logs[members.any(axis=1)].max()) < _MAY_BE_EXACT:
             exact = self._solved(inner, toward, group, np.full(_SCALES, _LOG_SMALLEST), sigma)
             if (evidence := self._evidence(exact, toward, sigma)) > worth:
-                worth, solution, scales = evidence, exact, Scales(*[_SMALLEST] * _SCALES)
+                worth, solution, scales = evidence, exact, Scales(*[SMALLEST] * _SCALES)
         worth += self._outliers - self._cost(chosen)
         factor, _, amounts = solution
         return Together(chosen, worth, scales, sigma, spent, amounts, factor, columns)
