@@ -295,7 +295,8 @@ class Sets:
     @cached_property
     def _of_numbers(self) -> dict[Key, FloatArray]:
         """Cost of each choice of the numbers of each cause that may have only some of them [nats]."""
-        return {effect.key: np.log(ways_to_choose(effect)) for effect in self.effects if effect.kind.in_parts}
+        in_parts = {effect.key: effect for effect in self.effects if effect.kind.in_parts}
+        return {key: np.log(ways_to_choose(effect)) for key, effect in in_parts.items()}
 
     def _promising(self, here: Together, least: float) -> list[tuple[int, ...]]:
         """Return the groups of candidates that may reach the worth `least`, the best first.
