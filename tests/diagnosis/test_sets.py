@@ -16,7 +16,7 @@ from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.fit.worth import ways_to_choose
 from bodyschema.diagnosis.search.hypotheses import Hypotheses
 from bodyschema.diagnosis.search.scan import Candidate
-from bodyschema.diagnosis.search.together import Sets, _Place, together
+from bodyschema.diagnosis.search.together import Sets, _Place, together, tolerated
 from bodyschema.effects import Effect, Simulation
 from bodyschema.robot.description import RobotDescription
 
@@ -109,15 +109,24 @@ def test_a_roughly_made_arm_has_no_cause(seed, angle) -> None:
     assert together(start, hypotheses).causes == ()
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_refitted_set_has_the_tolerances_that_it_shows(seed) -> None:
+    place = _Place(rough(desk_arm(), seed, 8e-3).tolerating(Scales()), [], ())
+    fit = place.refitted(place.here)
+    scales = fit.background.scales
+    assert scales is not None
+    assert scales.angles == pytest.approx(tolerated(fit).scales.angles, rel=0.3)
+
+
 def test_of_several_causes_the_one_needed_least_is_left_out(monkeypatch) -> None:
     robot = desk_arm()
     offsets = [Effect.at(robot, "joint_offset", joint, values=[0.02]) for joint in (ELBOW, WRIST)]
     place = _Place(rough(robot, 0, 1e-3, *offsets).tolerating(Scales()).with_causes(offsets), offsets, ())
-    gains = {ELBOW: 1.0, WRIST: 5.0}
+    gains = {ELBOW: 5.0, WRIST: 1.0}
     monkeypatch.setattr(_Place, "_worth", lambda self, fit: self.here.worth + gains[fit.causes[0].where])
     fewer = place.with_one_less()
     assert fewer is not None
-    assert [cause.where for cause in fewer.causes] == [WRIST]
+    assert [cause.where for cause in fewer.causes] == [ELBOW]
 
 
 @pytest.fixture(scope="module")
