@@ -28,8 +28,8 @@ _LIKE_OTHERS = 3.0
 _COUNTS_IN_FULL = 1e-9
 # Prior standard deviation of the logarithms of the scales.
 SPREAD = 2.0
-# Largest scale.
-MOST = 10.0
+# Smallest and largest scale. With all at the smallest, the arm is exactly as described, such as a simulated one.
+SMALLEST, MOST = 1e-3, 10.0
 
 
 class Scales(NamedTuple):
@@ -47,7 +47,9 @@ class Scales(NamedTuple):
 
     @property
     def doubt(self) -> float:
-        """Penalty of these scales under their prior, relative to a scale of 1 [nats]."""
+        """Penalty of these scales under their prior, relative to a scale of 1; 0 for an exact arm [nats]."""
+        if max(self) <= SMALLEST:
+            return 0.0
         return float(0.5 * np.square(np.log(self) / SPREAD).sum())
 
 

@@ -18,6 +18,8 @@ from .background import Background
 _COLLINEAR = 1e-11
 # A column that keeps a smaller share of its squares beside the others is not identifiable: it is of their rounding.
 TOLD_APART = 1e-7
+# Relative size below which an eigenvalue of normal equations is rounding.
+_SINGULAR = 1e-12
 
 dpotrf, dpotrs = get_lapack_funcs(("potrf", "potrs"), dtype=np.float64)
 
@@ -102,4 +104,8 @@ def solved(normal: FloatArray, gradient: FloatArray) -> FloatArray:
     factor, failed = dpotrf(scaled, lower=True)
     if not failed and np.square(np.diag(factor)).min(initial=1.0) > _COLLINEAR:
         return (dpotrs(factor, wanted, lower=True)[0].T / scales).T
-    return (np.linalg.lstsq(scaled, wanted, rcond=1e-12)[0].T / scales).T
+    # The singular value decomposition of such a matrix need not converge.
+    values, vectors = np.linalg.eigh(scaled)
+    there = np.abs(values) > _SINGULAR * np.abs(values).max()
+    inverse = vectors[:, there] / values[there]
+    return ((inverse @ (vectors[:, there].T @ wanted)).T / scales).T

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import get_blas_funcs, get_lapack_funcs
 
-from bodyschema.diagnosis.fit.background import MOST, SPREAD, Scales
+from bodyschema.diagnosis.fit.background import MOST, SMALLEST, SPREAD, Scales
 from bodyschema.diagnosis.fit.fit import Fit, solved
 from bodyschema.diagnosis.fit.worth import ANOTHER, NAMED, ways_to_choose
 from bodyschema.effects import Effect, EffectType, Identity
@@ -34,8 +34,8 @@ from .search import Key
 _ROUNDS, _ROUNDS_NEAR, _STILL = 25, 8, 0.02
 # Limit of a step in the logarithms.
 _FARTHEST = 1.0
-# Lower limits of the scales, and of the noise as a share of that of the fit.
-_SMALLEST, _QUIETEST = 1e-3, 1e-3
+# Lower limit of the noise as a share of that of the fit.
+_QUIETEST = 1e-3
 # Number of the most promising moves that are tried with their own scales.
 _TRIED = 4
 # With all scales below this, also try an arm exactly as described, such as a simulated one.
@@ -56,7 +56,7 @@ _MOST_REFITTED, _COMES_NEAR = 8, 15.0
 # Tolerances may stand for a cause of which they leave less than this share of the squares; a third is left of a jump.
 _FOLLOWED = 0.1
 
-_LOG_SMALLEST, _LOG_MOST, _SCALES = math.log(_SMALLEST), math.log(MOST), len(Scales())
+_LOG_SMALLEST, _LOG_MOST, _SCALES = math.log(SMALLEST), math.log(MOST), len(Scales())
 
 dpotrf, dpotri, dpotrs = get_lapack_funcs(("potrf", "potri", "potrs"), dtype=np.float64)
 (dtrsm,) = get_blas_funcs(("trsm",), dtype=np.float64)
@@ -296,7 +296,8 @@ class Sets:
     @cached_property
     def _of_numbers(self) -> dict[Key, FloatArray]:
         """Cost of each choice of the numbers of each cause that may have only some of them [nats]."""
-        return {effect.key: np.log(ways_to_choose(effect)) for effect in self.effects if effect.kind.in_parts}
+        in_parts = {effect.key: effect for effect in self.effects if effect.kind.in_parts}
+        return {key: np.log(ways_to_choose(effect)) for key, effect in in_parts.items()}
 
     def _promising(self, here: Together, least: float) -> list[tuple[int, ...]]:
         """Return the groups of candidates that may reach the worth `least`, the best first.
@@ -385,7 +386,7 @@ class Sets:
         if math.exp(logs[members.any(axis=1)].max()) < _MAY_BE_EXACT:
             exact = self._solved(inner, toward, group, np.full(_SCALES, _LOG_SMALLEST), sigma)
             if (evidence := self._evidence(exact, toward, sigma)) > worth:
-                worth, solution, scales = evidence, exact, Scales(*[_SMALLEST] * _SCALES)
+                worth, solution, scales = evidence, exact, Scales(*[SMALLEST] * _SCALES)
         worth += self._outliers - self._cost(chosen)
         factor, _, amounts = solution
         return Together(chosen, worth, scales, sigma, spent, amounts, factor, columns)
@@ -528,16 +529,20 @@ def together(start: Fit, hypotheses: Sequence[Effect], tell: Callable[[str], Non
     """
     known = [_Place(start.tolerating(Scales()), hypotheses, ())]
     while len(known) < _MOST_REFITTED:
-        looked_at = {place.name for place in known}
+        looked_at = Counter(place.name for place in known)
+        best = max(known, key=lambda place: place.here.worth)
+        # A set that was fitted far from its own parameters is fitted once more, from where it seems better than all.
         proposals = [
-            (one.worth, place, one) for place in known for one in place.reached if place.name_of(one) not in looked_at
+            (one.worth, place, one)
+            for place in known
+            for one in place.reached
+            if not (times := looked_at[place.name_of(one)]) or (times == 1 and one.worth > best.here.worth + _STILL)
         ]
         worth, place, one = max(proposals, key=lambda proposal: proposal[0], default=(-np.inf, known[0], known[0].here))
-        best = max(known, key=lambda place: place.here.worth)
         if worth < best.here.worth - _COMES_NEAR:
             place, one = best, best.with_all_zeros
             if best.here.scales.angles <= 1.0 or place.name_of(one) in looked_at:
-                fewer = best.with_one_less(looked_at)
+                fewer = best.with_one_less()
                 if fewer is None:
                     break
                 known.append(_Place(fewer, hypotheses, known))
@@ -634,22 +639,19 @@ class _Place:
         zeros = [k for k, effect in enumerate(self._sets.effects) if effect.kind.is_zero]
         return self._sets.possible(self._sets.of(tuple(dict.fromkeys((*self.here.chosen, *zeros)))))
 
-    def with_one_less(self, known: Collection[frozenset[Key]]) -> Fit | None:
-        """Refit without one link or joint offset, where that is more probable; None where all are needed.
+    def with_one_less(self) -> Fit | None:
+        """Refit without the rigid cause that is needed least, where that is more probable; None where all are needed.
 
-        Without it tolerances may be larger, at angles where what is linear about this fit is so no more.
-
-        Args:
-            known: names of sets that are not tried.
+        Without it tolerances may be larger, at angles where what is linear about this fit is so no more. The set may
+        have been fitted before, about other parameters.
         """
+        fewer = []
         for cause in self.fit.causes:
-            one = self._sets.of(self._sets.again([other for other in self.fit.causes if other is not cause]), self.here)
-            if not cause.kind.rigid or self.name_of(one) in known:
-                continue
-            fit = self.refitted(one)
-            if _worth(fit, self._doubt) > self.here.worth + _STILL:
-                return fit
-        return None
+            if cause.kind.rigid:
+                others = self._sets.again([other for other in self.fit.causes if other is not cause])
+                fewer.append(self.refitted(self._sets.of(others, self.here)))
+        best = max(fewer, key=self._worth, default=None)
+        return best if best is not None and self._worth(best) > self.here.worth + _STILL else None
 
     def numbers_of(self, one: Together) -> list[Effect]:
         """Return the causes of a set, those of which some numbers may be free once for each."""
@@ -664,20 +666,24 @@ class _Place:
         start = self.fit.starting(self._sets.causes(one))
         fits = [start.tolerating(one.scales).tolerating(one.scales)]
         if max(one.scales.lengths, one.scales.angles) > 1.0:
-            least = one.scales.no_larger
-            fits.append(start.tolerating_anew(least).tolerating(least))
-        return max(fits, key=lambda fit: _worth(fit, self._doubt))
+            near = start.tolerating_anew(one.scales.no_larger)
+            fits.append(near.tolerating(_own(near, self._doubt).scales))
+        return max(fits, key=self._worth)
+
+    def _worth(self, fit: Fit) -> float:
+        """Return the evidence of a fit's own causes less the cost of naming them [nats]."""
+        return _own(fit, self._doubt).worth
 
 
-def _worth(fit: Fit, doubt: float) -> float:
-    """Return the evidence of a fit's own causes less the cost of naming them [nats].
+def _own(fit: Fit, doubt: float) -> Together:
+    """Return the set of a fit's own causes.
 
     Args:
         doubt: minimum cost of naming one of them [nats].
     """
     parts = [part for cause in fit.causes for part in _in_parts(Candidate(cause, 0.0, 1))]
     sets = Sets(fit, parts, doubt)
-    return sets.of(sets.again(fit.causes)).worth
+    return sets.of(sets.again(fit.causes))
 
 
 def _beside_links(fit: Fit, absent: Sequence[Effect]) -> list[Candidate]:

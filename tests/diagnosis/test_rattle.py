@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from planted_cases import SIGMA_M, measured, scattered, surveyed_arm, walk
+from planted_cases import SIGMA_M, measured, scattered, seen, surveyed_arm, walk
 
 from bodyschema.diagnosis import diagnosis
 from bodyschema.diagnosis.diagnosis import diagnose
@@ -81,6 +81,14 @@ def test_a_marker_seldom_on_its_other_side_is_loose(seed) -> None:
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_marker_that_slips_once_is_not_loose(seed) -> None:
     found = beside_tolerances(seed, changes=(200,))
+    assert (found.verdict, [cause.effect for cause in found.causes]) == ("explained", ["tool_slip"])
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_marker_that_slips_once_between_poses_of_an_exact_arm_is_not_loose(seed) -> None:
+    robot, motion = surveyed_arm(), scattered(surveyed_arm(), seed)
+    slip = Effect.at(robot, "tool_slip", values={"x_m": 0.0, "y_m": 0.0024, "z_m": -0.0015, "t0": 44.9})
+    found = conclusion(diagnose(seen(robot, motion, (slip,), seed), Simulation(robot)))
     assert (found.verdict, [cause.effect for cause in found.causes]) == ("explained", ["tool_slip"])
 
 

@@ -8,8 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from planted_cases import BASE, ELBOW, INTERVAL_S, SHOULDER, WRIST, at_rest, desk_arm, start_of, surveyed_arm, walk
 
+from bodyschema.diagnosis.assess.rivals import standings
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.worth import NAMED, nats, rise_for
+from bodyschema.diagnosis.search.held_out import Blocks
 from bodyschema.diagnosis.search.scan import Candidate, Scan
 from bodyschema.diagnosis.search.search import Search, contains, simplicity
 from bodyschema.diagnosis.search.together import together
@@ -132,11 +134,29 @@ def test_a_jump_of_the_last_joint_is_named_rather_than_a_slip_of_three_numbers(r
     assert beside.cost_of(beside.candidates[0]) < -6.0
 
 
+def test_a_jump_is_more_probable_than_a_slip_of_three_numbers(robot) -> None:
+    motion = walk(robot, 6)
+    t0 = float(motion.clock[150])
+    jump = Effect.at(robot, "encoder_jump", WRIST, values={"jump_rad": 0.15, "t0": t0})
+    slip = Effect.at(robot, "tool_slip", None, values={"t0": t0})
+    search = Search([jump, slip], lambda _: None)
+    fit = start_of(robot, motion, (jump,), 6).with_causes([slip])
+    (standing,) = standings(fit, search, Blocks.cut(len(motion)), 0)
+    assert standing.rivals[0].probability > 0.99
+
+
 def test_names_are_charged_as_a_set_and_not_as_an_order(robot) -> None:
     offset, scale = (Effect.at(robot, name, ELBOW) for name in ("joint_offset", "joint_scale"))
     search = Search([offset] * 100, lambda _: None)
     alone, beside = search.doubt(Candidate(scale, 10.0, 1)), search.doubt(Candidate(scale, 10.0, 1), [offset])
     assert alone + beside == pytest.approx(np.log(100 * 100 / 2))
+
+
+def test_all_joint_offsets_have_one_name(robot) -> None:
+    offsets = [Effect.at(robot, "joint_offset", joint) for joint in (ELBOW, SHOULDER)]
+    scale = Candidate(Effect.at(robot, "joint_scale", ELBOW), 10.0, 1)
+    search = Search([scale.effect] * 100, lambda _: None)
+    assert search.doubt(scale, offsets) == search.doubt(scale, offsets[:1])
 
 
 def test_a_link_gives_way_to_the_offsets_that_it_contains(robot) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,12 +14,14 @@ from bodyschema.diagnosis.fit.background import Scales
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.fit.worth import ways_to_choose
+from bodyschema.diagnosis.search.hypotheses import Hypotheses
 from bodyschema.diagnosis.search.scan import Candidate
-from bodyschema.diagnosis.search.together import Sets, _Place, _worth
+from bodyschema.diagnosis.search.together import Sets, _Place, together, tolerated
 from bodyschema.effects import Effect, Simulation
 from bodyschema.robot.description import RobotDescription
 
 NOISE_M, ROWS = 3e-4, 60
+NAMES = ("joint_offset", "joint_scale")
 
 
 def fit_of(robot: RobotDescription, hidden: Effect, away_m: Sequence[float] = (0.0, 0.0, 0.0)) -> Fit:
@@ -81,7 +84,7 @@ def test_a_set_is_fitted_as_well_from_tolerances_that_were_far_too_large(seed) -
     afar = _Place(start.tolerating(Scales(10.0, 10.0, 10.0)), hypotheses, ())
     near = start.with_causes(offsets).tolerating(Scales()).tolerating(Scales())
     again = afar.refitted(afar._sets.of(afar._sets.again(offsets)))
-    assert _worth(again, 2.0) == pytest.approx(_worth(near, 2.0), abs=3.0)
+    assert afar._worth(again) == pytest.approx(afar._worth(near), abs=3.0)
 
 
 @pytest.mark.parametrize(("bent", "stays"), [(0.0, False), (0.1, True)])
@@ -95,7 +98,64 @@ def test_a_link_leaves_a_roughly_made_arm_unless_it_is_bent_far_more(seed, bent,
     )
     place = _Place(fit.tolerating(Scales()), hypotheses, ())
     place = _Place(place.refitted(place.here), hypotheses, ())
-    assert (place.with_one_less([]) is None) is stays
+    assert (place.with_one_less() is None) is stays
+
+
+@pytest.mark.parametrize("angle", [5e-3, 8e-3])
+@pytest.mark.parametrize("seed", range(6))
+def test_a_roughly_made_arm_has_no_cause(seed, angle) -> None:
+    start = rough(desk_arm(), seed, angle)
+    hypotheses = Hypotheses.of(start.simulation, start.observations).effects
+    assert together(start, hypotheses).causes == ()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_refitted_set_has_the_tolerances_that_it_shows(seed) -> None:
+    place = _Place(rough(desk_arm(), seed, 8e-3).tolerating(Scales()), [], ())
+    fit = place.refitted(place.here)
+    scales = fit.background.scales
+    assert scales is not None
+    assert scales.angles == pytest.approx(tolerated(fit).scales.angles, rel=0.3)
+
+
+def test_of_several_causes_the_one_needed_least_is_left_out(monkeypatch) -> None:
+    robot = desk_arm()
+    offsets = [Effect.at(robot, "joint_offset", joint, values=[0.02]) for joint in (ELBOW, WRIST)]
+    place = _Place(rough(robot, 0, 1e-3, *offsets).tolerating(Scales()).with_causes(offsets), offsets, ())
+    gains = {ELBOW: 5.0, WRIST: 1.0}
+    monkeypatch.setattr(_Place, "_worth", lambda self, fit: self.here.worth + gains[fit.causes[0].where])
+    fewer = place.with_one_less()
+    assert fewer is not None
+    assert [cause.where for cause in fewer.causes] == [ELBOW]
+
+
+@pytest.fixture(scope="module")
+def named() -> Sets:
+    """Return sets of zeros, ratios and links, each number of a link by itself, and jumps at one moment."""
+    robot = surveyed_arm()
+    names = ("joint_offset", "joint_scale", "link_geometry", "encoder_jump")
+    effects = [Effect.at(robot, name, joint) for name in names for joint in robot.joints]
+    links = [replace(one, free=(k,)) for one in effects if one.kind.in_parts for k in one.amounts]
+    others = [one for one in effects if not one.kind.in_parts]
+    fit = fit_of(robot, others[0])
+    return Sets(fit, [Candidate(one, 0.0, 1, 7 if one.kind.begins else 1) for one in (*others, *links)], 4.0)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_a_group_costs_is_the_difference_of_two_sets(named, seed) -> None:
+    rng = np.random.default_rng(seed)
+    chosen = tuple(np.flatnonzero(rng.random(len(named.effects)) < 0.3).tolist())
+    absent = [group for group in named._groups if not set(group) & set(chosen)]
+    present = [group for group in named._groups if set(group) <= set(chosen)]
+    more = [named._cost((*chosen, *group)) - named._cost(chosen) for group in absent]
+    less = [named._cost(chosen) - named._cost(tuple(k for k in chosen if k not in group)) for group in present]
+    np.testing.assert_allclose(named._costs_of(chosen, absent, are_in=False), more, atol=1e-9)
+    np.testing.assert_allclose(named._costs_of(chosen, present, are_in=True), less, atol=1e-9)
+
+
+def test_the_names_of_a_set_have_no_order(named) -> None:
+    zero, scale = (next(k for k, one in enumerate(named.effects) if one.name == name) for name in NAMES)
+    assert named._cost((zero, scale)) == pytest.approx(named._cost((zero,)) + named._cost((scale,)) - np.log(2.0))
 
 
 def test_the_choices_of_a_links_numbers_are_as_probable_together_as_one() -> None:
