@@ -111,7 +111,7 @@ class Fitted:
 def fitted(room: Room, corners: FloatArray, start: FloatArray, correction: FloatArray | None = None) -> Fitted:
     """Fit all poses and the lens to corners (n, 4, 2), and with a correction its share, by Levenberg's method."""
     cameras, tags = room.counts
-    numbers: FloatArray = np.append(start, np.zeros(correction is not None))
+    numbers: FloatArray = np.append(start, np.zeros(int(correction is not None)))
     weak = np.zeros((cameras + 8, len(numbers)))
     lens = 6 * (cameras + tags)
     weak[np.arange(cameras), lens + LENS + np.arange(cameras)] = 1.0 / FOCUS
