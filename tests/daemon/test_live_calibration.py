@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from unittest.mock import Mock
@@ -219,6 +220,14 @@ def test_lines_tell_each_view_and_do_not_repeat_themselves(views) -> None:
         lines(each)
     assert said[0].startswith("taken: view 1. 1 views, ")
     assert said[1:] == ["hold it still"]
+
+
+def test_lines_do_not_repeat_a_complaint_after_each_view(views) -> None:
+    said: list[str] = []
+    lines = Lines(said.append, SystemClock())
+    for k in (2, 4):
+        lines(replace(shown_of(views, k), trouble=("its autofocus is on",)))
+    assert [text[:8] for text in said].count("its auto") == 1
 
 
 def test_where_there_is_no_terminal_lines_are_printed(views, capsys) -> None:
