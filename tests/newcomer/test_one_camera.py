@@ -48,7 +48,7 @@ def test_every_command_on_the_page_is_understood(command: str) -> None:
 
 
 def test_init_writes_the_tables_of_the_page(written) -> None:
-    shown, found = tomllib.loads(re.search(r"```toml\n(.*?)```", PAGE, re.DOTALL)[1]), tomllib.loads(written)
+    shown, found = tomllib.loads(re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)[0]), tomllib.loads(written)
     assert found["vision"] == shown["vision"]
     assert {key: found["camera"][key] for key in shown["camera"]} == shown["camera"]
 
@@ -74,7 +74,7 @@ def tool_poses(rows: int, rng: np.random.Generator) -> str:
     lines = ["tool_x,tool_y,tool_z,tool_roll,tool_pitch,tool_yaw,x,y,z"]
     for _ in range(rows):
         place = marker[:3] + rng.uniform(-0.25, 0.25, 3) + [0.0, 0.0, 0.55]
-        angles = rng.uniform(-0.5, 0.5, 3) + [np.pi, 0.0, 0.0]
+        angles = np.array([np.pi, 0.0, 0.0]) + rng.uniform(-0.5, 0.5, 3)
         tool = np.eye(4)
         tool[:3, :3], tool[:3, 3] = Rotation.from_euler("xyz", angles).as_matrix(), place
         seen = (np.linalg.inv(tool @ mounted) @ marker)[:3] + 2e-4 * rng.standard_normal(3)
