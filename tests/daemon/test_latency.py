@@ -240,6 +240,12 @@ def test_a_marker_that_moves_by_itself_is_named() -> None:
         latency_of(Wiggle(ours.t_joints, ours.q, ours.t_marker, others.x), ARM.chain)
 
 
+@pytest.mark.parametrize("latency_s", [-0.1, 0.3])
+def test_a_latency_beyond_the_search_is_named(latency_s) -> None:
+    with pytest.raises(LatencyError, match=r"follows the joints best at (250|-50) ms, the end of the search"):
+        latency_of(wiggle(0, latency_s), ARM.chain)
+
+
 def test_without_readings_the_encoders_are_named() -> None:
     with pytest.raises(LatencyError, match="the encoders gave nothing"):
         wiggle_of([], [])

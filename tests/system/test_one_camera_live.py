@@ -29,7 +29,7 @@ from kbmaps import RigidChain
 pytestmark = pytest.mark.soak
 
 ARM = Path(__file__).parents[2] / "examples" / "desk_arm" / "desk_arm.urdf"
-SIZE_PX, FPS, LATENCY_S, SIDE_M = (640, 480), 10.0, 0.25, 0.0498
+SIZE_PX, FPS, LATENCY_S, SIDE_M = (640, 480), 10.0, 0.2, 0.0498
 LENS = TrueLens((600.0, 600.0), (319.5, 239.5), (0.0,) * 5)
 CAMERA = StereoCalibration(600.0, (319.5, 239.5), 0.0, SIZE_PX)
 LOOK = Look(wall=0.6, noise_sd=2.0, samples=3)
