@@ -146,9 +146,9 @@ def latency_of(wiggle: Wiggle, chain: RigidChain) -> Latency:
     _require_following(fit, cost[best])
     if best in (0, len(grid) - 1):
         raise LatencyError(
-            f"the marker follows the joints best at {1e3 * (LATEST_S if best else EARLIEST_S):.0f} ms, the end of the "
-            "search: the real latency is beyond. Give the cameras fewer buffers, a higher rate or a shorter exposure "
-            "(docs/cameras.md)"
+            f"{_strange(fit, cost[best])} They agree best at {1e3 * (LATEST_S if best else EARLIEST_S):.0f} ms, the "
+            "end of the search: the real latency may be beyond (fewer buffers, a higher rate or a shorter exposure: "
+            "docs/cameras.md)"
         )
     _require_one(grid, cost, best)
     fit, near_s, residual_m = _nearest(fit, grid[best])
@@ -354,7 +354,13 @@ def _require_following(fit: _Fit, cost: float) -> None:
             f"the marker moved by {1e3 * moved_m:.1f} mm only (RMS), hardly more than its noise. Move joints that "
             "bring it far: not one that turns it on the spot"
         )
-    raise LatencyError(
+    raise LatencyError(_strange(fit, cost))
+
+
+def _strange(fit: _Fit, cost: float) -> str:
+    """Return the message for a marker that does not move with the joints."""
+    moved_m, residual_m = fit.motion_m, math.sqrt(cost / len(fit.x))
+    return (
         f"the marker does not follow the joints: of {1e3 * moved_m:.0f} mm of motion (RMS) {1e3 * residual_m:.0f} mm "
         f"do not go with them at any latency from {1e3 * EARLIEST_S:.0f} to {1e3 * LATEST_S:.0f} ms. Is it the marker "
         "that is found (`bodyschema watch cameras`), are the joints in the order of robot.toml (`bodyschema watch "

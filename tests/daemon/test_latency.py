@@ -242,7 +242,7 @@ def test_a_marker_that_moves_by_itself_is_named() -> None:
 
 @pytest.mark.parametrize("latency_s", [-0.1, 0.3])
 def test_a_latency_beyond_the_search_is_named(latency_s) -> None:
-    with pytest.raises(LatencyError, match=r"follows the joints best at (250|-50) ms, the end of the search"):
+    with pytest.raises(LatencyError, match=r"agree best at (250|-50) ms, the end of the search"):
         latency_of(wiggle(0, latency_s), ARM.chain)
 
 

@@ -12,16 +12,14 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
-from ball_renderer import Look
 from board_renderer import Photographer, Printed, Taken, TrueLens, TrueRig, poses
 from sampled import LIMIT_S, on_the_bench
-from tag_renderer import Sheet, photograph
 from v4l2_cameras import LiveCamera, preloaded
 
 from bodyschema.daemon.config import Config
-from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
 from kbmaps import RigidChain
 
@@ -31,8 +29,10 @@ pytestmark = pytest.mark.soak
 ARM = Path(__file__).parents[2] / "examples" / "desk_arm" / "desk_arm.urdf"
 SIZE_PX, FPS, LATENCY_S, SIDE_M = (640, 480), 10.0, 0.2, 0.0498
 LENS = TrueLens((600.0, 600.0), (319.5, 239.5), (0.0,) * 5)
-CAMERA = StereoCalibration(600.0, (319.5, 239.5), 0.0, SIZE_PX)
-LOOK = Look(wall=0.6, noise_sd=2.0, samples=3)
+WALL, MODULE_PX = 185, 12
+TAG = cv2.aruco.generateImageMarker(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11), 0, 8 * MODULE_PX)
+PRINT = np.pad(TAG // 2 + 30, MODULE_PX, constant_values=157)
+NOISE = np.random.default_rng(0).normal(0.0, 2.0, SIZE_PX[::-1]).round().astype(np.int16)
 SHOWN_S = 1.5  # how long the board is held still
 BASE_TO_CAMERA = np.array([[0.0, 0.0, -1.0, 1.0], [1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.3], [0.0, 0.0, 0.0, 1.0]])
 MIDDLE, SWING = np.radians([10.0, 30.0, 45.0, 0.0]), np.radians([12.0, 12.0, 12.0, 20.0])
@@ -52,7 +52,8 @@ model = "STS3215"
 
 
 def guided(t: float) -> FloatArray:
-    return MIDDLE + SWING * np.sin(PACE * t)
+    """Return the joints' angles, of a motion that does not repeat itself."""
+    return MIDDLE + SWING * (0.6 * np.sin(PACE * t) + 0.4 * np.sin(2.3 * PACE[::-1] * t + 1.0))
 
 
 @dataclass
@@ -68,8 +69,22 @@ class World:
         if self.shows_board:
             return self.boards[int(t / SHOWN_S) % len(self.boards)]
         pose, middle = self.chain.poses(np.array([guided(t), MIDDLE]))
-        sheet = Sheet(0, pose[:3, :3] @ middle[:3, :3].T @ FACING, pose[:3, 3], SIDE_M)
-        return photograph([sheet], CAMERA, LOOK, np.random.default_rng(int(1e3 * t)), t=t).left
+        return tag_at(pose[:3, :3] @ middle[:3, :3].T @ FACING, pose[:3, 3])
+
+
+def tag_at(rotation: FloatArray, x: FloatArray) -> np.ndarray:
+    """Return the image of the tag at x [m], quickly: the emulated servos answer from this process, too."""
+    # From the print's pixels to the tag's plane, to the image, and to a third of its pixels.
+    side = SIDE_M / (8.0 * MODULE_PX)
+    plane = np.array([[side, 0.0, -5.0 * SIDE_M / 8.0], [0.0, -side, 5.0 * SIDE_M / 8.0], [0.0, 0.0, 1.0]])
+    camera = np.array([[600.0, 0.0, 319.5], [0.0, 600.0, 239.5], [0.0, 0.0, 1.0]])
+    finer = np.array([[3.0, 0.0, 1.0], [0.0, 3.0, 1.0], [0.0, 0.0, 1.0]])
+    middles = np.array([[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
+    shown = finer @ camera @ np.column_stack([rotation[:, :2], x]) @ plane @ middles
+    size = 3 * SIZE_PX[0], 3 * SIZE_PX[1]
+    seen = cv2.warpPerspective(PRINT, shown, size, borderMode=cv2.BORDER_CONSTANT, borderValue=WALL)
+    seen = cv2.resize(cv2.GaussianBlur(seen, (0, 0), 1.5), SIZE_PX, interpolation=cv2.INTER_AREA)
+    return cv2.cvtColor(cv2.add(seen, NOISE, dtype=cv2.CV_8U), cv2.COLOR_GRAY2BGR)
 
 
 def boards(count: int) -> list[np.ndarray]:
