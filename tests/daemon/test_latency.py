@@ -56,7 +56,8 @@ def latency_by_speed(wiggle: Wiggle, chain: RigidChain) -> float:
 
     grid = np.arange(EARLIEST_S, LATEST_S, STEP_S)
     best = grid[int(np.argmin([mismatch(lag) for lag in grid]))]
-    return float(minimize_scalar(mismatch, bounds=(best - STEP_S, best + STEP_S), method="bounded").x)
+    found = minimize_scalar(mismatch, bounds=(best - STEP_S, best + STEP_S), method="bounded")
+    return float(found.x)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 @pytest.mark.parametrize(

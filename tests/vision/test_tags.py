@@ -302,7 +302,8 @@ def test_a_tag_printed_in_another_size_is_a_size_mismatch(printed) -> None:
 
 def test_rows_that_disagree_are_epipolar() -> None:
     frame = seen(sheet())
-    assert reason(tracker().track(replace(frame, right=np.roll(frame.right, 4, axis=0)))) is Reason.EPIPOLAR
+    left, right = frame.images
+    assert reason(tracker().track(StereoFrame(frame.t, left, np.roll(right, 4, axis=0)))) is Reason.EPIPOLAR
 
 
 def test_eyes_that_are_interchanged_are_epipolar() -> None:
