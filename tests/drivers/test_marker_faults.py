@@ -18,7 +18,10 @@ GOOD = 200
 def faulty(**keys) -> Sent:
     """Return a source after good messages."""
     sent = Sent(**keys)
-    sent.send(GOOD, **({"body": "tool"} if "body" in keys else {}))
+    if "body" in keys:
+        sent.send(GOOD, body="tool")
+    else:
+        sent.send(GOOD)
     return sent
 
 
