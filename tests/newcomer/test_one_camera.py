@@ -47,6 +47,10 @@ def test_every_command_on_the_page_is_understood(command: str) -> None:
     assert command_of(command).startswith("bodyschema.cli.commands.")
 
 
+def test_the_readme_lists_the_demo_with_one_camera() -> None:
+    assert ".venv/bin/bodyschema demo --camera mono\n" in (DOCS.parent / "README.md").read_text(encoding="utf-8")
+
+
 def test_init_writes_the_tables_of_the_page(written) -> None:
     shown, found = tomllib.loads(re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)[0]), tomllib.loads(written)
     assert found["vision"] == shown["vision"]
