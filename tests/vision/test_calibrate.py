@@ -22,6 +22,7 @@ from bodyschema.vision.calibration.guidance import Coverage
 from bodyschema.vision.calibration.held_out import covariance
 from bodyschema.vision.calibration.images import ImagePair
 from bodyschema.vision.calibration.view import View
+from bodyschema.vision.calibration.weights import corner_weights
 from bodyschema.vision.rig.lens import Lens
 from bodyschema.vision.rig.stereo_rig import CalibrationError, lenses_of
 
@@ -386,3 +387,11 @@ def test_equations_whose_poses_explain_more_than_all_have_no_step() -> None:
         penalty=0.0,
     )
     assert at.step(0.0) is None
+
+
+def test_a_fit_whose_equations_have_no_solution_is_refused() -> None:
+    rng = np.random.default_rng(0)
+    found = fit(corner_views(webcams(rng), rng, 14), BOARD.corners_m, SIZE, "pinhole")
+    nowhere = replace(found.bundle, normal=-found.bundle.normal)
+    with pytest.raises(CalibrationError, match="the views do not determine the lenses"):
+        corner_weights(found.views, BOARD.corners_m, nowhere)

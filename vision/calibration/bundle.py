@@ -16,6 +16,7 @@ from bodyschema.vision.rig.stereo_rig import CalibrationError, lenses_of
 from .view import EYES, View
 
 POSE = 6
+UNDETERMINED = "the views do not determine the lenses. Take more views, tilted and all over the image"
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ def solve(
 
     linear = minimised(_linearised(views, corners_m, model, vector, poses, weighed, prior), stepped)
     if not np.isfinite(linear.squares):
-        raise CalibrationError("the views do not determine the lenses. Take more views, tilted and all over the image")
+        raise CalibrationError(UNDETERMINED)
     return Bundle(model, linear.vector, linear.poses, tuple(linear.residuals), weighed, linear.reduced(0.0)[0], prior)
 
 
