@@ -57,7 +57,8 @@ class TagFinder:
             self._suspect, self._warned = (self._suspect + 1) % len(names), False
         elif not self._warned:
             self._warned = True
-            _log.warning("%s, not one of %s", name or "a mirrored tag", self._config.dictionary)
+            kind = f"tag of {name}" if name else "mirrored tag"
+            _log.warning("a %s is in view, not one of %s", kind, self._config.dictionary)
         return reason
 
     def find(self, grey: ImageArray, region: Region | None = None) -> Seen:
