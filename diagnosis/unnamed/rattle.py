@@ -115,6 +115,9 @@ def _two_sided(fit: Fit) -> Rattle | None:
     ways = np.einsum("nji,j->ni", _turns(fit), axes[:, 2])
     rarer = min(int((sides[rows] < 0.0).sum()), int((sides[rows] > 0.0).sum()))
     is_clear = 2.0 * half >= _APART * sigma and worth >= _NAMED and ratio >= _BEYOND_NOISE**2 - 1.0
+    # A marker that changed its place once has slipped.
+    sure = np.sign(sides[rows & (sides != 0.0)])
+    is_clear = is_clear and int((np.diff(sure) != 0.0).sum()) > 1
     whole = _likelihood(fit, rows) + worth - _UNNAMED
     return Rattle(half, ratio, axes[:, 2], ways, sides, whole, is_clear and rarer >= _FEWEST)
 
