@@ -1,8 +1,8 @@
 """Corners of tags on photographs of flat grids, beside OpenCV's and AprilTag's refined corners.
 
-Run `python -m benchmarks.tag_grids FOLDER [--columns 6] [--pitch 1.3] [--dictionary NAME] [--border 1] [--lens 5]
-[--pupil PYTHON]`. FOLDER holds photographs of one grid (larger ones are shrunk to 2048 px), its tags numbered from 0
-row by row, `--pitch` sides apart. A plane and a lens with `--lens` coefficients are fitted to the corners of one
+Run `python -m benchmarks.tag_grids FOLDER [--columns 6] [--pitch 1.3] [--dictionary APRILTAG_36H11] [--border 1]
+[--lens 5] [--pupil PYTHON]`. FOLDER holds photographs of one grid (larger ones are shrunk to 2048 px), tags numbered
+from 0 row by row, `--pitch` sides apart. A plane and a lens with `--lens` coefficients are fitted to the corners of one
 detector: a truth that no other detector shares. The error of a corner is its distance from the plane of all *other*
 tags. Each detector gets the same tags.
 
@@ -28,7 +28,6 @@ from scipy.optimize import least_squares
 from bodyschema.interfaces.records import FloatArray, ImageArray
 from bodyschema.vision.tags import image
 from bodyschema.vision.tags.config import TagConfig
-from bodyschema.vision.tags.dictionary import tags_of
 
 FEWEST, LONGEST_PX = 6, 2048
 # Script run by the interpreter that has pupil_apriltags: an image in, the tags' numbers and corners out.
@@ -55,13 +54,13 @@ class Grid:
     """How a grid is printed.
 
     Attributes:
-        config: whose dictionary the tags are of.
+        dictionary: OpenCV's name of it, of six by six modules.
         columns: tags in a row.
         pitch: from one tag to the next, in sides.
         border: black modules around the data.
     """
 
-    config: TagConfig
+    dictionary: str
     columns: int
     pitch: float
     border: int
@@ -89,7 +88,7 @@ class Grid:
 
     @property
     def _tags(self) -> Any:
-        return tags_of(self.config.dictionary)
+        return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{self.dictionary}"))
 
 
 def april_tag(python: str, grey: ImageArray, border: int) -> Corners:
@@ -103,10 +102,10 @@ def ours(grey: ImageArray, grid: Grid, rough: Corners, *, bleeding: bool) -> tup
     """Return corners and covariances (8, 8) of the tags that are measured."""
     with mock.patch.object(image, "tag_modules", grid.modules):
         if bleeding:
-            found = [image.measure_tag(grey, id, quad, grid.config) for id, quad in rough.items()]
+            found = [image.measure_tag(grey, id, quad, TagConfig()) for id, quad in rough.items()]
         else:
             with mock.patch.object(image, "bleed", return_value=(0.0, 0.0)):
-                found = [image.measure_tag(grey, id, quad, grid.config) for id, quad in rough.items()]
+                found = [image.measure_tag(grey, id, quad, TagConfig()) for id, quad in rough.items()]
     tags = [tag for tag in found if isinstance(tag, image.TagImage)]
     return {tag.id: tag.corners_px for tag in tags}, {tag.id: tag.cov_px for tag in tags}
 
@@ -169,14 +168,16 @@ def photograph(path: Path, grid: Grid, lens: int, pupil: str | None) -> dict[str
     if pupil is not None:
         answers["pupil_apriltags"] = april_tag(pupil, grey, grid.border)
     answers = {name: corners for name, corners in answers.items() if len(corners) >= FEWEST}
+    if "tracker" not in answers:
+        return None
     shared = sorted(set.intersection(*(set(corners) for corners in answers.values())))
-    if "tracker" not in answers or len(shared) < FEWEST:
+    if len(shared) < FEWEST:
         return None
     first = {id: corrected[id] for id in shared}
     printed = arrangement(grid, first)
     row: dict[str, Any] = {"photograph": path.name, "tags": [len(shared), len(rough)]}
     for name, corners in answers.items():
-        measured = np.array([_in_order(corners[id], first[id]) for id in shared])
+        measured = np.array([in_order(corners[id], first[id]) for id in shared])
         size_px = (grey.shape[1], grey.shape[0])
         apart = left_out(printed, measured, size_px, lens)
         outward = measured - measured.mean(axis=1, keepdims=True)
@@ -192,7 +193,7 @@ def photograph(path: Path, grid: Grid, lens: int, pupil: str | None) -> dict[str
     return row
 
 
-def _in_order(corners: FloatArray, order: FloatArray) -> FloatArray:
+def in_order(corners: FloatArray, order: FloatArray) -> FloatArray:
     """Return a tag's corners in the order of those that they are nearest to."""
     orders = [np.roll(way, turn, axis=0) for way in (corners, corners[::-1]) for turn in range(4)]
     return min(orders, key=lambda each: float(np.abs(each - order).sum()))
@@ -202,7 +203,7 @@ def main() -> None:
     """Measure all photographs of a folder."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
-    parser.add_argument("--dictionary", default="apriltag_36h11")
+    parser.add_argument("--dictionary", default="APRILTAG_36H11")
     parser.add_argument("--columns", type=int, default=6)
     parser.add_argument("--pitch", type=float, default=1.3)
     parser.add_argument("--border", type=int, default=1)
@@ -210,7 +211,7 @@ def main() -> None:
     parser.add_argument("--lens", type=int, default=5, choices=range(6))
     asked = parser.parse_args()
     cv2.setNumThreads(1)
-    grid = Grid(TagConfig(dictionary=asked.dictionary), asked.columns, asked.pitch, asked.border)
+    grid = Grid(asked.dictionary, asked.columns, asked.pitch, asked.border)
     rows = map(partial(photograph, grid=grid, lens=asked.lens, pupil=asked.pupil), sorted(asked.folder.iterdir()))
     for row in filter(None, rows):
         print(json.dumps(row))

@@ -145,7 +145,11 @@ def latency_of(wiggle: Wiggle, chain: RigidChain) -> Latency:
     best = int(np.argmin(cost))
     _require_following(fit, cost[best])
     if best in (0, len(grid) - 1):
-        raise LatencyError(_strange(fit, cost[best]))
+        raise LatencyError(
+            f"{_strange(fit, cost[best])} They agree best at {1e3 * (LATEST_S if best else EARLIEST_S):.0f} ms, the "
+            "end of the search: the real latency may be beyond (fewer buffers, a higher rate or a shorter exposure: "
+            "docs/cameras.md)"
+        )
     _require_one(grid, cost, best)
     fit, near_s, residual_m = _nearest(fit, grid[best])
     lag = _minimum(fit, near_s)

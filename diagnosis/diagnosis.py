@@ -24,8 +24,9 @@ from bodyschema.diagnosis.assess.shares import Shares, shares
 from bodyschema.diagnosis.assess.stored import is_better_with, stored
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.background import Scales
-from bodyschema.diagnosis.fit.fit import Fit, correlation, fitted, wanders
+from bodyschema.diagnosis.fit.fit import Fit, fitted
 from bodyschema.diagnosis.fit.instrument import instrument_factor, reshaped
+from bodyschema.diagnosis.fit.noise import correlation, wanders
 from bodyschema.diagnosis.fit.observations import IntArray, Observations
 from bodyschema.diagnosis.fit.worth import NAMED
 from bodyschema.diagnosis.search.drives import with_small_ripples
@@ -43,30 +44,33 @@ from bodyschema.recordings.recording import Recording
 from .stages import NAMELESS, RIVALS, SEARCH, SETS, Stages
 
 Told = Callable[[str], None]
-# Fewer outliers than this are not a finding.
-_FEWEST_OUTLIERS = 3
-# Smallest evidence gain for reporting outliers [nats].
-_OUTLIERS_NAMED = 15.0
-# Outliers count as motion-related if they occur on faster rows at least this often.
-_MOSTLY = 0.8
-# Farther off than this, in units of the change by the path between two readings, the path cannot be the reason.
-_BY_SO_MUCH = 4.0
+
+
+class _Settings:
+    """Settings of the diagnosis.
+
+    Sensitivity, each at 0.3 and 3 times over seven recordings with hidden errors: `same_scale` and `rescaled`, with
+    which tolerances are fitted again, change one and three reports; `little` changes a word. The others change nothing
+    there; `most_spent`, `same_noise`, `most_rows` and `run` were tried on three of them alone, none a long one.
+    """
+
+    fewest_outliers = 3  # fewer outliers than this are not a finding
+    outliers_named = 15.0  # smallest evidence gain for reporting outliers [nats]
+    mostly = 0.8  # outliers count as motion-related if they occur on faster rows at least this often
+    # Farther off than this, in units of the change by the path between two readings, the path cannot be the reason.
+    by_so_much = 4.0
+    # Smallest change of the tolerance scales (in logarithms) that triggers a refit, and the maximum of refits.
+    same_scale, rescaled = 0.25, 3
+    rattled = 2  # fits with the play of a loose marker; the first tells the noise beside it
+    little = 0.9  # squares reduced by less than to this share are reduced a little
+    most_spent = 0.9  # the fit absorbs at most this share of the noise
+    same_noise = 0.1  # smallest change of the instrument's noise (in logarithms) that triggers a refit
+    # In more than twice as many rows, causes are sought in runs of neighbouring rows, and fitted to all of them.
+    most_rows, run = 1000, 50
+
+
 # With a larger share of doubtful rows, dropping them costs more than keeping them.
 MOST_DOUBTFUL = 0.25
-# Beside an unnamed cause, a named cause stays only if it is more probable than not.
-_HALF = 0.5
-# Smallest change of the tolerance scales (in logarithms) that triggers a refit, and the maximum of refits.
-_SAME_SCALE, _RESCALED = 0.25, 3
-# Fits with the play of a loose marker; the first tells the noise beside it.
-_RATTLED = 2
-# Squares reduced by less than to this share are reduced a little.
-_LITTLE = 0.9
-# The fit absorbs at most this share of the noise.
-_MOST_SPENT = 0.9
-# Smallest change of the instrument's noise (in logarithms) that triggers a refit.
-_SAME_NOISE = 0.1
-# In more than twice as many rows, causes are sought in runs of neighbouring rows, and fitted to all of them.
-_MOST_ROWS, _RUN = 1000, 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +151,7 @@ class Diagnosis:
     def leaves_out(self) -> bool:
         """True if extended.toml leaves out what reduces the error by more than a little here."""
         squares = [np.square(errors[self.markers]).sum() for errors in (self.complete_errors, self.errors["extended"])]
-        return bool(squares[0] < _LITTLE * squares[1])
+        return bool(squares[0] < _Settings.little * squares[1])
 
     @cached_property
     def held_out(self) -> dict[str, FloatArray]:
@@ -172,7 +176,7 @@ class Diagnosis:
     def outliers_are_found(self) -> bool:
         """Return True if outliers are numerous and large enough to be a finding."""
         worth = self.extended.noise.log_likelihood - self.extended.without_outliers
-        named = self.outliers >= _FEWEST_OUTLIERS and worth > _OUTLIERS_NAMED
+        named = self.outliers >= _Settings.fewest_outliers and worth > _Settings.outliers_named
         return named and not self._off_where_fast() and not self._off_by_what_is_inexact()
 
     def _off_by_what_is_inexact(self) -> bool:
@@ -186,7 +190,7 @@ class Diagnosis:
             changes.append(self.left.model.explained)
         squares = np.square(fit.observations.whitened(np.stack(changes, axis=2))).sum(axis=1).mean(axis=0)
         off = np.square(fit.residuals[self._off]).sum(axis=1)
-        return bool(np.median(off) < _BY_SO_MUCH**2 * squares.sum())
+        return bool(np.median(off) < _Settings.by_so_much**2 * squares.sum())
 
     def _off_where_fast(self) -> bool:
         """Return True if the outliers are mostly at the fastest rows; the motion is then poorly modelled."""
@@ -195,7 +199,7 @@ class Diagnosis:
         duration = np.ones(len(motion)) if motion.t is None else np.append(np.inf, np.diff(motion.t))
         speed = steps / np.maximum(duration, 1e-9)
         on, off = self.markers, self._off
-        return max(_exceeds(v[off], v[on]) for v in (steps, speed)) > _MOSTLY
+        return max(_exceeds(v[off], v[on]) for v in (steps, speed)) > _Settings.mostly
 
     def gain(self) -> tuple[float, tuple[float, float]]:
         """Return the reduction of the RMS from aligned to extended [%], with its 95 % interval on new poses."""
@@ -251,7 +255,7 @@ class Diagnosis:
         roots = np.linalg.inv(fit.observations.whitening)
         stated = roots @ np.swapaxes(roots, 1, 2)
         # Scale the stated noise to the size of the residuals, corrected for what the fit absorbed.
-        spent = min(fit.background.spent(fit.noise.sigma) / max(left.size, 1), _MOST_SPENT)
+        spent = min(fit.background.spent(fit.noise.sigma) / max(left.size, 1), _Settings.most_spent)
         size = np.square(left).sum() / np.trace(stated[kept], axis1=1, axis2=2).sum() / (1.0 - spent) * (1.0 - shared)
         # The play of a loose marker is no noise.
         return float(size) * fit.observations.own
@@ -410,13 +414,13 @@ def _part_of(begins: NDArray[np.bool_]) -> IntArray:
         begins: (n,), True in the first row after each break.
     """
     rows = len(begins)
-    if rows <= 2 * _MOST_ROWS:
+    if rows <= 2 * _Settings.most_rows:
         return np.arange(rows)
-    breaks = np.convolve(begins[1:], np.ones(_RUN - 1), "valid")
-    firsts = np.linspace(0, rows - _RUN, _MOST_ROWS // _RUN).astype(np.intp)
+    breaks = np.convolve(begins[1:], np.ones(_Settings.run - 1), "valid")
+    firsts = np.linspace(0, rows - _Settings.run, _Settings.most_rows // _Settings.run).astype(np.intp)
     for k, (first, after) in enumerate(pairwise(firsts.tolist())):
-        firsts[k] += np.argmin(breaks[first : after - _RUN + 1])
-    return (firsts[:, None] + np.arange(_RUN)).ravel()
+        firsts[k] += np.argmin(breaks[first : after - _Settings.run + 1])
+    return (firsts[:, None] + np.arange(_Settings.run)).ravel()
 
 
 def _moment_anew(fit: Fit, cause: Effect, searched: FloatArray) -> Candidate | None:
@@ -468,7 +472,7 @@ def _found(
     bare = begun.with_causes([]).to(start.observations)
     fits = [start, bare, *([extended.with_causes(steady)] if steady else [])]
     loose = None if start.is_exact else _loose(explanation, fits, search)
-    for _ in range(_RATTLED if loose is not None else 0):
+    for _ in range(_Settings.rattled if loose is not None else 0):
         assert loose is not None
         told(loose.what)
         # Begin again: causes may have been named for it, and the noise is smaller without it.
@@ -483,7 +487,7 @@ def _found(
     explanation = useful(explanation, search, blocks, told)
     told.begin(RIVALS, NAMELESS)
     stands = standings(explanation.beside, search, blocks, seed, None if explanation.unknown else unknowns)
-    while explanation.unknown and any(standing.probability < _HALF for standing in stands):
+    while explanation.unknown and any(standing.probability < 0.5 for standing in stands):
         weakest = int(np.argmin([standing.probability for standing in stands]))
         fewer = without_one(explanation, explanation.fit.causes[weakest], unknowns, search)
         if not fewer.unknown:
@@ -522,7 +526,7 @@ def _counted(fit: Fit, start: Fit, simulation: Simulation, shape: Observations |
     before = np.zeros_like(left_out) if observations.doubtful is None else observations.doubtful
     # Other sizes of the same causes change few rows.
     other_rows = (left_out ^ before).sum() > (left_out & before).sum()
-    other_noise = abs(np.log(factor / observations.stated_factor)) > _SAME_NOISE
+    other_noise = abs(np.log(factor / observations.stated_factor)) > _Settings.same_noise
     if fit.is_exact or not (other_rows or other_noise or shape is not None):
         return fit, start
     observations = (shape or observations).with_factor(factor).without(left_out)
@@ -551,7 +555,7 @@ def _stored(start: Fit, alone: Fit, complete: Fit, left: Leftover, blocks: Block
 def _searched(begun: Fit, search: Search) -> Fit:
     """Run the search for causes from a fit, and refit with tolerances updated to what it finds."""
     extended = begun
-    for _ in range(_RESCALED):
+    for _ in range(_Settings.rescaled):
         begun = _with_small_ones_tolerated(begun)
         extended = search.run(begun)
         before = extended.background.scales or Scales()
@@ -559,7 +563,7 @@ def _searched(begun: Fit, search: Search) -> Fit:
         bare = extended.with_causes([])
         search.path = [bare.tolerating(before.no_larger), bare, *search.path[1:]]
         scales = tolerated(extended).scales
-        is_same = not _small_ones(extended) and np.abs(np.log(scales) - np.log(before)).max() < _SAME_SCALE
+        is_same = not _small_ones(extended) and np.abs(np.log(scales) - np.log(before)).max() < _Settings.same_scale
         if search.ended_early or is_same:
             break
         begun = extended.tolerating(scales, _small_ones(extended))

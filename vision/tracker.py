@@ -21,6 +21,7 @@ from bodyschema.interfaces.records import (
 from bodyschema.vision.ball.blob import Disc, Patch, Region, find_patches, measure, patch_at, roughly
 from bodyschema.vision.ball.colour import gate_of
 from bodyschema.vision.ball.match import StereoMatcher, is_reflection_of
+from bodyschema.vision.ball.settings import TrackSettings as _Settings
 from bodyschema.vision.ball.size import BallSize
 from bodyschema.vision.ball.sphere import Pinhole
 
@@ -29,21 +30,6 @@ from .images import check_calibration, check_images
 from .triangulate import Location
 
 _log = logging.getLogger(__name__)
-
-# Half the side of the region searched around the predicted centre: radii, plus pixels, plus steps between frames.
-_REGION_RADII, _REGION_PX, _REGION_STEPS = 1.6, 14.0, 0.7
-# A disc fits the prediction if its position and its size differ by less than this, in radii of the marker.
-_AS_EXPECTED = 0.25
-# So long after the last fix the marker is expected within reach of it [s], if it moved on for no longer than this [s];
-# the reach is so many radii larger. Without a fix, what is left of two is the marker after that time.
-_LONGEST_MEMORY_S, _FAIR_PAUSE_S, _JUMP_RADII = 0.9, 0.1, 2.0
-# What looks like the marker's copy in a mirror is the marker in the shade where it is no more radii from the last fix.
-_COPY_RADII = 4.0
-# Of two things one after the other that are one thing, the brighter is not brighter than this times the other.
-_ALIKE_LEVELS = 1.25
-
-# Fixes between two looks at the ball's colour.
-_COLOUR_EVERY = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +53,7 @@ class _Expected:
     def fits(self, disc: Disc | Patch) -> bool:
         """Return True if a disc agrees with the prediction in this eye."""
         apart_px = max(float(np.linalg.norm(disc.centre_px - self.centre_px)), abs(disc.radius_px - self.radius_px))
-        return apart_px < _AS_EXPECTED * self.radius_px
+        return apart_px < _Settings.as_expected * self.radius_px
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,7 +227,11 @@ class StereoTracker:
         if track is None or not 0 < t - track.t <= LONGEST_PAUSE_S:
             return None
         step = track.velocity_px_s * (t - track.t)
-        half = _REGION_RADII * track.radius_px + _REGION_PX + _REGION_STEPS * float(np.abs(step).max())
+        half = (
+            _Settings.region_radii * track.radius_px
+            + _Settings.region_px
+            + _Settings.region_steps * float(np.abs(step).max())
+        )
         centres = (track.centres_px + step).reshape(2, 2)
         left, right = (self._region(centre, half) for centre in centres)
         if left is None or right is None:
@@ -257,7 +247,7 @@ class StereoTracker:
     def _doubt(self, t: float, found: Location) -> Reason | None:
         """Return the reason why the detection contradicts the recent track, or None."""
         last = self._last
-        if last is None or not 0 <= t - last.t <= _LONGEST_MEMORY_S:
+        if last is None or not 0 <= t - last.t <= _Settings.longest_memory_s:
             return self._doubt_without_track(t, found)
         reason = self._size.contradicts(found)
         if reason is not None:
@@ -265,7 +255,7 @@ class StereoTracker:
         reason = self._refused_again(t, found)
         if reason is None:
             is_copy = is_reflection_of(found, last.level, float(np.linalg.norm(last.x)))
-            goes_on = float(np.linalg.norm(found.x - last.x)) <= _COPY_RADII * self.config.radius_m
+            goes_on = float(np.linalg.norm(found.x - last.x)) <= _Settings.copy_radii * self.config.radius_m
             if self._within_reach(found.x, last.x, t - last.t) and (goes_on or not is_copy):
                 return None
             reason = Reason.REFLECTION if is_copy else Reason.IMPLAUSIBLE_SPEED
@@ -277,21 +267,23 @@ class StereoTracker:
         refused = self._refused
         if refused is None or not 0 <= t - refused.t <= LONGEST_PAUSE_S:
             return None
-        alike = max(found.level, refused.level) < _ALIKE_LEVELS * min(found.level, refused.level)
+        alike = max(found.level, refused.level) < _Settings.alike_levels * min(found.level, refused.level)
         return refused.reason if alike and self._within_reach(found.x, refused.x, t - refused.t) else None
 
     def _within_reach(self, x: FloatArray, from_x: FloatArray, seconds: float) -> bool:
         """Return True if an object can have moved from one place (3,) [m] to another in that time."""
-        reach_m = _JUMP_RADII * self.config.radius_m + self.config.max_speed_m_s * min(seconds, _FAIR_PAUSE_S)
+        reach_m = _Settings.jump_radii * self.config.radius_m + self.config.max_speed_m_s * min(
+            seconds, _Settings.fair_pause_s
+        )
         return float(np.linalg.norm(x - from_x)) <= reach_m
 
     def _doubt_without_track(self, t: float, found: Location) -> Reason | None:
         """Why what was found may not be the marker though nothing was, a moment ago."""
-        if 0 <= t - self._ambiguous_t <= _LONGEST_MEMORY_S:
+        if 0 <= t - self._ambiguous_t <= _Settings.longest_memory_s:
             # One of two that were alike has gone; nothing tells which.
             return Reason.AMBIGUOUS
         is_copy = any(
-            0 <= t - seen.t <= _LONGEST_MEMORY_S
+            0 <= t - seen.t <= _Settings.longest_memory_s
             and is_reflection_of(found, seen.level, self.config.depth_size_ratio * seen.distance_m)
             for seen in self._sighted
         )
@@ -312,7 +304,7 @@ class StereoTracker:
     def _follow_colour(self, frame: StereoFrame, found: Location) -> None:
         """Show the colours' gate the middle of the ball in the left image, now and then."""
         self._fixes += 1
-        if self._fixes % _COLOUR_EVERY:
+        if self._fixes % _Settings.colour_every:
             return
         half = max(1.0, 0.5 * self.calibration.focal_px * self.config.radius_m / float(found.x[2]))
         middle = self._region(found.centres_px[:2], half)

@@ -316,18 +316,19 @@ def _distances(coverage: Coverage) -> Table:
 
 
 class Lines:
-    """The same as lines: each view at once, what else changes every few seconds."""
+    """The same as lines: each view and each complaint at once, what else changes every few seconds."""
 
     def __init__(self, say: Callable[[str], None], clock: Clock) -> None:
         self._say, self._clock = say, clock
         self._next_s = 0.0
-        self._said: set[str] = set()
+        self._said: set[str] = set()  # since the last view
+        self._complaints: set[str] = set()
         self._wish = ""
 
     def __call__(self, shown: Shown) -> None:
         """Print what is new."""
         for text in (shown.refusal and f"not good enough yet: {shown.refusal}", *shown.trouble):
-            self._once(text)
+            self._once(text, self._complaints)
         if _is_taken(shown.look) or (shown.wish != self._wish and not shown.doing):
             self._wish = shown.wish
             said = f"{shown.coverage.whole_views} views, {shown.coverage.progress:.0%}. Next: {shown.wish}"
@@ -335,12 +336,11 @@ class Lines:
             self._said.clear()
         elif shown.doing or (shown.look is not None and self._clock.now() >= self._next_s):
             self._next_s = self._clock.now() + LINE_EVERY_S
-            self._once(now_text(shown))
+            self._once(now_text(shown), self._said)
 
-    def _once(self, text: str) -> None:
-        """Print the text, unless it was printed since the last view."""
-        if text and text not in self._said:
-            self._said.add(text)
+    def _once(self, text: str, said: set[str]) -> None:
+        if text and text not in said:
+            said.add(text)
             self._say(text)
 
 

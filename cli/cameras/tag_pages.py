@@ -8,14 +8,18 @@ from pathlib import Path
 from typing import Literal
 
 from bodyschema.interfaces.errors import ConfigError
+from bodyschema.vision.board import Board
+from bodyschema.vision.board.board import MARKER_SHARE
+from bodyschema.vision.board.page import page as board_page
 from bodyschema.vision.cluster.page import FACE_SIDES, shape_page, tags_page
-from bodyschema.vision.cluster.shapes import Shape, cube, plate
+from bodyschema.vision.cluster.shapes import Shape, chessboard, cube, plate
 from bodyschema.vision.cluster.tables import cluster_tables, tag_tables
+from bodyschema.vision.printing import Page
 from bodyschema.vision.tags.config import Dictionary
 
 from .board_pages import write_page
 
-ShapeName = Literal["tags", "plate", "cube"]
+ShapeName = Literal["tags", "plate", "cube", "board"]
 _RUN = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?")
 _MOST_TAGS = 100
 
@@ -28,7 +32,8 @@ class Tags:
         shape: single tags, or one body of them.
         ids: numbers of the tags as in 0-5,9; None: as many as the shape has, from 0 on.
         side_mm: side of the black squares.
-        columns, rows, fold_deg: columns, rows and fold angle [°] of a plate.
+        columns, rows: tags of a plate, or squares of a board.
+        fold_deg: fold angle of a plate [°].
     """
 
     shape: ShapeName = "tags"
@@ -41,10 +46,16 @@ class Tags:
 
     @property
     def body(self) -> Shape | None:
-        """The body to fold from the tags; None if they are cut apart."""
-        if self.shape == "tags":
-            return None
-        return cube() if self.shape == "cube" else plate(self.columns, self.rows, self.fold_deg)
+        """The body of the tags; None if they are cut apart."""
+        match self.shape:
+            case "tags":
+                return None
+            case "cube":
+                return cube()
+            case "plate":
+                return plate(self.columns, self.rows, self.fold_deg)
+            case "board":
+                return chessboard(self.columns, self.rows)
 
     @property
     def numbers(self) -> list[int]:
@@ -75,18 +86,27 @@ def write_tags(tags: Tags, paper: str, out: Path) -> tuple[float, float]:
     Raises:
         ConfigError: there are no such tags, they do not fit, or the file cannot be written.
     """
-    body, ids = tags.body, tags.numbers
-    if body is None:
-        page = tags_page(ids, tags.dictionary, tags.side_mm, paper)
-    else:
-        page = shape_page(body, ids, tags.dictionary, tags.side_mm, paper)
+    page = sheet(tags, paper)
     write_page(page, out)
     return page.rulers_mm
 
 
+def sheet(tags: Tags, paper: str) -> Page:
+    """Lay out the page. ConfigError if there are no such tags, or they do not fit."""
+    if tags.shape == "board":
+        if tags.ids is not None:
+            raise ConfigError("the tags of a board are numbered from 0", remedy="Leave out --ids")
+        family = tags.dictionary.replace("aruco_6x6", "6X6").replace("apriltag", "APRILTAG")
+        return board_page(Board(tags.columns, tags.rows, 1e-3 * face_mm(tags), dictionary=family), paper)
+    body, ids = tags.body, tags.numbers
+    if body is None:
+        return tags_page(ids, tags.dictionary, tags.side_mm, paper)
+    return shape_page(body, ids, tags.dictionary, tags.side_mm, paper)
+
+
 def face_mm(tags: Tags) -> float:
-    """Return the width of a face between cuts or folds [mm]."""
-    return FACE_SIDES * tags.side_mm
+    """Return the width of a face between cuts or folds, or of a board's square [mm]."""
+    return tags.side_mm / MARKER_SHARE if tags.shape == "board" else FACE_SIDES * tags.side_mm
 
 
 def tables(tags: Tags) -> str:

@@ -25,7 +25,7 @@ from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import CommandRequest, JointsRequest, PairsReply, PredictReply, decode, encode
-from bodyschema.diagnosis.report.plot import HEIGHT, WIDTH, Plot
+from bodyschema.diagnosis.report.plot import Layout, Plot
 from bodyschema.interfaces.errors import BusError
 from bodyschema.interfaces.interpreter import module_command
 from bodyschema.interfaces.records import FloatArray
@@ -101,16 +101,16 @@ def plot_curve(rows: Sequence[CurveRow], change_at: int | None, file: Path) -> N
 
 def _page(plot: str, legend: dict[str, str]) -> str:
     """Return a standalone SVG: a title, the plot, and a legend below it."""
-    width, height = WIDTH, HEIGHT + _TITLE + _LEGEND_LINE * (len(legend) + 1)
+    width, height = Layout.width, Layout.height + _TITLE + _LEGEND_LINE * (len(legend) + 1)
     title = f'<text class="title" x="{width / 2}" y="16" text-anchor="middle">{_HEADING}</text>'
     entries = []
     for number, (text, look) in enumerate(legend.items(), 1):
-        y = HEIGHT + _TITLE + _LEGEND_LINE * number
+        y = Layout.height + _TITLE + _LEGEND_LINE * number
         entries.append(f'<path class="line {look}" d="M60 {y - 4}h24"/><text x="92" y="{y}">{text}</text>')
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" width="{2 * width}" '
         f'height="{2 * height}"><style>{_STYLE}</style><rect class="page" width="{width}" height="{height}"/>{title}'
-        f'<svg y="{_TITLE}" width="{WIDTH}" height="{HEIGHT}">{plot}</svg>{"".join(entries)}</svg>\n'
+        f'<svg y="{_TITLE}" width="{Layout.width}" height="{Layout.height}">{plot}</svg>{"".join(entries)}</svg>\n'
     )
 
 

@@ -60,11 +60,11 @@ marker_known = false
 # CHECK: who bears the arm's weight while it is recorded: torque_free (a guiding hand) | zero_force | held (its motors).
 hold = "torque_free"
 
-# The measurement frame: the left optical frame, x right, y down, z forward.
+# The measurement frame: the {frame}, x right, y down, z forward.
 [camera]
 # CHECK: the link the cameras stand on, or ride on (a head).
 parent_link = {camera_link}
-# CHECK: pose of the left optical frame in it [m, rad], as in URDF; this rpy looks along the link's x axis.
+# CHECK: pose of the {frame} in it [m, rad], as in URDF; this rpy looks along the link's x axis.
 xyz = [0.0, 0.0, 0.0]
 rpy = [-1.5707963267948966, 0.0, -1.5707963267948966]
 # true once the pose was measured; false fits it first.
@@ -157,6 +157,7 @@ def robot_toml(guess: Guess, seen: Seen = _NOTHING_SEEN) -> str:
         joints=joints,
         marker_link=quoted(guess.marker_link),
         camera_link=quoted(guess.camera_link),
+        frame="left optical frame" if seen.webcam is None else "camera's optical frame",
         eyes=_TWO_EYES if seen.webcam is None else _ONE_EYE,
         marker=marker if seen.tag_mm is None else _TAG.format(side_m=_metres(seen.tag_mm)),
         cameras=_camera_tables(seen),

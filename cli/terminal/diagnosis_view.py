@@ -11,15 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from bodyschema.cli.terminal.screen import BAR_WIDTH
-from bodyschema.diagnosis.report.numbers import (
-    chance,
-    mm,
-    numbers_of,
-    percent,
-    place,
-    share,
-    telling,
-)
+from bodyschema.diagnosis.report.numbers import chance, mm, numbers_of, percent, place, share, telling
 from bodyschema.diagnosis.report.presenters.registry import named, rival_named
 from bodyschema.diagnosis.report.result import SMALL, DiagnosisFile, Errors, Indistinguishable, Verdict
 from bodyschema.diagnosis.report.text import in_order, made_to, modelled, other_shares, to_do

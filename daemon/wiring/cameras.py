@@ -311,7 +311,8 @@ def _lines_of(cameras: CamerasConfig, folder: Path) -> Iterator[str]:
             for name, device in cameras.devices.items():
                 yield f"{name} {device}"
             width, height = layout.image_size_px
-            yield f"images of {width}x{height} pixels for each eye, {layout.fps:g} a second, as {layout.fourcc}"
+            each = " for each eye" if cameras.eyes > 1 else ""
+            yield f"images of {width}x{height} pixels{each}, {layout.fps:g} a second, as {layout.fourcc}"
         case RealsenseConfig(image_size_px=(width, height), serial=serial) as layout:
             which = "the only RealSense" if serial is None else f"RealSense {serial}"
             yield f"{which}: infra-red images of {width}x{height} pixels, {layout.fps:g} a second"

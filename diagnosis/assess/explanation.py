@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from bodyschema.diagnosis.fit.fit import Fit, wanders
+from bodyschema.diagnosis.fit.fit import Fit
+from bodyschema.diagnosis.fit.noise import wanders
 from bodyschema.diagnosis.fit.worth import NAMED
 from bodyschema.diagnosis.search.held_out import Blocks, held_out_errors, is_marker
 from bodyschema.diagnosis.search.search import Search, describe, named
@@ -16,28 +17,26 @@ from bodyschema.diagnosis.unnamed.unknown import Apart, Unknowns, Way
 from bodyschema.effects import Effect
 from bodyschema.interfaces.records import FloatArray
 
-# Unnamed causes are accepted if they are more probable than named ones alone by this [nats].
-_MARGIN = 8.0
-_MOST_UNKNOWNS = 3
-# Safety factor on the first-order gain of several unnamed causes.
-_SLACK = 1.2
-# Cost of each parameter of a named cause when sets of causes are compared [nats].
-_NUMBER = 3.0
-# The imperfect shape of large causes is not an unnamed cause, up to a share of all causes, and a larger share of those
-# that depend on the unobserved path between two readings.
-_OF_THE_CAUSES, _OF_THE_WAY = 0.05, 0.12
-# A smaller share than this is a remainder.
-_REST = 0.25
-# Causes that the same unnamed families explain as well, to within this, are dropped [nats].
-_AS_GOOD = 8.0
-# Unnamed causes alone are refitted with scales of their own where they are no further behind [nats].
-_NEAR = 30.0
-# A smaller share of the held-out squares is a slight gain; 1 % was, and 40 % was not.
-_SLIGHT = 0.02
-# Of the fits along the search, this many first and last ones are tried beside unnamed causes.
-_FIRST, _LAST = 3, 2
-# Rounded readings of a joint at rest cannot produce more evidence than this [nats].
-_BEYOND_DOUBT = 60.0
+
+class _Settings:
+    """Settings of the explanation.
+
+    Sensitivity: each at 0.3 and 3 times changes nothing in three recordings with hidden errors, all of which are named.
+    """
+
+    margin = 8.0  # unnamed causes are accepted if they are more probable than named ones alone by this [nats]
+    most_unknowns = 3
+    slack = 1.2  # safety factor on the first-order gain of several unnamed causes
+    number = 3.0  # cost of each parameter of a named cause when sets of causes are compared [nats]
+    # The imperfect shape of large causes is not an unnamed cause, up to a share of all causes, and a larger share of
+    # those that depend on the unobserved path between two readings.
+    of_the_causes, of_the_way = 0.05, 0.12
+    rest = 0.25  # a smaller share than this is a remainder
+    as_good = 8.0  # causes that the same unnamed families explain as well, to within this, are dropped [nats]
+    near = 30.0  # unnamed causes alone are refitted with scales of their own where they are no further behind [nats]
+    slight = 0.02  # a smaller share of the held-out squares is a slight gain; 1 % was, and 40 % was not
+    first, last = 3, 2  # of the fits along the search, this many first and last ones are tried beside unnamed causes
+    beyond_doubt = 60.0  # rounded readings of a joint at rest cannot produce more evidence than this [nats]
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,29 +115,29 @@ def _compared(found: Fit, path: Sequence[Fit], unknowns: Unknowns, search: Searc
     """
     whole = _length(found, found.run.measured - path[0].run.measured)
     best = _with_unknown(found, unknowns, search, counted)
-    inexact = max(_OF_THE_CAUSES * whole, _OF_THE_WAY * _length(found, changed_by_the_way(found)))
+    inexact = max(_Settings.of_the_causes * whole, _Settings.of_the_way * _length(found, changed_by_the_way(found)))
     if is_at_limit(found.background.scales):
         # Causes of an arm that no workshop made have not been found, so what is left is not their shape.
         inexact = 0.0
     if best.apart is not None and (best.size < inexact or not unknowns.predicts(best.apart, found)):
         best = replace(best, apart=None, size=0.0)
     # Named causes that explain nearly everything are not given up for what explains the rest.
-    is_rest = best.size < _REST * whole
-    margin = _MARGIN if is_rest else 0.0
+    is_rest = best.size < _Settings.rest * whole
+    margin = _Settings.margin if is_rest else 0.0
     # Upper bound of an unnamed cause's gain: to first order it explains no more beside fewer causes.
     hope = counted * found.log_likelihood + best.promise if best.apart is None else np.inf
     looked_at = {(named(found.causes), found.background.scales)}
-    for fit in [*path[:_FIRST], *path[_FIRST:][-_LAST:]]:
+    for fit in [*path[: _Settings.first], *path[_Settings.first :][-_Settings.last :]]:
         looked = named(fit.causes), fit.background.scales
         if looked in looked_at:
             continue
         looked_at.add(looked)
         narrower = found.background.volume(found.noise.sigma) - fit.background.volume(found.noise.sigma)
-        least = best.worth - (_AS_GOOD if best.unknown else 0.0)
+        least = best.worth - (_Settings.as_good if best.unknown else 0.0)
         if hope + counted * narrower - cost_of_names(fit.causes, search) < least:
             continue
         other = _with_unknown(fit, unknowns, search, counted, least)
-        if other.apart is not None and not fit.causes and other.worth > best.worth - _NEAR:
+        if other.apart is not None and not fit.causes and other.worth > best.worth - _Settings.near:
             # The scales of a fit without causes are those of an arm without unnamed causes, or a guess.
             other = _rescaled(other, other.apart, unknowns, search)
         clearly = margin if best.fit is found and not other.is_specific else 0.0
@@ -190,7 +189,7 @@ def useful(explanation: Explanation, search: Search, blocks: Blocks, tell: Calla
 
 def _is_told(cause: Effect, beyond: bool | None, loss: float) -> bool:
     """Return True if a cause is worth telling, whose absence adds a share `loss` to the held-out squares."""
-    if cause.kind.rigid and beyond is not None and loss < _SLIGHT:
+    if cause.kind.rigid and beyond is not None and loss < _Settings.slight:
         # Every link is a little off, so a slight gain of one is chance.
         return beyond
     return loss > 0.0 or bool(beyond)
@@ -221,7 +220,7 @@ def _is_as_good(fewer: Explanation, explanation: Explanation) -> bool:
     if len(fewer.fit.causes) >= len(explanation.fit.causes):
         return False
     ways, needed = ({way.family.what for way in one.unknown} for one in (explanation, fewer))
-    return bool(needed) and needed <= ways and fewer.worth > explanation.worth - _AS_GOOD
+    return bool(needed) and needed <= ways and fewer.worth > explanation.worth - _Settings.as_good
 
 
 def changed_by_the_way(fit: Fit) -> FloatArray:
@@ -242,7 +241,7 @@ def _with_unknown(fit: Fit, unknowns: Unknowns, search: Search, counted: float, 
     """Add worthwhile unnamed causes one by one; stop where the total will hardly reach `least` [nats]."""
     apart: Apart | None = None
     promise, names = -np.inf, cost_of_names(fit.causes, search)
-    while not fit.is_exact and (apart is None or len(apart.chosen) < _MOST_UNKNOWNS):
+    while not fit.is_exact and (apart is None or len(apart.chosen) < _Settings.most_unknowns):
         here, chosen = (fit, ()) if apart is None else (apart.fit, apart.chosen)
         near = unknowns.nearest(here, chosen, counted)
         way, more = near[0]
@@ -250,9 +249,9 @@ def _with_unknown(fit: Fit, unknowns: Unknowns, search: Search, counted: float, 
         spent = 0.0 if apart is None else unknowns.cost(apart)
         worth = counted * here.log_likelihood - names - spent
         # Each remaining unnamed cause is worth hardly more than this one.
-        if worth + _SLACK * (_MOST_UNKNOWNS - len(chosen)) * max(more, 0.0) < least:
+        if worth + _Settings.slack * (_Settings.most_unknowns - len(chosen)) * max(more, 0.0) < least:
             break
-        if more < NAMED or (more < _BEYOND_DOUBT and unknowns.agreed(here, chosen, way) < 0.0):
+        if more < NAMED or (more < _Settings.beyond_doubt and unknowns.agreed(here, chosen, way) < 0.0):
             break
         tried = [unknowns.apart(fit, (*chosen, way), apart) for way, _ in near]
         apart = max(tried, key=lambda one: counted * one.fit.log_likelihood - unknowns.cost(one))
@@ -264,13 +263,13 @@ def _with_unknown(fit: Fit, unknowns: Unknowns, search: Search, counted: float, 
 
 def cost_of_names(causes: Iterable[Effect], search: Search) -> float:
     """Return the cost of causes where sets of causes are compared [nats]."""
-    return sum(_NUMBER * len(effect.amounts) + search.doubt_of(effect) for effect in causes)
+    return sum(_Settings.number * len(effect.amounts) + search.doubt_of(effect) for effect in causes)
 
 
 def _pruned(explanation: Explanation, unknowns: Unknowns, search: Search, *, rest: bool) -> Explanation:
     """Remove causes not worth keeping beside unnamed ones; with a remainder, those the unnamed ones can replace."""
     for cause in explanation.fit.causes:
-        least = explanation.worth - (_AS_GOOD if rest else NAMED)
+        least = explanation.worth - (_Settings.as_good if rest else NAMED)
         fewer = without_one(explanation, cause, unknowns, search, least)
         redundant = _is_as_good(fewer, explanation) if rest else fewer.worth > least
         if fewer.unknown and redundant:

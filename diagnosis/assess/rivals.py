@@ -9,6 +9,7 @@ import numpy as np
 
 from bodyschema.diagnosis.fit.fit import Fit, amount_columns, solved
 from bodyschema.diagnosis.fit.scatter import beyond_single_rows, limited_rows, remembers
+from bodyschema.diagnosis.fit.tangent import TOLD_APART
 from bodyschema.diagnosis.fit.worth import SAME
 from bodyschema.diagnosis.search.held_out import Blocks, beside_fit
 from bodyschema.diagnosis.search.scan import Candidate
@@ -19,23 +20,26 @@ from bodyschema.interfaces.records import FloatArray
 
 from .nameless import Nameless
 
-# Predictions are the same if their expected Δχ² is smaller.
-_SAME_SHARE = 1e-3
-# Share of a column's squares below which it is not told from the fit's own parameters.
-_TOLD = 1e-7
-# Number of resamplings for probabilities; 0.3 to 3 times this changes them by less than 0.03.
-_BAGGED = 400
+
+class _Settings:
+    """Settings of rivals.
+
+    Sensitivity, each at 0.3 and 3 times over three recordings with hidden errors: `comes_near` changes who is a rival,
+    and with it probabilities; `bagged` a probability by up to 0.03; `poses` a word of advice. The rest changes none.
+    """
+
+    same_share = 1e-3  # predictions are the same if their expected Δχ² is smaller
+    bagged = 400  # number of resamplings for probabilities; 0.3 to 3 times this changes them by less than 0.03
+    comes_near = 0.7  # smallest share of a cause's gain that a rival must explain
+    hopeless = 40.0  # a rival less probable by this is not fitted to convergence [nats]
+    # Number of poses over the whole range of the joints, which stand for any motion, and the scatter of the logarithms
+    # of the times between them.
+    poses, uneven = 400, 1.0
+    next_to_it = 1e-3  # smallest move there, as a share of a far one
+
+
 # A less probable rival is not listed.
 PROBABLE = 0.02
-# Smallest share of a cause's gain that a rival must explain.
-_COMES_NEAR = 0.7
-# A rival less probable by this is not fitted to convergence [nats].
-_HOPELESS = 40.0
-# Number of poses over the whole range of the joints, which stand for any motion, and the scatter of the logarithms of
-# the times between them.
-_POSES, _UNEVEN = 400, 1.0
-# Smallest move there, as a share of a far one.
-_NEXT_TO_IT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +72,7 @@ class Rival:
     @property
     def is_same_anywhere(self) -> bool:
         """True if no motion separates it from the cause."""
-        return self.anywhere < _SAME_SHARE * self.signal
+        return self.anywhere < _Settings.same_share * self.signal
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,9 +116,9 @@ def _standing(
     tried: list[tuple[Fit, Effect]] = []
     behind = list[float]()
     for candidate in beside.candidates:
-        if candidate.gain < _COMES_NEAR * itself.gain:
+        if candidate.gain < _Settings.comes_near * itself.gain:
             continue
-        rival = beside.exchanged(candidate, fit.log_likelihood - _HOPELESS)
+        rival = beside.exchanged(candidate, fit.log_likelihood - _Settings.hopeless)
         doubt = float(np.log(max(candidate.trials / max(itself.trials, 1), 1e-3)))
         more = rival.log_likelihood - fit.log_likelihood - beside.cost_of(candidate) - doubt
         more += search.for_zero(fit, itself, candidate)
@@ -123,7 +127,7 @@ def _standing(
         behind.append(more + (beyond_single_rows(fit, rival) if alike else 0.0))
     others: list[tuple[Fit | Nameless, Effect | Nameless]] = [_as_fitted(*one) for one in tried]
     if unknowns is not None:
-        near = unknowns.specific(without, _COMES_NEAR * itself.gain)
+        near = unknowns.specific(without, _Settings.comes_near * itself.gain)
         aparts = [unknowns.apart(without, (way,)) for way in near]
         if (nameless := Nameless.in_place_of(cause, fit, aparts, unknowns, search)) is not None:
             others.append((nameless, nameless))
@@ -131,17 +135,17 @@ def _standing(
     # What a cause is worth allows for blocks already.
     rows = [np.zeros(len(fit.left)), *(_at_rows(fit, other, cause, itself) for other, itself in others)]
     probable = bagged([-worth, *behind], rows, blocks, seed)
-    wide = widened(fit, range(fit.observations.motion.q.shape[1]), uneven=_UNEVEN)
+    wide = widened(fit, range(fit.observations.motion.q.shape[1]), uneven=_Settings.uneven)
     signal = apart_on(fit, without, wide)
     rivals = []
     for (other, alternative), share in zip(others, probable[2:], strict=True):
         if share >= PROBABLE:
             anywhere = apart_on(fit, other, wide)
-            one = anywhere < _SAME_SHARE * signal and _is_no_more(other, fit, without, wide)
+            one = anywhere < _Settings.same_share * signal and _is_no_more(other, fit, without, wide)
             rivals.append(Rival(other, alternative, float(share), _difference(fit, other), anywhere, signal, one))
     same = sum(rival.probability for rival in rivals if rival.is_one)
     ordered = tuple(sorted(rivals, key=lambda rival: rival.probability, reverse=True))
-    sags = is_like_sag(without, cause, _COMES_NEAR * itself.gain)
+    sags = is_like_sag(without, cause, _Settings.comes_near * itself.gain)
     return Standing(itself, float(probable[0]) + same, itself.dof, gain, ordered, sags)
 
 
@@ -166,7 +170,7 @@ def is_like_sag(without: Fit, cause: Effect, least: float) -> bool:
     left = without.evident.ravel()
     toward, squares = beside.T @ left, np.square(beside).sum(axis=0)
     # The share of a column that the fit's own parameters leave may be rounding alone.
-    told = (toward > 0.0) & (squares > _TOLD * np.square(columns).sum(axis=(0, 1)))
+    told = (toward > 0.0) & (squares > TOLD_APART * np.square(columns).sum(axis=(0, 1)))
     explained = np.square(toward[told]) / squares[told]
     rows = 3.0 * float(without.noise.weights.sum())
     share = float(explained.max(initial=0.0)) / max(float(left @ left), 1e-300)
@@ -183,8 +187,10 @@ def bagged(behind: Sequence[float], rows: Sequence[FloatArray], blocks: Blocks, 
         rows: the part of it that each row holds (n,).
     """
     even = np.full(blocks.count, 1.0 / blocks.count)
-    drawn = np.random.default_rng(seed).multinomial(blocks.count, even, _BAGGED) - 1
-    nats = np.array([np.zeros(_BAGGED), *(b + drawn @ blocks.sums(own) for b, own in zip(behind, rows, strict=True))])
+    drawn = np.random.default_rng(seed).multinomial(blocks.count, even, _Settings.bagged) - 1
+    nats = np.array(
+        [np.zeros(_Settings.bagged), *(b + drawn @ blocks.sums(own) for b, own in zip(behind, rows, strict=True))]
+    )
     odds = np.exp(nats - nats.max(axis=0))
     return np.asarray((odds / odds.sum(axis=0)).mean(axis=1), dtype=np.float64)
 
@@ -201,7 +207,7 @@ def _is_no_more(other: Fit | Nameless, fit: Fit, without: Fit, wide: Motion) -> 
     """Return True if the cause, refitted, covers all that a rival can do on any motion."""
     if not isinstance(other, Fit):
         return True
-    return apart_on(other, fit, wide) < _SAME_SHARE * apart_on(other, without, wide)
+    return apart_on(other, fit, wide) < _Settings.same_share * apart_on(other, without, wide)
 
 
 def _as_fitted(fit: Fit, effect: Effect) -> tuple[Fit, Effect]:
@@ -224,13 +230,13 @@ def widened(fit: Fit, joints: Iterable[int], uneven: float = 0.0) -> Motion:
     motion = fit.observations.motion
     rng = np.random.default_rng(0)
     n = len(motion)
-    rows = np.sort(rng.integers(n, size=min(n, _POSES)))
+    rows = np.sort(rng.integers(n, size=min(n, _Settings.poses)))
     q = motion.q[rows].copy()
     for k in joints:
         q[:, k] = rng.uniform(*whole_range(fit, k), len(rows))
         # The second pose of each run is near to far from the first, which separates effects with memory.
         firsts, seconds = q[: len(rows) // 2 * 2 : 2, k], q[1::2, k]
-        seconds[:] = firsts + np.exp(rng.uniform(np.log(_NEXT_TO_IT), 0.0, len(seconds))) * (seconds - firsts)
+        seconds[:] = firsts + np.exp(rng.uniform(np.log(_Settings.next_to_it), 0.0, len(seconds))) * (seconds - firsts)
     clock = motion.clock
     gaps = np.cumsum(np.exp(uneven * rng.normal(size=len(rows))))
     shares = (gaps - gaps[0]) / max(gaps[-1] - gaps[0], 1e-9)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -15,99 +15,38 @@ from bodyschema.effects import Effect, Simulated, Simulation
 from bodyschema.interfaces.records import FloatArray
 
 from .background import MOST, SPREAD, Background, Scales
+from .noise import ROUNDED, Noise, correlation
 from .observations import IntArray, Observations
 from .tangent import Tangent, solved
 
 # Prior limit of an effect, in units of its usual size; unidentifiable parameters stay near zero.
 LARGEST = 10.0
-# Maximum of steps, and the rise of the likelihood below which the fit has converged [nats].
-_ROUNDS, _ENOUGH = 12, 0.02
-# Give up a fit if this multiple of the next step's promise, and this much more [nats], would not suffice.
-_SLACK, _LITTLE = 2.0, 5.0
-# A step that promises a smaller rise is not tried [nats].
-_NOT_TRIED = 1e-3
-# Largest share of a step's squares that kept derivatives may leave to the next: the square of their relative error.
-# With 0.3 to 3 times this, four recordings had the same causes, probabilities to 0.001 and RMS to 0.01 %.
-_LEFT_OVER = 3e-3
-# Uncertainty, in steps that are still valid, of a period or a time constant that is not identifiable.
-_UNTOLD = 10.0
-_FEWEST_OUTLIERS = 1e-4
-# Blocks of time whose disagreement widens the intervals.
-_BLOCKS = 60
-_EM_ROUNDS = 6
-# Scales of the tolerances over which intervals are integrated, in standard deviations of their logarithm.
-# 0.3 to 3 times the span, and 5 to 39 of them, changed intervals of four recordings by less than 5 %.
-_NODES = np.linspace(-3.0, 3.0, 13)
-# A direction is left out if tolerances absorb less than this share of it: 1e-9 gave the same within 0.001 nats.
-_UNABSORBED = 1e-6
-# Relative rounding of products, and of logarithms.
-_ROUNDED_OFF, _STILL = 1e-12, 1e-6
-# Floor of the residuals, in units of the stated noise: numerical rounding.
-ROUNDED = 1e-9
-# Largest correlation of neighbouring rows that counts, and the largest that noise of an instrument is taken to have:
-# that of a slow tracker. With 0.6, three of six recordings of such a tracker were unexplained; with 0.8, two of six
-# errors that wander were noise.
-_MOST_ALIKE, _NOISE_ALIKE = 0.99, 0.7
-# A larger share of outliers within such a window is a change and not outliers.
-_WINDOW, _BURST = 61, 0.45
 
 
-@dataclass(frozen=True, eq=False)
-class Noise:
-    """A mixture: most fixes have the stated noise times `sigma`; a share of outliers lies anywhere.
+class _Settings:
+    """Settings of the fit.
 
-    Outliers are scattered. Where many rows in a row are off, something has changed.
-
-    Attributes:
-        sigma: size of the noise, in units of the stated one.
-        share: share of outliers.
-        weights: probability of each fix to be the marker (n,).
-        log_likelihood: log-likelihood of all residuals [nats].
+    Sensitivity, each at 0.3 and 3 times over seven recordings with hidden errors: `rounds`, `enough`, `not_tried` and
+    `left_over` end fits earlier or later, which changes texts of up to three reports, and a figure by 90 % at most, of
+    a rejected cause; `slack` and `little` change one by 9 % at most, a rival's probability. The others: 2 % at most.
     """
 
-    sigma: float
-    share: float
-    weights: FloatArray
-    log_likelihood: float
-
-    @classmethod
-    def of(
-        cls,
-        residuals: FloatArray,
-        observations: Observations,
-        start: Noise | None = None,
-        spent: Callable[[float], float] = lambda _: 0.0,
-    ) -> Noise:
-        """Fit the most probable noise of residuals (n, 3), by expectation maximisation; untrusted rows are ignored.
-
-        Args:
-            spent: effective number of parameters of a background of tolerances, for noise of a given size.
-        """
-        trusted, outlier_density = observations.trusted, observations.outlier_density
-        squares = np.einsum("ni,ni->n", residuals, residuals)
-        # The median of the sum of three squared standard normal coordinates is 2.366.
-        sigma = float(np.sqrt(max(np.median(squares[trusted]) / 2.366, ROUNDED**2)))
-        share = 0.02 if start is None else start.share
-        weights, total = np.ones(len(squares)), -np.inf
-        for _ in range(_EM_ROUNDS):
-            inlier = np.log1p(-share) - 1.5 * np.log(2.0 * np.pi * sigma**2) - 0.5 * squares / sigma**2
-            outlier = np.log(share) + outlier_density
-            both = np.logaddexp(inlier, outlier)
-            weights = np.exp(inlier - both)
-            off = 1.0 - weights
-            bursts = np.zeros(len(off), dtype=np.bool_)
-            if off.sum() > _BURST * _WINDOW:
-                near = np.convolve(off, np.full(_WINDOW, 1.0 / _WINDOW))[_WINDOW // 2 :][: len(off)]
-                bursts = near > _BURST
-                weights[bursts] = 1.0
-            share = float(np.clip(1.0 - weights[trusted].mean(), _FEWEST_OUTLIERS, 0.5))
-            weights[~trusted] = 0.0
-            total = float(np.where(bursts, inlier, both)[trusted].sum())
-            counted = max(3.0 * max(float(weights.sum()), 1.0) - spent(sigma), 1.0)
-            before, sigma = sigma, float(np.sqrt(max((weights @ squares) / counted, ROUNDED**2)))
-            if abs(sigma - before) < _STILL * sigma:
-                break
-        return cls(sigma, share, weights, total)
+    # Maximum of steps, and the rise of the likelihood below which the fit has converged [nats].
+    rounds, enough = 12, 0.02
+    # Give up a fit if this multiple of the next step's promise, and this much more [nats], would not suffice.
+    slack, little = 2.0, 5.0
+    not_tried = 1e-3  # a step that promises a smaller rise is not tried [nats]
+    # Largest share of a step's squares that kept derivatives may leave to the next: the square of their relative error.
+    # With 0.3 to 3 times this, four recordings had the same causes, probabilities to 0.001 and RMS to 0.01 %.
+    left_over = 3e-3
+    untold = 10.0  # uncertainty, in steps that are still valid, of a period or a time constant that is not identifiable
+    blocks = 60  # blocks of time whose disagreement widens the intervals
+    # Scales of the tolerances over which intervals are integrated, in standard deviations of their logarithm: 5 to 39
+    # change an interval by 3 %. The span, at 0.3 and 3 times: by 5 % on four recordings, by - 26 and + 11 % where the
+    # tolerances are half of what they should be.
+    nodes = np.linspace(-3.0, 3.0, 13)
+    # A direction is left out if tolerances absorb less than this share of it: 1e-9 gave the same within 0.001 nats.
+    unabsorbed = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,7 +187,7 @@ class Fit:
         tolerances = self.background.tolerances
         inner = self.background.inner(self.noise.weights) * np.outer(tolerances, tolerances)
         values, vectors = np.linalg.eigh(inner)
-        there = values > _UNABSORBED * self.noise.sigma**2
+        there = values > _Settings.unabsorbed * self.noise.sigma**2
         values, vectors = values[there], vectors[:, there]
         directions = self.tolerance_columns @ (tolerances[:, None] * vectors / np.sqrt(values))
         return directions, values / (values + self.noise.sigma**2)
@@ -301,13 +240,13 @@ class Fit:
         """
         columns = np.concatenate([self.columns, self.shape_columns], axis=2)
         flat, variance = columns.reshape(self.left.size, -1), self.noise.sigma**2
-        precision = np.append(self.precision, self._shape_precision / _UNTOLD**2)
+        precision = np.append(self.precision, self._shape_precision / _Settings.untold**2)
         information = flat.T @ flat / variance + np.diag(precision)
         # Normalise the units, since seconds and radians differ widely in size.
         units = np.outer(scales := np.sqrt(np.diag(information)), scales)
         covariance = np.asarray(np.linalg.pinv(information / units, rcond=1e-14, hermitian=True) / units)
         scores = np.einsum("nip,ni->np", columns, self.left) / variance
-        firsts = np.unique(np.linspace(0, len(scores), _BLOCKS, endpoint=False).astype(int))
+        firsts = np.unique(np.linspace(0, len(scores), _Settings.blocks, endpoint=False).astype(int))
         moved = np.add.reduceat(scores, firsts, axis=0) @ covariance
         ratio = np.square(moved).sum(axis=0) / np.maximum(np.diag(covariance), 1e-300)
         products = information - np.diag(precision)
@@ -341,8 +280,8 @@ class Fit:
             mine = groups == g
             spent = float(mine.sum() - (here.variances[0] * prior)[mine].sum())
             unsure = 1.0 / np.sqrt(2.0 * max(spent, 0.0) + 1.0 / SPREAD**2)
-            logs = np.log(scale) + unsure * _NODES
-            logs = logs[logs < np.log(MOST) + _STILL]
+            logs = np.log(scale) + unsure * _Settings.nodes
+            logs = logs[logs < np.log(MOST) + _Settings.enough]
             other = np.where(mine, np.exp(-2.0 * (logs - np.log(scale)))[:, None], 1.0) * prior
             tried = _posteriors(inner, toward, now, other)
             evidence = tried.evidence + 0.5 * np.log(other[:, mine]).sum(axis=1) - 0.5 * np.square(logs / SPREAD)
@@ -553,29 +492,6 @@ class Fit:
         return replace(started, tangent=self.own_tangent)
 
 
-def correlation(left: FloatArray, begins: NDArray[np.bool_]) -> float:
-    """Return the correlation [0, 1) of residuals (n, 3) of neighbouring rows; 0 within two errors of white rows.
-
-    Args:
-        begins: (n,), True in the first row after each break.
-    """
-    follows = ~begins[1:]
-    agree = float((left[1:][follows] * left[:-1][follows]).sum())
-    squares = float(np.square(left[1:][follows]).sum())
-    rho = float(np.clip(agree / max(squares, 1e-300), 0.0, _MOST_ALIKE))
-    return rho if rho > 2.0 / np.sqrt(max(3.0 * float(follows.sum()), 1.0)) else 0.0
-
-
-def wanders(rho: float, begins: NDArray[np.bool_]) -> bool:
-    """Return True if residuals of neighbouring rows are surely more alike than the noise of an instrument.
-
-    Args:
-        rho: their correlation.
-        begins: (n,), True in the first row after each break.
-    """
-    return rho - 2.0 * np.sqrt((1.0 - rho**2) / max(3.0 * float((~begins[1:]).sum()), 1.0)) > _NOISE_ALIKE
-
-
 def fitted(observations: Observations, simulation: Simulation, nuisances: int, start: Noise | None = None) -> Fit:
     """Fit the most probable amounts of all effects of `simulation`, by damped Gauss-Newton steps.
 
@@ -597,16 +513,16 @@ def improved(fit: Fit, least: float = -np.inf) -> Fit:
     if not fit.simulation.effects and not len(fit.tolerated):
         return fit
     tangent, is_fresh, before = fit.near_tangent, fit.tangent is None, np.inf
-    for done in range(_ROUNDS):
+    for done in range(_Settings.rounds):
         step, promised = fit.step(tangent)
         # In squares, since the noise falls as well.
         square = promised * fit.noise.sigma**2
-        if not is_fresh and square > _LEFT_OVER * before:
+        if not is_fresh and square > _Settings.left_over * before:
             tangent, is_fresh = fit.own_tangent, True
             step, promised = fit.step(tangent)
             square = promised * fit.noise.sigma**2
-        hopeless = fit.log_likelihood + _SLACK * _rise(promised, fit) + _LITTLE < least
-        if promised < _NOT_TRIED or (done and hopeless):
+        hopeless = fit.log_likelihood + _Settings.slack * _rise(promised, fit) + _Settings.little < least
+        if promised < _Settings.not_tried or (done and hopeless):
             return fit
         best = _best_of(fit, step)
         if best is None and not is_fresh:
@@ -616,7 +532,7 @@ def improved(fit: Fit, least: float = -np.inf) -> Fit:
             return fit
         gained = best.log_likelihood - fit.log_likelihood
         fit, is_fresh, before = best, False, square
-        if gained < _ENOUGH:
+        if gained < _Settings.enough:
             break
     return fit
 
@@ -647,7 +563,7 @@ def _posteriors(inner: FloatArray, scores: FloatArray, now: FloatArray, precisio
     Args:
         precision: prior precisions (m, p).
     """
-    information = inner + (precision + _ROUNDED_OFF)[:, :, None] * np.eye(len(scores))
+    information = inner + (precision + np.finfo(np.float64).eps)[:, :, None] * np.eye(len(scores))
     covariances, toward = np.linalg.inv(information), scores - precision * now
     means = np.einsum("mpq,mq->mp", covariances, toward)
     evidence = 0.5 * (means * toward).sum(axis=1) - 0.5 * precision @ np.square(now)

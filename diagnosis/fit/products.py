@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from bodyschema.effects import Effect
 from bodyschema.interfaces.records import FloatArray
 
-from .fit import ROUNDED, Fit
+from .fit import Fit
+from .noise import ROUNDED
 
 # Relative size below which a direction that all others can change is rounding error.
 _ROUNDED_OFF = 1e-9

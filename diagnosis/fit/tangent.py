@@ -16,6 +16,8 @@ from .background import Background
 
 # Columns of unit length with a smaller part beside the others are collinear, for a Cholesky factor [squared length].
 _COLLINEAR = 1e-11
+# A column that keeps a smaller share of its squares beside the others is not identifiable: it is of their rounding.
+TOLD_APART = 1e-7
 # Relative size below which an eigenvalue of normal equations is rounding.
 _SINGULAR = 1e-12
 

@@ -16,7 +16,9 @@ from bodyschema.diagnosis.search.together import is_at_limit
 from bodyschema.effects import Effect
 from bodyschema.interfaces.records import FloatArray
 
+from .residuals import SIGNIFICANT
 from .result import (
+    EVEN,
     OUTLIERS,
     Cause,
     DiagnosisFile,
@@ -33,14 +35,8 @@ from .result import (
 from .text import advice, evidence, sentence
 
 _HALF_WIDTH_95 = 1.959964
-# Probability that causes which describe the error, and do not explain it, are there at all.
-_OF_A_DESCRIPTION = 0.5
-# ... and that an error beside a joint that gives is one of its own, where the weight is assumed.
-_OF_A_GUESS = 0.5
 _UNKNOWN_WEIGHT = "the spread of the arm's weight, which the URDF does not state"
 _UNTESTED_WEIGHT = "sag, which was not tested: robot.toml says that the hand bore the weight"
-# Below this p-value, the report explains why a hypothesis is not a cause.
-_HARDLY_CHANCE = 1e-3
 
 
 def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
@@ -133,7 +129,8 @@ def _mean_mm(diagnosis: Diagnosis) -> Errors:
 
 def _causes(diagnosis: Diagnosis, seen_by: str) -> tuple[Cause, ...]:
     fit, worse = diagnosis.extended, [max(diagnosis.worse_without[c.identity], 1.0) for c in diagnosis.causes]
-    sure, causes = _OF_A_DESCRIPTION if diagnosis.ended_early else 1.0, []
+    # Causes that describe the error, and do not explain it, may not be there at all.
+    sure, causes = EVEN if diagnosis.ended_early else 1.0, []
     parts = zip(fit.causes, diagnosis.standings, diagnosis.shares.causes, worse, strict=True)
     for cause, standing, share, squares in parts:
         causes.append(
@@ -164,8 +161,8 @@ def _causes(diagnosis: Diagnosis, seen_by: str) -> tuple[Cause, ...]:
 
 def _or_sag(cause: Cause, what: str) -> Cause:
     """Return a cause that may be a joint that gives, or a part of that, where the weight is assumed or not tested."""
-    sag = Indistinguishable("unexplained", None, None, "this_motion", _OF_A_GUESS, what)
-    return msgspec.structs.replace(cause, probability=min(cause.probability, _OF_A_GUESS), rivals=(sag, *cause.rivals))
+    sag = Indistinguishable("unexplained", None, None, "this_motion", EVEN, what)
+    return msgspec.structs.replace(cause, probability=min(cause.probability, EVEN), rivals=(sag, *cause.rivals))
 
 
 def _named(rival: Rival) -> Indistinguishable:
@@ -243,7 +240,7 @@ def _rejected(diagnosis: Diagnosis) -> tuple[Rejected, ...]:
     rows = []
     for candidate, more in diagnosis.rejected:
         chance = min(1.0, more.p_value * tried)
-        why = _why_not(diagnosis, candidate, tried) if chance < _HARDLY_CHANCE else ""
+        why = _why_not(diagnosis, candidate, tried) if chance < SIGNIFICANT else ""
         rows.append(Rejected(*candidate.effect.key, more.held_out_gain_percent, chance, why))
     return tuple(sorted(rows, key=lambda row: row.held_out_gain_percent, reverse=True))
 

@@ -19,9 +19,8 @@ from bodyschema.diagnosis.report.text import corrections, finding, in_order, mad
 from bodyschema.effects import Effect
 
 from . import tables
-from .panels import Panel, panels
+from .panels import Panel, arrows, histogram, panels
 from .residuals import Residuals
-from .spread import arrows, histogram
 
 _STYLE = (Path(__file__).parent / "page.css").read_text(encoding="utf-8")
 _VERDICTS: dict[Verdict, tuple[str, str]] = {

@@ -1,4 +1,4 @@
-"""Plot errors before and after against everything they may depend on, the most informative first."""
+"""Plot errors before and after: against everything they may depend on, their sizes, and their directions."""
 
 from __future__ import annotations
 
@@ -11,17 +11,8 @@ from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray
 
-from .plot import ASPECT, Plot, round_up, span
-from .residuals import POINTS, Residuals, binned, structure
-
-# Share of the error variance that a plot must explain to be shown at first.
-_TELLING = 0.02
-# Share of single errors at each end that does not set the range of a plot.
-_CUT = 0.01
-_CELLS = (10, 6)
-_FEWEST_IN_A_CELL = 3
-# Length of the longest mean arrow, as a share of a cell.
-_OF_A_CELL = 1.0
+from .plot import ASPECT, Layout, Plot, round_up, span
+from .residuals import ARROWS, POINTS, Residuals, binned, structure
 
 
 @dataclass(frozen=True)
@@ -41,7 +32,7 @@ class Panel:
     @property
     def is_telling(self) -> bool:
         """True if the plot shows a clear dependence."""
-        return self.tells >= _TELLING
+        return self.tells >= Layout.telling
 
     def html(self) -> str:
         """Return the plot with its title."""
@@ -62,7 +53,7 @@ def _compared(
     rows = residuals.rows
     some = residuals.some(POINTS)
     means = [(binned(x[rows], y[rows]), look) for y, look in ((before, "before"), (after, "after"))]
-    plot = Plot(*axes, span(x[rows]), span(before[rows], after[rows], cut=_CUT, around_zero=True))
+    plot = Plot(*axes, span(x[rows]), span(before[rows], after[rows], cut=Layout.cut, around_zero=True))
     marks = [plot.dots(x[some], before[some], "pale before"), plot.dots(x[some], after[some], "pale after")]
     marks += [plot.bars(bins.x, bins.y, bins.half, look) for bins, look in means]
     tells = max(structure(x[rows], y[rows]) for y in (before, after))
@@ -157,10 +148,11 @@ def _by_image(residuals: Residuals) -> Iterator[Panel]:
         for look, error in (("before", residuals.before), ("after", residuals.after))
     }
     low, high = _framed(at.min(axis=0), at.max(axis=0))
-    cells = np.clip(((at - low) / (high - low) * _CELLS).astype(np.intp), 0, np.array(_CELLS) - 1) @ (1, _CELLS[0])
+    count = np.array(Layout.cells)
+    cells = np.clip(((at - low) / (high - low) * count).astype(np.intp), 0, count - 1) @ (1, count[0])
     means = {look: _cell_means(cells, at, error) for look, error in errors.items()}
     longest = round_up(max(float(np.linalg.norm(m[:, 2:], axis=1).max(initial=1e-6)) for m in means.values()))
-    stretch = _OF_A_CELL * float(high[0] - low[0]) / _CELLS[0] / longest
+    stretch = float(high[0] - low[0]) / Layout.cells[0] / longest
     plot = Plot("u in the left image [px]", "v [px]", (low[0], high[0]), (high[1], low[1]))
     marks = [plot.arrows(m[:, 0], m[:, 1], stretch * m[:, 2], stretch * m[:, 3], look) for look, m in means.items()]
     tells = max(structure(at[:, i], error[:, j]) for error in errors.values() for i in (0, 1) for j in (0, 1))
@@ -181,6 +173,75 @@ def _cell_means(cells: NDArray[np.intp], at: FloatArray, error: FloatArray) -> F
     arrows = [
         np.concatenate([at[rows].mean(axis=0), error[rows].mean(axis=0)])
         for rows in inside
-        if rows.sum() >= _FEWEST_IN_A_CELL
+        if rows.sum() >= Layout.fewest_in_a_cell
     ]
     return np.array(arrows).reshape(-1, 4)
+
+
+def histogram(residuals: Residuals) -> Panel:
+    """Plot lengths of the errors before and after, beside those of noise alone."""
+    before, after = (1e3 * np.linalg.norm(e[residuals.rows], axis=1) for e in (residuals.before, residuals.after))
+    noise = 1e3 * _noise(residuals)
+    end = float(np.quantile(np.concatenate([before, after]), Layout.shown)) or 1.0
+    columns = int(np.clip(len(before) // Layout.pairs_a_column, Layout.fewest_columns, Layout.most_columns))
+    edges = np.linspace(0.0, end, columns + 1)
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    shares = {
+        look: 100.0 * np.histogram(lengths, edges)[0] / len(lengths)
+        for look, lengths in (("before", before), ("after", after), ("noise", noise))
+    }
+    top = max(float(share.max()) for share in shares.values())
+    plot = Plot("error [mm]", "share of the pairs [%]", (0.0, end), (0.0, 1.06 * top))
+    marks = [plot.area(middle, shares[look], look) for look in ("before", "after")]
+    return Panel(
+        "How large the errors are: before, after, and what noise alone would be (line)",
+        plot.svg(*marks, plot.line(middle, shares["noise"], "noise")),
+    )
+
+
+def _noise(residuals: Residuals) -> FloatArray:
+    """Return lengths of errors due to noise alone."""
+    fit = residuals.diagnosis.extended
+    spread = np.linalg.inv(fit.observations.whitening[residuals.rows])
+    rng = np.random.default_rng(residuals.diagnosis.seed)
+    drawn = rng.normal(size=(Layout.drawn, len(spread), 3))
+    return fit.noise.sigma * np.linalg.norm(np.einsum("nij,knj->kni", spread, drawn), axis=2).ravel()
+
+
+def arrows(residuals: Residuals) -> tuple[list[Panel], float]:
+    """Return three projections before and three after at the same scale, and the stretch of the arrows."""
+    rows = residuals.some(ARROWS)
+    at = residuals.diagnosis.extended.observations.x[rows]
+    extent = float(np.ptp(at, axis=0).max()) or 1.0
+    usual = float(np.quantile(np.linalg.norm(residuals.before[rows], axis=1), Layout.shorter)) or 1e-6
+    stretch = max(round_up(Layout.long * extent / usual), 1.0)
+    if residuals.calibration is not None:
+        views = (("as the camera sees it", 0, 1, 1), ("from above the camera", 0, 2, -1), ("from its side", 2, 1, 1))
+    else:
+        views = (("x and y", 0, 1, -1), ("x and z", 0, 2, -1), ("y and z", 1, 2, -1))
+    panels = [
+        Panel(f"{when}: {name}", _projection(at, errors[rows], stretch, (across, down), sign, extent, look))
+        for when, look, errors in (("Before", "before", residuals.before), ("After", "after", residuals.after))
+        for name, across, down, sign in views
+    ]
+    return panels, stretch
+
+
+def _projection(
+    at: FloatArray, errors: FloatArray, stretch: float, axes: tuple[int, int], sign: int, extent: float, look: str
+) -> str:
+    """Draw arrows from the predicted to the measured marker position, stretched."""
+    flip = np.array([1.0, sign])
+    middle = 0.5 * (at.min(axis=0) + at.max(axis=0))
+    scale = (Layout.side - 2 * Layout.margin) / extent
+    feet = (at - errors - middle)[:, axes] * flip * scale + 0.5 * Layout.side
+    ends = stretch * errors[:, axes] * flip * scale
+    path = "".join(f"M{x:.1f} {y:.1f}l{dx:.1f} {dy:.1f}" for (x, y), (dx, dy) in zip(feet, ends, strict=True))
+    dots = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in feet)
+    bar = round_up(0.2 * extent)
+    return (
+        f'<svg viewBox="0 0 {Layout.side} {Layout.side}" role="img" aria-label="error arrows">'
+        f'<path class="arrows {look}" d="{path}"/><path class="feet {look}" d="{dots}"/>'
+        f'<path class="scale" d="M8 {Layout.side - 8}h{bar * scale:.1f}"/>'
+        f'<text x="{14 + bar * scale:.1f}" y="{Layout.side - 4}">{100 * bar:.3g} cm</text></svg>'
+    )

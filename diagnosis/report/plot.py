@@ -12,11 +12,24 @@ import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
 
-WIDTH, HEIGHT = 380, 236
-_LEFT, _RIGHT, _TOP, _BOTTOM = 52, 10, 10, 40
-_STEPS = (1.0, 2.0, 2.5, 5.0, 10.0)
-_TICKS = 5
-ASPECT = (WIDTH - _LEFT - _RIGHT) / (HEIGHT - _TOP - _BOTTOM)
+
+class Layout:
+    """Layout of the report's drawings; no figure depends on it."""
+
+    width, height = 380, 236
+    left, top, right, bottom = 52, 10, 370, 196  # the axes
+    steps, ticks = (1.0, 2.0, 2.5, 5.0, 10.0), 5  # between ticks, and usual number of them
+    telling = 0.02  # share of the error variance that a plot must explain to be shown at first
+    cut = 0.01  # share of single errors at each end that does not set the range of a plot
+    cells, fewest_in_a_cell = (10, 6), 3
+    # Histogram: columns, the quantile of the errors at which it ends, and noise samples per row.
+    most_columns, fewest_columns, pairs_a_column, shown, drawn = 48, 12, 12, 0.99, 20
+    side, margin = 300, 26  # of a view with arrows
+    # Arrow length as a share of the largest span, for the given quantile of the errors before.
+    long, shorter = 0.1, 0.9
+
+
+ASPECT = (Layout.right - Layout.left) / (Layout.bottom - Layout.top)
 
 
 @dataclass(frozen=True)
@@ -40,10 +53,11 @@ class Plot:
     def svg(self, *marks: str) -> str:
         """Return the plot with marks, the first at the back."""
         label = escape(f"{self.y_label} against {self.x_label}", quote=True)
-        box = (_LEFT, _TOP, WIDTH - _LEFT - _RIGHT, HEIGHT - _TOP - _BOTTOM)
+        box = (Layout.left, Layout.top, Layout.right - Layout.left, Layout.bottom - Layout.top)
         place = " ".join(f'{name}="{value}"' for name, value in zip(("x", "y", "width", "height"), box, strict=True))
         inside = f'<svg {place} viewBox="{" ".join(map(str, box))}">{"".join(marks)}</svg>'
-        return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{label}">{self._grid()}{inside}</svg>'
+        size = f"0 0 {Layout.width} {Layout.height}"
+        return f'<svg viewBox="{size}" role="img" aria-label="{label}">{self._grid()}{inside}</svg>'
 
     def dots(self, x: FloatArray, y: FloatArray, look: str) -> str:
         """Draw the points inside the axes, as one path to keep the file small."""
@@ -70,7 +84,7 @@ class Plot:
         """Fill the area down to the x axis."""
         left, top = self._at(x, y)
         points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(left, top, strict=True))
-        bottom = HEIGHT - _BOTTOM
+        bottom = Layout.bottom
         return f'<polygon class="area {look}" points="{left[0]:.1f},{bottom} {points} {left[-1]:.1f},{bottom}"/>'
 
     def arrows(self, x: FloatArray, y: FloatArray, dx: FloatArray, dy: FloatArray, look: str) -> str:
@@ -84,12 +98,12 @@ class Plot:
 
     def moment(self, x: float, text: str) -> str:
         """Draw a labelled vertical line."""
-        left, _ = self._at(np.array([x]), np.array([self.y[0]]))
+        (left, _), top = self._at(np.array([x]), np.array([self.y[0]])), Layout.top
         side = "end" if x > 0.5 * sum(self.x) else "start"
         shift = -4 if side == "end" else 4
         return (
-            f'<line class="moment" x1="{left[0]:.1f}" x2="{left[0]:.1f}" y1="{_TOP}" y2="{HEIGHT - _BOTTOM}"/>'
-            f'<text class="named" x="{left[0] + shift:.1f}" y="{_TOP + 11}" text-anchor="{side}">{escape(text)}</text>'
+            f'<line class="moment" x1="{left[0]:.1f}" x2="{left[0]:.1f}" y1="{top}" y2="{Layout.bottom}"/>'
+            f'<text class="named" x="{left[0] + shift:.1f}" y="{top + 11}" text-anchor="{side}">{escape(text)}</text>'
         )
 
     def _points(self, x: FloatArray, y: FloatArray) -> str:
@@ -105,35 +119,34 @@ class Plot:
         across = (x - self.x[0]) / (self.x[1] - self.x[0])
         low, high = self._height(self.y[0]), self._height(self.y[1])
         up = (self._height(y) - low) / (high - low)
-        return _LEFT + across * (WIDTH - _LEFT - _RIGHT), HEIGHT - _BOTTOM - up * (HEIGHT - _TOP - _BOTTOM)
+        left, bottom = Layout.left, Layout.bottom
+        return left + across * (Layout.right - left), bottom - up * (bottom - Layout.top)
 
     def _height(self, y: Any) -> Any:
         return np.log10(y) if self.log_y else y
 
     def _grid(self) -> str:
-        bottom, right = HEIGHT - _BOTTOM, WIDTH - _RIGHT
-        parts = []
+        left, right, bottom, parts = Layout.left, Layout.right, Layout.bottom, []
         for value in (log_ticks if self.log_y else ticks)(*sorted(self.y)):
             y = self._at(np.array([self.x[0]]), np.array([value]))[1][0]
             zero = " zero" if value == 0.0 else ""
-            parts.append(f'<line class="grid{zero}" x1="{_LEFT}" x2="{right}" y1="{y:.1f}" y2="{y:.1f}"/>')
-            parts.append(f'<text x="{_LEFT - 5}" y="{y + 4:.1f}" text-anchor="end">{_figure(value)}</text>')
+            parts.append(f'<line class="grid{zero}" x1="{left}" x2="{right}" y1="{y:.1f}" y2="{y:.1f}"/>')
+            parts.append(f'<text x="{left - 5}" y="{y + 4:.1f}" text-anchor="end">{_figure(value)}</text>')
         marks = [(float(k), name) for k, name in enumerate(self.names)]
         for value, name in marks or [(value, _figure(value)) for value in ticks(*self.x)]:
             x = self._at(np.array([value]), np.array([self.y[0]]))[0][0]
             parts.append(f'<text x="{x:.1f}" y="{bottom + 15}" text-anchor="middle">{escape(name)}</text>')
-        middle = 0.5 * (_LEFT + right)
-        parts.append(
-            f'<text class="label" x="{middle}" y="{HEIGHT - 6}" text-anchor="middle">{escape(self.x_label)}</text>'
-        )
-        turned = f"translate(11 {0.5 * (bottom + _TOP):.0f}) rotate(-90)"
+        middle = 0.5 * (left + right)
+        below = Layout.height - 6
+        parts.append(f'<text class="label" x="{middle}" y="{below}" text-anchor="middle">{escape(self.x_label)}</text>')
+        turned = f"translate(11 {0.5 * (bottom + Layout.top):.0f}) rotate(-90)"
         parts.append(f'<text class="label" transform="{turned}" text-anchor="middle">{escape(self.y_label)}</text>')
         return "".join(parts)
 
 
 def ticks(low: float, high: float) -> list[float]:
     """Return round figures in a range."""
-    step = round_up((high - low) / _TICKS)
+    step = round_up((high - low) / Layout.ticks)
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
     return [k * step for k in range(first, last + 1)]
 
@@ -152,7 +165,7 @@ def log_ticks(low: float, high: float) -> list[float]:
 def round_up(value: float) -> float:
     """Return the next figure of 1, 2, 2.5, 5 times a power of ten."""
     power = 10.0 ** math.floor(math.log10(max(value, 1e-12)))
-    return next(factor * power for factor in _STEPS if factor * power >= value * (1.0 - 1e-9))
+    return next(factor * power for factor in Layout.steps if factor * power >= value * (1.0 - 1e-9))
 
 
 def span(*values: FloatArray, cut: float = 0.0, around_zero: bool = False) -> tuple[float, float]:

@@ -19,8 +19,8 @@ POINTS, ARROWS = 450, 220
 # A joint's rows count if it moves the marker by this share of its median effect.
 _TELLS = 0.5
 _BINS, _FEWEST_IN_A_BIN = 16, 8
-# Structure with a larger p-value counts as chance.
-_SIGNIFICANT = 1e-3
+# A larger p-value counts as chance.
+SIGNIFICANT = 1e-3
 
 
 @dataclass(frozen=True)
@@ -163,7 +163,7 @@ def structure(x: FloatArray, y: FloatArray) -> float:
     inside = float(np.square(y - means[member]).sum())
     between = float(np.square(means[member] - y.mean()).sum())
     ratio = (between / (groups - 1)) / max(inside / (n - groups), 1e-300)
-    if fdtrc(groups - 1, n - groups, ratio) > _SIGNIFICANT:
+    if fdtrc(groups - 1, n - groups, ratio) > SIGNIFICANT:
         return 0.0
     share = between / max(between + inside, 1e-300)
     return max(share - (groups - 1) / (n - 1), 0.0)

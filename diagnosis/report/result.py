@@ -13,7 +13,7 @@ SURE = 0.9
 # Fixes that are not the marker, as a cause.
 OUTLIERS = "outliers"
 # Probability of what is no more probable than not.
-_EVEN = 0.5
+EVEN = 0.5
 Verdict = Literal["explained", "nothing_found", "undecided", "unexplained"]
 
 
@@ -100,7 +100,7 @@ class Cause(msgspec.Struct, frozen=True):
     @property
     def is_correction(self) -> bool:
         """True for one that makes a small difference, and is no more probable than not: its cause is not known."""
-        return self.is_small and self.probability <= _EVEN
+        return self.is_small and self.probability <= EVEN
 
 
 class Rejected(msgspec.Struct, frozen=True):

@@ -5,16 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from html import escape
 
-from bodyschema.diagnosis.report.numbers import (
-    Number,
-    chance,
-    mm,
-    numbers_of,
-    percent,
-    place,
-    share,
-    telling,
-)
+from bodyschema.diagnosis.report.numbers import Number, chance, mm, numbers_of, percent, place, share, telling
 from bodyschema.diagnosis.report.presenters.registry import rival_named
 from bodyschema.diagnosis.report.result import Cause, DiagnosisFile, Indistinguishable, Rejected
 from bodyschema.diagnosis.report.text import in_order, other_shares

@@ -20,16 +20,16 @@ from bodyschema.robot.description import RobotDescription
 from .numbers import told_values
 from .result import SMALL, SURE, Cause, DiagnosisFile, Errors, Gain, Interval, Tolerances, Unexplained, Verdict
 
-# Tolerances that leave at most this share of the error are mentioned.
-_BY_TOLERANCES = 0.95
-# An interval with a larger ratio of its ends is given by its upper end.
-_UNTOLD = 10.0
-# A headline names this many causes and counts the others, to fit two lines.
-_TOLD = 2
-# Number of pairs of causes named with the motion that tells them apart.
-_PAIRS = 3
-# Smallest Δχ² between two causes at which a motion is worth advising.
-_TELLS = 25.0
+
+class _Settings:
+    """Settings of the text, which change words and no figure."""
+
+    by_tolerances = 0.95  # tolerances that leave at most this share of the error are mentioned
+    untold = 10.0  # an interval with a larger ratio of its ends is given by its upper end
+    named, pairs = 2, 3  # causes in a headline, to fit two lines; pairs of causes with a motion that tells them apart
+    worth_a_motion = 25.0  # smallest Δχ² between two causes at which a motion is advised
+
+
 # Measurements that reveal an unnamed cause.
 _WATCH = {
     "joint": "compare its reading with an angle that is measured otherwise",
@@ -126,7 +126,7 @@ def sentence(
         timed, weighed: as in `Found`.
     """
     figures = f"{rms.aligned:.3g} → {rms.extended:.3g} mm on held-out data"
-    if verdict == "nothing_found" and rms.extended < _BY_TOLERANCES * rms.aligned:
+    if verdict == "nothing_found" and rms.extended < _Settings.by_tolerances * rms.aligned:
         return f"No cause stands out: small errors everywhere explain {_share(gain)} ({figures})"
     if verdict == "nothing_found" and tolerances is not None and not tolerances.in_extended:
         return f"No cause stands out; small errors everywhere are not known well enough to correct {rms.aligned:.3g} mm"
@@ -145,7 +145,7 @@ def sentence(
         return f"{head}: this explains the pairs that were fitted and no others ({figures})"
     if named_mm is not None:
         figures += f", {named_mm:.3g} mm without the smooth model of the rest"
-    elif tolerated_mm is not None and tolerated_mm < _BY_TOLERANCES * rms.aligned:
+    elif tolerated_mm is not None and tolerated_mm < _Settings.by_tolerances * rms.aligned:
         figures += f", {tolerated_mm:.3g} mm with tolerances alone"
     return f"{head}. RMS error {figures}{_open(verdict, causes, seen_by)}"
 
@@ -154,7 +154,8 @@ def _head(causes: Sequence[Cause], tolerances: Tolerances | None, seen_by: str, 
     """Return the largest causes as a sentence without its full stop."""
     ordered = in_order(causes)
     everywhere = ["small errors everywhere"] if _shows(tolerances) else []
-    first = [cause for cause in ordered if not (cause.is_correction or (everywhere and cause.is_small))][:_TOLD]
+    first = [cause for cause in ordered if not (cause.is_correction or (everywhere and cause.is_small))]
+    first = first[: _Settings.named]
     said = [finding(c.effect, c.where, c.source, told_values(c), seen_by, timed=timed, weighed=weighed) for c in first]
     told = [clause + _or(cause, seen_by) for clause, cause in zip(said, first, strict=True)]
     others = [cause.is_outvoted or cause.is_correction for cause in ordered if cause not in first]
@@ -200,7 +201,7 @@ def made_to(tolerances: Tolerances) -> str:
 
     def told(size: Interval, unit: str, sign: str = "") -> str:
         low, high = size.ci95
-        if high > _UNTOLD * low:
+        if high > _Settings.untold * low:
             return f"at most {sign}{high:.1g}{unit}"
         return f"about {sign}{size.value:.1g}{unit}"
 
@@ -303,8 +304,8 @@ def _of_the_model(diagnosis: Diagnosis) -> str:
 
 def _some(pairs: Sequence[str]) -> str:
     """Return the first of some pairs of causes, and the number of the others."""
-    more = len(pairs) - _PAIRS
-    return ", ".join(pairs[:_PAIRS]) + (f" and {more} more" if more > 0 else "")
+    more = len(pairs) - _Settings.pairs
+    return ", ".join(pairs[: _Settings.pairs]) + (f" and {more} more" if more > 0 else "")
 
 
 def _motion(diagnosis: Diagnosis, rival: Rival) -> str:
@@ -312,13 +313,13 @@ def _motion(diagnosis: Diagnosis, rival: Rival) -> str:
     robot, fit = diagnosis.extended.simulation.robot, diagnosis.sought
     apart = [apart_on(fit, rival.instead, widened(fit, [k])) for k in range(len(robot.joints))]
     best = int(np.argmax(apart))
-    if apart[best] >= _TELLS:
+    if apart[best] >= _Settings.worth_a_motion:
         low, high = whole_range(fit, best)
         unit, scale = ("mm", 1e3) if robot.chain.prismatic[best] else ("°", 180.0 / np.pi)
         span = f"{low * scale:.0f}{unit} to {high * scale:.0f}{unit}"
         return f"move joint {robot.joints[best]} through its whole range ({span}) in another recording"
     poses = "record poses over the whole range of all joints, with stops and at different speeds"
-    if rival.anywhere >= _TELLS:
+    if rival.anywhere >= _Settings.worth_a_motion:
         return poses
-    pairs = len(fit.observations) * _TELLS / rival.anywhere
+    pairs = len(fit.observations) * _Settings.worth_a_motion / rival.anywhere
     return f"{poses}: about {float(f'{pairs:.1g}'):,.0f} of them, since the effect is small beside the noise"

@@ -16,18 +16,27 @@ from scipy.special import fdtrc
 from bodyschema.diagnosis.fit.fit import LARGEST, Fit, solved
 from bodyschema.diagnosis.fit.observations import IntArray
 from bodyschema.diagnosis.fit.scatter import instruments
+from bodyschema.diagnosis.fit.tangent import TOLD_APART
 from bodyschema.interfaces.records import FloatArray
 
 from .scan import Candidate
 
-# Maximum of blocks of time, and the number of folds they are dealt to in turn.
-_MOST_BLOCKS, _FOLDS = 80, 5
+
+class _Settings:
+    """Settings of held-out prediction.
+
+    Sensitivity, each at 0.3 and 3 times over three recordings: `folds` and the rows of a block change probabilities by
+    0.005, gains by 2 %, and gains of rejected causes by their own size; `bootstraps` and `long_blocks` the ends of the
+    gain's interval; with `marker` above 1 no fix is left. Other `most_blocks` were not measured.
+    """
+
+    most_blocks, folds = 80, 5  # of time; blocks are dealt to the folds in turn
+    # Neighbours in time are alike for long, so a gain's interval rests on this many long parts of a recording.
+    bootstraps, long_blocks = 2000, 10
+    marker = 0.5  # a fix that is less probably the marker is left out of all figures
+
+
 FEWEST_ROWS_A_BLOCK = 5
-_BOOTSTRAPS = 2000
-# Neighbours in time are alike for long, so a gain's interval rests on this many long parts of a recording.
-_LONG_BLOCKS = 10
-# A fix whose probability of being the marker is lower is left out of all figures.
-_MARKER = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,15 +52,15 @@ class Blocks:
     count: int
 
     @classmethod
-    def cut(cls, rows: int, most: int = _MOST_BLOCKS) -> Blocks:
+    def cut(cls, rows: int, most: int = _Settings.most_blocks) -> Blocks:
         """Cut rows into blocks of equal length, as many as make sense."""
-        count = int(np.clip(rows // FEWEST_ROWS_A_BLOCK, _FOLDS, most))
+        count = int(np.clip(rows // FEWEST_ROWS_A_BLOCK, _Settings.folds, most))
         return cls(np.arange(rows) * count // max(rows, 1), count)
 
     @property
     def fold(self) -> IntArray:
         """Fold of each row (n,)."""
-        return self.of_row % _FOLDS
+        return self.of_row % _Settings.folds
 
     def merged(self, most: int) -> Blocks:
         """Return at most `most` longer blocks of neighbouring blocks."""
@@ -85,15 +94,15 @@ def gain_percent(before: FloatArray, after: FloatArray, blocks: Blocks, seed: in
     The interval is for another recording of the same kind, half as long: long blocks are resampled, since this
     recording is a sample, and as many as the other one has are drawn from them.
     """
-    blocks = blocks.merged(_LONG_BLOCKS)
+    blocks = blocks.merged(_Settings.long_blocks)
     rows = blocks.sums(np.stack([np.square(before), np.square(after)], axis=1))
     rows = rows[rows[:, 0] > 0.0]  # the others have no fix that counts
     if not len(rows):
         return 0.0, (0.0, 0.0)
     count, total = len(rows), rows.sum(axis=0)
     rng = np.random.default_rng(seed)
-    again = rng.integers(count, size=(_BOOTSTRAPS, count))
-    other = rng.integers(count, size=(_BOOTSTRAPS, max(count // 2, 1)))
+    again = rng.integers(count, size=(_Settings.bootstraps, count))
+    other = rng.integers(count, size=(_Settings.bootstraps, max(count // 2, 1)))
     sums = rows[np.take_along_axis(again, other, axis=1)].sum(axis=1)
 
     def percent(before_after: FloatArray) -> FloatArray:
@@ -157,7 +166,7 @@ class _Products:
     def of(cls, fit: Fit, columns: FloatArray, blocks: Blocks) -> _Products:
         """Form the products of columns (n, 3, p)."""
         rows = []
-        for fold in range(_FOLDS):
+        for fold in range(_Settings.folds):
             own = np.flatnonzero(blocks.fold == fold)
             rows.append((columns[own].reshape(3 * len(own), columns.shape[2]), fit.left[own].ravel()))
         inner, toward = np.array([c.T @ c for c, _ in rows]), np.array([c.T @ left for c, left in rows])
@@ -210,7 +219,7 @@ def _p_value(fit: Fit, beside: FloatArray, blocks: Blocks) -> float:
     inner = flat.T @ flat
     scales = np.sqrt(np.maximum(np.diag(inner), 1e-300))
     values, vectors = np.linalg.eigh(inner / np.outer(scales, scales))
-    told = values > 1e-7
+    told = values > TOLD_APART
     k = int(told.sum())
     if not 0 < k < blocks.count:
         return 1.0
@@ -233,4 +242,4 @@ def scores_p_value(columns: FloatArray, left: FloatArray, blocks: Blocks) -> flo
 
 def is_marker(fit: Fit) -> np.ndarray:
     """Return True for trusted fixes (n,) that are probably the marker."""
-    return fit.noise.weights >= _MARKER
+    return fit.noise.weights >= _Settings.marker

@@ -55,6 +55,16 @@ class Hypotheses:
         return cls(tuple(effects), tuple(limits.sentences))
 
 
+def has_simpler_name(effect: Effect, hypotheses: Collection[Effect], simulation: Simulation) -> bool:
+    """Return True for the link before the first joint where the camera's pose is a hypothesis.
+
+    In any motion they are the same. The pose is named, which is measured by hand, and the link told as its rival.
+    """
+    if not effect.kind.in_parts or simulation.place(effect).joint != 0 or simulation.upward[0]:
+        return False
+    return any(one.kind.stage == "camera" and one.kind.rigid for one in hypotheses)
+
+
 class _Limits:
     """Effects that this recording cannot test."""
 

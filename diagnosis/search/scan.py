@@ -12,9 +12,11 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from bodyschema.diagnosis.fit.fit import LARGEST, Fit
 from bodyschema.diagnosis.fit.products import Products, System
+from bodyschema.diagnosis.fit.tangent import TOLD_APART
 from bodyschema.diagnosis.fit.worth import choices, nats, ways_to_choose
 from bodyschema.effects import Effect, Identity
 from bodyschema.effects.motion import flanks
@@ -23,20 +25,20 @@ from bodyschema.interfaces.records import FloatArray
 # Ripples are searched at every whole number of cycles per turn up to the first limit. Finer ones, up to twice per turn
 # of a strain wave gear of 120, are searched as coarsely as they can be resolved.
 _MOST_CYCLES, FINEST = 100, 240
-# Largest loss factor halfway between two shapes tried: for waves, one over sinc² of a half.
-_BETWEEN = 2.5
-# Effective number of independent shapes of a smooth family.
-_COARSE = 5
-# Number of moments tried first, before all those next to the best.
-_MOST_MOMENTS = 1000
-# Minimum of rows on either side of a moment.
-_BESIDE = 8
-# Δχ² at the ends of a 95 % interval.
-_AT_95 = 3.841
-# Share of the noise by which an effect has to differ from its first order to be evaluated beyond it.
-_BENT = 0.1
-# A column with a smaller share left beside the fit is not identifiable.
-_TOLD_APART = 1e-7
+
+
+class _Settings:
+    """Settings of the scan.
+
+    Sensitivity, each at 0.3 and 3 times over three recordings with hidden errors: `most_moments` and `beside` change
+    what is rejected; the others change nothing.
+    """
+
+    between = 2.5  # largest loss factor halfway between two shapes tried: for waves, one over sinc² of a half
+    coarse = 5  # effective number of independent shapes of a smooth family
+    most_moments = 1000  # number of moments tried first, before all those next to the best
+    beside = 8  # minimum of rows on either side of a moment
+    bent = 0.1  # share of the noise by which an effect has to differ from its first order to be evaluated beyond it
 
 
 # Index of the best choice, gains (m,), its amounts (k,) and degrees of freedom.
@@ -174,7 +176,7 @@ class Scan:
         off = np.square(moved).sum(axis=1, keepdims=True) / (2.0 * max(radius, 1e-6))
         # In all directions alike, since it is not known in which.
         white = observations.whitened(np.broadcast_to(off[:, :, None] * np.eye(3), (len(off), 3, 3)))
-        return bool(np.square(white).sum(axis=(1, 2)).mean() > 3.0 * (_BENT * self._fit.noise.sigma) ** 2)
+        return bool(np.square(white).sum(axis=(1, 2)).mean() > 3.0 * (_Settings.bent * self._fit.noise.sigma) ** 2)
 
     @property
     def _left_out(self) -> Identity | None:
@@ -187,13 +189,13 @@ class Scan:
         if not dofs.any():
             return None
         told, best = shapes[dofs > 0], int(np.argmax(np.where(dofs > 0, gains, -np.inf)))
-        if self._times(float(gains[best]), _BETWEEN) >= least:
+        if self._times(float(gains[best]), _Settings.between) >= least:
             place = int(np.searchsorted(told, shapes[best]))
             shapes = np.linspace(told[max(place - 1, 0)], told[min(place + 1, len(told) - 1)], 13)
             gains, amounts, dofs = self._solved(self._each(effect, shapes), effect)
             best = int(np.argmax(gains))
         values = np.append(amounts[best], shapes[best])
-        trials = _COARSE * effect.kind.further_trials
+        trials = _Settings.coarse * effect.kind.further_trials
         return Candidate(effect.with_values(values), float(gains[best]), int(dofs[best]), trials)
 
     def _each(self, effect: Effect, shapes: FloatArray) -> System:
@@ -259,7 +261,7 @@ class Scan:
             apart = max(min(width, 0.1 * (FINEST - _MOST_CYCLES)), step)
             bands.append(np.arange(_MOST_CYCLES + 1.0, FINEST, apart))
         tried, cycles = max(((self._rippled_best(effect, band), band) for band in bands), key=_most_gain)
-        if width < step or self._times(float(tried[1][tried[0]]), _BETWEEN) >= least:
+        if width < step or self._times(float(tried[1][tried[0]]), _Settings.between) >= least:
             fine: FloatArray = cycles[tried[0]] + 0.5 * max(width, step) * np.linspace(-1.0, 1.0, 61)
             cycles = np.asarray(fine[fine > 0.5 * first], dtype=np.float64)
             tried = self._best(self._rippled(effect, cycles), effect)
@@ -293,7 +295,7 @@ class Scan:
     def _moment(self, effect: Effect) -> Candidate | None:
         """Return the best moment between two rows: a coarse search, then all near the best."""
         n = len(self._fit.left)
-        if n < 2 * _BESIDE + 1:
+        if n < 2 * _Settings.beside + 1:
             return None
         begun = effect.with_values(np.append(effect.values[:-1], -np.inf))
 
@@ -301,14 +303,14 @@ class Scan:
             columns = self._fit.weighted(self._fit.run.columns(begun)[:, :, effect.amounts])
             return self._products.since(columns, rows)
 
-        step = 1 + n // _MOST_MOMENTS
-        some = range(_BESIDE, n - _BESIDE, step)
+        step = 1 + n // _Settings.most_moments
+        some = range(_Settings.beside, n - _Settings.beside, step)
         best, gains, amounts, dof = self._best(self._products.kept(effect, lambda: since(some)), effect)
         if not dof:
             return None
         tried, row = np.asarray(some), some[best]
         if step > 1:
-            beside = range(max(row - step + 1, _BESIDE), min(row + step, n - _BESIDE))
+            beside = range(max(row - step + 1, _Settings.beside), min(row + step, n - _Settings.beside))
             best, closer, amounts, dof = self._best(since(beside), effect)
             row = beside[best]
             tried, first = np.unique(np.append(tried, beside), return_index=True)
@@ -316,7 +318,7 @@ class Scan:
         clock = self._fit.observations.motion.clock
         values = np.append(amounts, 0.5 * (clock[row - 1] + clock[row]))
         interval = _interval(0.5 * (clock[tried - 1] + clock[tried]), gains)
-        return Candidate(effect.with_values(values), float(gains.max()), dof, n - 2 * _BESIDE, interval)
+        return Candidate(effect.with_values(values), float(gains.max()), dof, n - 2 * _Settings.beside, interval)
 
     def _linear(self, effect: Effect) -> System:
         """Return the system of an effect that has amounts only."""
@@ -374,7 +376,7 @@ class Scan:
         unit = _units(effect)
         shares = _eigenvalues(inner / np.sqrt(np.maximum(raw[:, :, None] * raw[:, None, :], 1e-300)))
         told = _eigenvalues(inner * unit[:, None] * unit) > 10.0 * self._fit.noise.sigma**2
-        return ((shares > _TOLD_APART) & told).sum(axis=1)
+        return ((shares > TOLD_APART) & told).sum(axis=1)
 
 
 @cache
@@ -397,7 +399,7 @@ def _eigenvalues(matrices: FloatArray) -> FloatArray:
 
 def _interval(shapes: FloatArray, gains: FloatArray) -> tuple[float, float]:
     """Return the first and the last of the shapes (m,) within the 95 % drop of the best gain."""
-    near = np.flatnonzero(gains > gains.max() - _AT_95)
+    near = np.flatnonzero(gains > gains.max() - float(chdtri(1, 0.05)))
     return float(shapes[near[0]]), float(shapes[near[-1]])
 
 

@@ -26,6 +26,7 @@ from bodyschema.diagnosis.fit.worth import ANOTHER, NAMED, ways_to_choose
 from bodyschema.effects import Effect, EffectType, Identity
 from bodyschema.interfaces.records import FloatArray
 
+from .hypotheses import has_simpler_name
 from .scan import Candidate, Scan
 from .search import Key
 
@@ -605,6 +606,7 @@ class _Place:
         self.fit = fit
         present = {cause.key for cause in fit.causes}
         absent = [one for one in hypotheses if one.key not in present and not one.kind.refines]
+        absent = [one for one in absent if not has_simpler_name(one, hypotheses, fit.simulation)]
         scanned = _beside_links(fit, absent)
         candidates = [Candidate(cause, 0.0, 1) for cause in fit.causes] + [_at_rest(one) for one in scanned]
         candidates = [part for candidate in candidates for part in _in_parts(candidate)]

@@ -18,18 +18,20 @@ from kbmaps.rotations import cross_matrix
 
 from .eyes import by_turn, undone
 
-_HARMONICS, _TIMES, _JOINT_TIMES = 5, 4, (8, 32, 96)
-# Minimum of rows per half wave over time.
-_ROWS_A_WAVE = 10
-# Time constants of warming up, as shares of the recording's duration.
-_WARMING = (0.07, 0.2, 0.6)
-# One torsional spring about all axes of a frame, optionally with one linear spring along all of them.
-_TILT = np.repeat([[0.0], [1.0]], 3, axis=0)
-_TILT_AND_SINK = np.repeat(np.eye(2), 3, axis=0)
-# One spring about both axes across a link, whose third axis lies along it; a shorter link does not bend [m].
-_BEND, _SHORTEST = np.array([[0.0], [0.0], [0.0], [1.0], [1.0], [0.0]]), 0.02
-# Axes of its own optical frame about which a camera is rotated: vergence only, or any.
-_TOWARDS, _ANY_WAY = np.eye(3)[1:2], np.eye(3)
+
+class _Settings:
+    """Settings of the families.
+
+    Sensitivity, each at 0.3 and 3 times over the same three recordings as in unknown.py: `harmonics` at 3 times cost so
+    much that wrong causes are named; fewer `harmonics` or `times` change what is rejected. The others change nothing.
+    """
+
+    # Harmonics of a joint's angle; waves over time of a body, and of a joint, each with so many rows to a half wave.
+    harmonics, times, joint_times, rows_a_wave = 5, 4, (8, 32, 96), 10
+    warming = (0.07, 0.2, 0.6)  # time constants, as shares of the recording's duration
+    shortest = 0.02  # a shorter link does not bend [m]
+
+
 Columns = Callable[[Simulated], FloatArray]
 
 
@@ -105,7 +107,7 @@ def families(run: Simulated) -> list[Family]:
                 found.append(Family(what, "joint", k, (k, j), False, joint, _any_of_both(k, j)))
         if timed:
             what = f"an error of {names[k]} that changes with time"
-            for count in (count for count in _JOINT_TIMES if _ROWS_A_WAVE * count < len(motion)):
+            for count in (count for count in _Settings.joint_times if _Settings.rows_a_wave * count < len(motion)):
                 found.append(Family(what, "joint", k, (), True, joint, _any_of_time(count)))
             what = f"the link before {names[k]} changes with time"
             found.append(Family(what, "body", k, (), True, link, _warming_or_any_of_time))
@@ -116,7 +118,7 @@ def families(run: Simulated) -> list[Family]:
             found.append(Family(what, "body", None, (), True, moves, _warming_or_any_of_time))
         if robot.calibration is not None:
             what = "the lens refocuses: its focal length wanders"
-            for count in (count for count in _JOINT_TIMES if _ROWS_A_WAVE * count < len(motion)):
+            for count in (count for count in _Settings.joint_times if _Settings.rows_a_wave * count < len(motion)):
                 found.append(Family(what, "place", None, (), True, _along_axis, _any_of_time(count)))
         for what, amounts in (
             ("the clocks of images and joints run apart", _shares_of_time),
@@ -130,8 +132,8 @@ def families(run: Simulated) -> list[Family]:
         what = "an error that depends on where the marker is in the image"
         found.append(Family(what, "place", None, (), False, _anywhere, _places_in_image(degree)))
     if robot.calibration is not None and robot.calibration.is_stereo:
-        found.append(_turned("the eyes are turned towards each other", robot.calibration, _TOWARDS))
-        found.append(_turned("the eyes are turned against each other", robot.calibration, _ANY_WAY))
+        found.append(_turned("the eyes are turned towards each other", robot.calibration, np.eye(3)[1:2]))
+        found.append(_turned("the eyes are turned against each other", robot.calibration, np.eye(3)))
     return found
 
 
@@ -154,13 +156,16 @@ def _giving(run: Simulated, k: int) -> list[Family]:
     supports = run.simulation.gravity.in_supports(k)
     for T in (np.eye(4), *supports):
         found.append(Family(what, "body", None, (), False, _link_about(k, T), _own_loads(k, T), ties=np.eye(6)))
-    for T, ties in product(supports if run.simulation.bears_weight else (), (_TILT, _TILT_AND_SINK)):
+    # One torsional spring about all axes of a frame, without and with one linear spring along all of them.
+    tilt, tilt_and_sink = np.repeat([[0.0], [1.0]], 3, axis=0), np.repeat(np.eye(2), 3, axis=0)
+    for T, ties in product(supports if run.simulation.bears_weight else (), (tilt, tilt_and_sink)):
         moves, loads = _link_about(k, T), _own_loads(k, T)
         found.append(Family(what, "body", None, (), False, moves, loads, ties, is_specific=True))
     for T in map(_middle, supports if run.simulation.bears_weight else ()):
-        if 2.0 * np.linalg.norm(T[:3, 3]) >= _SHORTEST:
+        if 2.0 * np.linalg.norm(T[:3, 3]) >= _Settings.shortest:
             moves, loads = _link_about(k, T), _own_loads(k, T)
-            found.append(Family(what, "body", None, (), False, moves, loads, _BEND, is_specific=True))
+            bend = np.array([[0.0, 0.0, 0.0, 1.0, 1.0, 0.0]]).T  # one spring about both axes across the link
+            found.append(Family(what, "body", None, (), False, moves, loads, bend, is_specific=True))
     return found
 
 
@@ -221,7 +226,7 @@ def _along_axis(run: Simulated) -> FloatArray:
 
 
 def _any_of_joint(j: int) -> Columns:
-    return lambda run: _with_one(np.concatenate([_trends(run, j), _harmonics(run, j, _HARMONICS)], axis=1))
+    return lambda run: _with_one(np.concatenate([_trends(run, j), _harmonics(run, j, _Settings.harmonics)], axis=1))
 
 
 def _any_of_both(k: int, j: int) -> Columns:
@@ -253,13 +258,15 @@ def _shares_of_time(run: Simulated) -> FloatArray:
 
 def _waves_of_time(run: Simulated) -> FloatArray:
     """Return cosines (n, a) over the time of the recording, without a constant."""
-    return _any_of_time(_TIMES)(run)[:, 1:]
+    return _any_of_time(_Settings.times)(run)[:, 1:]
 
 
 def _warming_or_any_of_time(run: Simulated) -> FloatArray:
     clock = run.motion.clock
     share = (clock - clock[0]) / max(float(clock[-1] - clock[0]), 1e-9)
-    return np.concatenate([_any_of_time(_TIMES)(run), np.exp(-share[:, None] / np.array(_WARMING))], axis=1)
+    return np.concatenate(
+        [_any_of_time(_Settings.times)(run), np.exp(-share[:, None] / np.array(_Settings.warming))], axis=1
+    )
 
 
 def _moments(k: int) -> Columns:

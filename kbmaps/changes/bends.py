@@ -37,12 +37,19 @@ class _Settings:
     taken_along: float = 3.0
     # Hypotheses less probable than this without a change are left out: even with one they hardly count.
     least: float = 1e-6
+    none = 1e-3  # 1-sigma that stands for an absent error
+    # Runs of neighbours count by their means; a run's length is this share of its age, at most this many pairs.
+    run_share, longest_run = 0.04, 6
+    # Any of this many newest runs may be the onset of a change; older onsets are spaced by this share of their age. A
+    # change is best seen soon after it, when a wrongly counted pair costs most.
+    each, spacing = 30, 0.1
+    # A pair far from the median of this many neighbours is clipped. Where more than half of them moved together, the
+    # median moved as well.
+    neighbours = 5
 
 
 # Log evidence of other pairs about bends of each length, without any such pairs.
 NOTHING_SEEN = (0.0,) * len(_Settings.lengths)
-# 1-sigma that stands for an absent error.
-_NONE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,7 +219,7 @@ def _prior(runs: Runs, k: int, turn: float) -> FloatArray:
     squares = np.tile(np.square(_sizes(k)), len(_Settings.noises)) + turn**2
     left_open = np.full(len(squares), _Settings.open**2) if runs.fitted else 1.0 + _Settings.taken_along * squares
     known = np.repeat(1.0 / left_open[:, None], runs.known, axis=1)
-    own = np.full((len(known), runs.rows.shape[2] - 1 - runs.known), max(turn, _NONE) ** -2.0)
+    own = np.full((len(known), runs.rows.shape[2] - 1 - runs.known), max(turn, _Settings.none) ** -2.0)
     return np.concatenate([known, own], axis=1)
 
 
@@ -230,14 +237,6 @@ def _own_errors(angles: FloatArray, turning: FloatArray) -> FloatArray:
     return np.concatenate(columns, axis=2)
 
 
-# Runs of neighbours count by their means; a run's length is this share of its age, at most this many pairs.
-_RUN_SHARE, _LONGEST_RUN = 0.04, 6
-# Any of this many newest runs may be the onset of a change; older onsets are spaced by this share of their age. A
-# change is best seen soon after it, when a wrongly counted pair costs most.
-_EACH, _SPACING = 30, 0.1
-# A pair far from the median of this many neighbours is clipped. Where more than half of them moved together, the
-# median moved as well.
-_NEIGHBOURS = 5
 # Maximum number of pairs, the newest ones, that are evaluated.
 MOST_PAIRS = 1200
 
@@ -275,7 +274,8 @@ def log_ratios_if_it_bends(
         Onsets (t,), ascending, the number of pairs that each stands for, and the ratios (t, kinds).
     """
     pairs, errors = len(angles), _without_outliers(errors)
-    starts = np.array(sorted({suspected, *(pairs - age for age in _ages(pairs, _RUN_SHARE, _LONGEST_RUN))}))
+    ages = _ages(pairs, _Settings.run_share, _Settings.longest_run)
+    starts = np.array(sorted({suspected, *(pairs - age for age in ages)}))
     runs = Runs.of(angles, known, turning, errors, starts, fitted=False)
     bends = probable_bends(runs, before)
     means = np.add.reduceat(changed, starts) / np.sqrt(runs.lengths)[:, None, None]
@@ -297,7 +297,7 @@ def log_evidence_of_bends(
 
     Arguments as in `log_ratios_if_it_bends`.
     """
-    starts = np.arange(0, len(angles), _LONGEST_RUN)
+    starts = np.arange(0, len(angles), _Settings.longest_run)
     return log_evidence(Runs.of(angles, known, turning, _without_outliers(errors), starts, fitted=True))
 
 
@@ -315,10 +315,10 @@ def _compared(sums: FloatArray, places: Sequence[slice], sizes: FloatArray) -> F
 
 def _without_outliers(errors: FloatArray) -> FloatArray:
     """Return errors (n, 3) in units of their noise, clipped to lie near their neighbours."""
-    if len(errors) < _NEIGHBOURS:
+    if len(errors) < _Settings.neighbours:
         return errors
-    middles = np.median(np.lib.stride_tricks.sliding_window_view(errors, _NEIGHBOURS, axis=0), axis=2)
-    ends = (_NEIGHBOURS // 2, _NEIGHBOURS // 2)
+    middles = np.median(np.lib.stride_tricks.sliding_window_view(errors, _Settings.neighbours, axis=0), axis=2)
+    ends = (_Settings.neighbours // 2, _Settings.neighbours // 2)
     middles = np.pad(middles, (ends, (0, 0)), mode="edge")
     off = errors - middles
     far = np.linalg.norm(off, axis=1, keepdims=True)
@@ -337,7 +337,7 @@ def _apart(starts: IntArray, pairs: int, suspected: int) -> IntArray:
     """Return starts (m,) that are far enough apart for their age, with the newest, the first and the suspected one."""
     kept = [int(starts[-1])]
     for start in starts[-2::-1].tolist():
-        age = pairs - start
-        if age <= _EACH or age >= (1.0 + _SPACING) * (pairs - kept[-1]) or start in (starts[0], suspected):
+        age, next_age = pairs - start, (1.0 + _Settings.spacing) * (pairs - kept[-1])
+        if age <= _Settings.each or age >= next_age or start in (starts[0], suspected):
             kept.append(start)
     return np.array(kept[::-1])

@@ -371,8 +371,9 @@ def _loaded(way: Way) -> list[str]:
     """Return the joints that bear a load by design, not only by their tolerances."""
     loads = np.abs(way.posture.torques()).max(axis=0)
     slides = np.array([way.arm.joint(name).kind == "prismatic" for name in way.arm.read])
-    kinds = [slides == kind for kind in (True, False)]  # forces and torques
-    enough = np.any([kind & (loads > LOADED * loads.max(where=kind, initial=1e-6)) for kind in kinds], axis=0)
+    torque = loads.max(where=~slides, initial=1e-6)
+    force = max(loads.max(where=slides, initial=1e-6), torque)  # a slide that lies flat bears less than torque over 1 m
+    enough = loads > LOADED * np.where(slides, force, torque)
     return [name for name, loaded in zip(way.arm.read, enough, strict=True) if loaded]
 
 

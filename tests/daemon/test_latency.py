@@ -56,7 +56,8 @@ def latency_by_speed(wiggle: Wiggle, chain: RigidChain) -> float:
 
     grid = np.arange(EARLIEST_S, LATEST_S, STEP_S)
     best = grid[int(np.argmin([mismatch(lag) for lag in grid]))]
-    return float(minimize_scalar(mismatch, bounds=(best - STEP_S, best + STEP_S), method="bounded").x)
+    found = minimize_scalar(mismatch, bounds=(best - STEP_S, best + STEP_S), method="bounded")
+    return float(found.x)  # pyright: ignore[reportAttributeAccessIssue]
 
 
 @pytest.mark.parametrize(
@@ -238,6 +239,12 @@ def test_a_marker_that_moves_by_itself_is_named() -> None:
     ours, others = wiggle(0, 0.05), wiggle(1, 0.05)
     with pytest.raises(LatencyError, match="does not follow the joints"):
         latency_of(Wiggle(ours.t_joints, ours.q, ours.t_marker, others.x), ARM.chain)
+
+
+@pytest.mark.parametrize("latency_s", [-0.1, 0.3])
+def test_a_latency_beyond_the_search_is_named(latency_s) -> None:
+    with pytest.raises(LatencyError, match=r"agree best at (250|-50) ms, the end of the search"):
+        latency_of(wiggle(0, latency_s), ARM.chain)
 
 
 def test_without_readings_the_encoders_are_named() -> None:

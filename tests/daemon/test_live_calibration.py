@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 from unittest.mock import Mock
@@ -29,7 +30,7 @@ from bodyschema.vision.calibration.images import pair_files
 from bodyschema.vision.calibration.live import LiveViews
 from bodyschema.vision.calibration.view import View
 from bodyschema.vision.rig.rig_file import read_rig, write_rig
-from bodyschema.vision.rig.stereo_rig import CalibrationError
+from bodyschema.vision.rig.stereo_rig import CalibrationError, StereoRig
 
 RIGHT = ("A1", "B2")
 
@@ -221,6 +222,14 @@ def test_lines_tell_each_view_and_do_not_repeat_themselves(views) -> None:
     assert said[1:] == ["hold it still"]
 
 
+def test_lines_do_not_repeat_a_complaint_after_each_view(views) -> None:
+    said: list[str] = []
+    lines = Lines(said.append, SystemClock())
+    for k in (2, 4):
+        lines(replace(shown_of(views, k), trouble=("its autofocus is on",)))
+    assert [text[:8] for text in said].count("its auto") == 1
+
+
 def test_where_there_is_no_terminal_lines_are_printed(views, capsys) -> None:
     with guidance_on(Console(stderr=True), BOARD.name, SystemClock()) as show:
         show(shown_of(views, 2))
@@ -264,7 +273,7 @@ def robot(tmp_path_factory) -> Path:
     """Return a robot whose cameras show the board, each view for two frames."""
     folder = tmp_path_factory.mktemp("robot")
     for k, pair in enumerate(photographed()[1][:9]):
-        for eye, image in (("left", pair.left), ("right", pair.right)):
+        for eye, image in zip(("left", "right"), pair.images, strict=True):
             cv2.imwrite(str(folder / f"{eye}{2 * k:02d}.png"), image)
             (folder / f"{eye}{2 * k + 1:02d}.png").symlink_to(folder / f"{eye}{2 * k:02d}.png")
     cameras = '[vision.cameras.images]\nleft = "left*.png"\nright = "right*.png"\nfps = 10.0\nspeed = 0.0\n'
@@ -280,6 +289,7 @@ def test_the_robots_own_cameras_are_calibrated_and_checked(robot, capsys) -> Non
     called("calibrate", "cameras", "--robot", robot, "--lens", "pinhole", "--save", robot.parent / "views")
     said = capsys.readouterr()
     rig, truth = read_rig(robot.parent / "cameras.toml"), photographed()[0]
+    assert isinstance(rig, StereoRig)
     assert abs(rig.baseline_m - truth.baseline_m) < 2.5 * rig.baseline_sigma_m
     assert 'In [vision.cameras] write\ncalibration = "cameras.toml"' in said.out
     assert "Next: tilt the board's" in said.err

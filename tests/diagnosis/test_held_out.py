@@ -94,6 +94,13 @@ def test_errors_on_rows_held_out_are_larger_than_those_on_fitted_rows(small) -> 
     assert np.square(distances).mean() > np.square(plain).mean()
 
 
+@pytest.mark.parametrize("folds", [2, 15])
+def test_the_held_out_error_hardly_depends_on_the_folds(small, monkeypatch, folds) -> None:
+    usual = np.linalg.norm(held_out_errors(small, Blocks.cut(60)))
+    monkeypatch.setattr("bodyschema.diagnosis.search.held_out._Settings.folds", folds)
+    assert np.linalg.norm(held_out_errors(small, Blocks.cut(60))) == pytest.approx(usual, rel=0.05)
+
+
 def test_blocks_are_runs_of_neighbouring_rows_and_folds_are_dealt_in_turn() -> None:
     blocks = Blocks.cut(600)
     assert (np.diff(blocks.of_row) >= 0).all()

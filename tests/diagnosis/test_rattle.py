@@ -16,6 +16,7 @@ from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.report.conclusion import conclusion
 from bodyschema.diagnosis.report.result import DiagnosisFile
 from bodyschema.diagnosis.unnamed.rattle import Rattle, rattle
+from bodyschema.diagnosis.unnamed.rattle import _Settings as Limits
 from bodyschema.effects import Effect, Simulation
 
 HALF_M = 2e-3
@@ -121,6 +122,26 @@ def test_a_marker_that_changes_its_side_once_has_no_play() -> None:
     ways = run.columns(Effect.at(robot, "tool_offset")) @ np.array([0.6, 0.0, 0.8])
     x = run.measured + sides[:, None] * ways + SIGMA_M * rng.normal(size=ways.shape)
     assert rattle(aligned(Observations.of(measured(robot, motion, x), Simulation(robot)), Simulation(robot))) is None
+
+
+@pytest.mark.parametrize(
+    ("limit", "factor"),
+    [("apart", 0.3), ("apart", 3.0), ("named", 0.3), ("named", 3.0), ("beyond_noise", 0.3), ("rounds", 0.3)],
+)
+def test_a_clear_play_does_not_depend_on_its_limits(monkeypatch, limit, factor) -> None:
+    robot, rng = surveyed_arm(), np.random.default_rng(4)
+    simulation, motion = Simulation(robot), scattered(robot, 1, rows=150)
+    run = simulation.run(motion)
+    x = run.measured + SIGMA_M * rng.normal(size=(150, 3))
+    ways = run.columns(Effect.at(robot, "tool_offset")) @ np.array([0.6, 0.0, 0.8])
+    moved = x + HALF_M * rng.choice([-1.0, 1.0], 150)[:, None] * ways
+    usual = getattr(Limits, limit)
+    monkeypatch.setattr(Limits, limit, type(usual)(factor * usual))
+    fixed, loose = (aligned(Observations.of(measured(robot, motion, at), simulation), simulation) for at in (x, moved))
+    play = rattle(loose)
+    assert play is not None
+    assert play.half_m == pytest.approx(HALF_M, rel=0.01)
+    assert rattle(fixed) is None
 
 
 @pytest.mark.parametrize("seed", [1, 2])

@@ -28,12 +28,19 @@ def _link(untold_m: float) -> Cause:
 
 
 def test_a_link_that_only_turns_is_off_by_an_angle_alone():
-    assert finding("link_geometry", "elbow", None, TURN) == "the link before joint elbow is off by 0.57°"
+    assert (
+        finding("link_geometry", "elbow", None, TURN) == "the link before joint elbow is off by 0.57°, mainly about y"
+    )
 
 
 def test_a_link_that_is_off_in_some_directions_has_them_named():
     said = finding("link_geometry", "elbow", None, {"x_m": 0.003, "z_m": 0.004, "ry_rad": 0.01})
     assert said == "the link before joint elbow is off by 5 mm in x and z and 0.57° about y"
+
+
+def test_a_link_that_is_off_about_one_axis_and_hardly_about_others_has_that_one_named():
+    said = finding("link_geometry", "elbow", None, {"rx_rad": 0.0117, "ry_rad": -0.0007, "rz_rad": 0.001})
+    assert said == "the link before joint elbow is off by 0.67°, mainly about x"
 
 
 def test_a_shift_that_the_recording_does_not_tell_is_in_no_sentence():

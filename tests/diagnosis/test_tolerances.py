@@ -13,6 +13,7 @@ from bodyschema.diagnosis.assess.explanation import _is_told
 from bodyschema.diagnosis.diagnosis import diagnose
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.background import Scales
+from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.report.conclusion import conclusion
 from bodyschema.diagnosis.report.result import DiagnosisFile
@@ -94,19 +95,32 @@ def test_a_bent_link_is_named_where_it_is_larger_than_tolerance(robot: RobotDesc
     assert [(cause.effect, cause.where) for cause in file.causes] == [("link_geometry", ELBOW)]
 
 
-def test_an_interval_allows_for_other_sizes_of_the_tolerances(robot: RobotDescription, monkeypatch) -> None:
+def _with_small_tolerances(robot: RobotDescription) -> Fit:
+    """Return a fit of a joint offset with tolerances that are smaller than the arm's."""
     rng = np.random.default_rng([7, 4])
     q = rng.uniform(0.7 * robot.lower, 0.7 * robot.upper, (ROWS, len(robot.joints)))
     offset = Effect.at(robot, "joint_offset", ELBOW, values=[0.04])
     x = Simulation(robot, (offset,), None, made(robot, rng)).positions(motion_of(q))
     recording = measured(robot, motion_of(q), x + NOISE_M * rng.normal(size=x.shape))
     start = aligned(Observations.of(recording, Simulation(robot)), Simulation(robot))
-    # Smaller than they are.
-    fit = start.with_causes([offset]).tolerating(Scales(0.5, 0.5, 0.5))
+    return start.with_causes([offset]).tolerating(Scales(0.5, 0.5, 0.5))
+
+
+def test_an_interval_allows_for_other_sizes_of_the_tolerances(robot: RobotDescription, monkeypatch) -> None:
+    fit = _with_small_tolerances(robot)
     (place,) = fit.places(fit.causes[0])
     integrated = fit.covariance[place, place]
-    monkeypatch.setattr("bodyschema.diagnosis.fit.fit._NODES", np.zeros(1))
+    monkeypatch.setattr("bodyschema.diagnosis.fit.fit._Settings.nodes", np.zeros(1))
     assert integrated > 1.2 * replace(fit).covariance[place, place]
+
+
+@pytest.mark.parametrize("count", [5, 39])
+def test_an_interval_hardly_depends_on_the_number_of_nodes(robot: RobotDescription, monkeypatch, count) -> None:
+    fit = _with_small_tolerances(robot)
+    (place,) = fit.places(fit.causes[0])
+    before = fit.covariance[place, place]
+    monkeypatch.setattr("bodyschema.diagnosis.fit.fit._Settings.nodes", np.linspace(-3.0, 3.0, count))
+    assert np.sqrt(replace(fit).covariance[place, place] / before) == pytest.approx(1.0, abs=0.05)
 
 
 def test_a_slide_may_run_less_true_than_links_are_made(robot: RobotDescription) -> None:

@@ -18,7 +18,10 @@ GOOD = 200
 def faulty(**keys) -> Sent:
     """Return a source after good messages."""
     sent = Sent(**keys)
-    sent.send(GOOD, **({"body": "tool"} if "body" in keys else {}))
+    if "body" in keys:
+        sent.send(GOOD, body="tool")
+    else:
+        sent.send(GOOD)
     return sent
 
 
@@ -72,6 +75,19 @@ def test_lost_messages_are_counted_by_their_numbers() -> None:
     sent.send(20, skip=1)
     assert sent.counts == {"used": GOOD + 20, "lost": 20}
     assert "were lost: use a cable" in sent.stream.health[0]
+
+
+def test_late_and_damaged_messages_are_not_lost() -> None:
+    sent = faulty()
+    sent.send(seq=GOOD + 2)
+    sent.send(seq=GOOD + 1, stamp=sent.clock.now() + AHEAD_S - PERIOD_S)
+    sent.send(2, raw=b"{")
+    sent.send(seq=GOOD + 5)
+    assert {what: count for what, count in sent.counts.items() if count} == {
+        "used": GOOD + 2,
+        "out_of_order": 1,
+        "malformed": 2,
+    }
 
 
 def test_duplicate_and_older_messages_are_not_used() -> None:

@@ -13,9 +13,7 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.vision.calibration.calibrate import Asked, Calibrated, ModelChoice, calibrate
 from bodyschema.vision.calibration.gather import gathered
 from bodyschema.vision.calibration.images import ImagePair
-from bodyschema.vision.rig.spread import covariance_of
-from bodyschema.vision.rig.stereo_rig import CalibrationError
-from bodyschema.vision.rig.triangulated import triangulated
+from bodyschema.vision.rig.stereo_rig import CalibrationError, covariance_of, triangulated
 
 VIEWS = 20
 DISTANCE_M = 0.6

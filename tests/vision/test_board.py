@@ -202,6 +202,12 @@ def test_a_mirrored_board_is_named() -> None:
     assert (found.why, "the board is mirrored" in found.text) == ("mirrored", True)
 
 
+def test_a_mirrored_board_is_named_from_near() -> None:
+    # Some of its mirrored markers look like others.
+    found = [fault(np.ascontiguousarray(pair.left[:, ::-1])).why for pair in photographed()[1][:6]]
+    assert set(found) == {"mirrored"}
+
+
 @pytest.mark.parametrize(
     ("board", "said"),
     [

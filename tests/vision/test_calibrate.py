@@ -15,12 +15,14 @@ from shown_board import BOARD, NOISE_PX, SIZE, corner_views, photographed, true_
 
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.vision.board import Corners, NotFound
+from bodyschema.vision.calibration.bundle import POSE, Linear
 from bodyschema.vision.calibration.calibrate import Asked, Fitted, calibrate, fit
 from bodyschema.vision.calibration.gather import Unusable, gathered, require_both, summarised
 from bodyschema.vision.calibration.guidance import Coverage
 from bodyschema.vision.calibration.held_out import covariance
 from bodyschema.vision.calibration.images import ImagePair
 from bodyschema.vision.calibration.view import View
+from bodyschema.vision.calibration.weights import corner_weights
 from bodyschema.vision.rig.lens import Lens
 from bodyschema.vision.rig.stereo_rig import CalibrationError, lenses_of
 
@@ -367,3 +369,29 @@ def test_a_tilt_that_was_shown_is_not_asked_for_again(planted, axis, said) -> No
     wishes = [wish for wish in Coverage.of([view, view], BOARD, SIZE).missing() if "tilt" in wish and "edge" in wish]
     assert len(wishes) == 3
     assert not any(said in wish for wish in wishes)
+
+
+def test_equations_whose_poses_explain_more_than_all_have_no_step() -> None:
+    normal, mixed = np.full((1, 1), 1e10), np.full((1, 1, POSE), 1e10)
+    poses = 1e10 * np.eye(POSE)[None]
+    at = Linear(
+        vector=np.zeros(1),
+        poses=np.zeros((1, POSE)),
+        residuals=[],
+        weights=[],
+        normal=normal,
+        gradient=np.ones(1),
+        pose_normals=poses,
+        pose_gradients=np.ones((1, POSE)),
+        mixed=mixed,
+        penalty=0.0,
+    )
+    assert at.step(0.0) is None
+
+
+def test_a_fit_whose_equations_have_no_solution_is_refused() -> None:
+    rng = np.random.default_rng(0)
+    found = fit(corner_views(webcams(rng), rng, 14), BOARD.corners_m, SIZE, "pinhole")
+    nowhere = replace(found.bundle, normal=-found.bundle.normal)
+    with pytest.raises(CalibrationError, match="the views do not determine the lenses"):
+        corner_weights(found.views, BOARD.corners_m, nowhere)

@@ -13,8 +13,7 @@ from bodyschema.vision.pose import PoseEstimator, Sighting, turned
 from bodyschema.vision.rig.common_error import CommonError
 from bodyschema.vision.rig.lens import Lens
 from bodyschema.vision.rig.rectified import Rectification
-from bodyschema.vision.rig.stereo_rig import Made, OneEyeRig, Rig, StereoRig, split
-from bodyschema.vision.rig.triangulated import triangulated
+from bodyschema.vision.rig.stereo_rig import Made, OneEyeRig, Rig, StereoRig, split, triangulated
 from bodyschema.vision.tags.body import TAG_CORNERS
 
 MADE = Made("", "", 20, 0, 0.0, 0.0, 0.0)

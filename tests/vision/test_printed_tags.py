@@ -12,6 +12,7 @@ import pytest
 from printed_page import PX_A_MM, from_pdf, from_svg, rasterised
 from scipy.spatial.transform import Rotation
 
+from bodyschema.cli.cameras.tag_pages import Tags, face_mm, sheet, tables
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray, ImageArray, MarkerFix, StereoFrame
@@ -43,27 +44,30 @@ def tracked(text: str, frame: StereoFrame) -> MarkerFix:
     return found
 
 
-def photographed(page: Page, shape: Shape, rotation: FloatArray, x: FloatArray) -> StereoFrame:
+def photographed(
+    page: Page, shape: Shape, rotation: FloatArray, x: FloatArray, width_m: float = WIDTH_M
+) -> StereoFrame:
     """Render the printed sheet, folded and held at a pose in the left optical frame: each face is cut from the page."""
-    printed = cv2.GaussianBlur(rasterised(*from_pdf(pdf(page))), (0, 0), 1.0)
-    return StereoFrame(
-        0.0, *(seen(printed, page, shape, rotation, x - [EYES.baseline_m * eye, 0, 0]) for eye in (0, 1))
-    )
+    printed = np.asarray(cv2.GaussianBlur(rasterised(*from_pdf(pdf(page))), (0, 0), 1.0), np.uint8)
+    left, right = (seen(printed, page, shape, rotation, x - [at, 0, 0], width_m) for at in (0.0, EYES.baseline_m))
+    return StereoFrame(0.0, left, right)
 
 
-def seen(printed: ImageArray, page: Page, shape: Shape, rotation: FloatArray, x: FloatArray) -> ImageArray:
+def seen(
+    printed: ImageArray, page: Page, shape: Shape, rotation: FloatArray, x: FloatArray, width_m: float
+) -> ImageArray:
     width, height = (FOUR_TIMES * side for side in EYES.image_size_px)
     image = np.full((height, width), 110, np.uint8)
     for face in shape.faces:
         normal = rotation @ face.rotation[:, 2]
-        centre = rotation @ face.centre * WIDTH_M + x
+        centre = rotation @ face.centre * width_m + x
         if normal @ centre >= 0:
             continue
         square = np.array([[-0.5, 0.5, 0], [0.5, 0.5, 0], [0.5, -0.5, 0], [-0.5, -0.5, 0]])
-        corners = WIDTH_M * (square @ face.rotation.T + face.centre) @ rotation.T + x
+        corners = width_m * (square @ face.rotation.T + face.centre) @ rotation.T + x
         px = EYES.focal_px * corners[:, :2] / corners[:, 2:] + EYES.principal_point_px
         cell = np.array([face.cell, np.add(face.cell, (1, 0)), np.add(face.cell, (1, 1)), np.add(face.cell, (0, 1))])
-        mm = cell * 1e3 * WIDTH_M + page.drawing_mm
+        mm = cell * 1e3 * width_m + page.drawing_mm
         # Both pictures count pixels from the middle of the first one.
         H = cv2.getPerspectiveTransform(
             (mm * PX_A_MM - 0.5).astype(np.float32), (FOUR_TIMES * (px + 0.5) - 0.5).astype(np.float32)
@@ -113,6 +117,18 @@ def test_a_plate_that_was_printed_is_found_as_its_tables_say(columns, rows, fold
     text = cluster_tables(APRILTAG, 1e-3 * SIDE_MM, shape.placed(ids_of(shape), WIDTH_M))
     fix = tracked(text, photographed(page, shape, rotation, x))
     assert np.abs(fix.x - x).max() < 3e-4
+
+
+@pytest.mark.parametrize("dictionary", ["aruco_6x6_50", "apriltag_36h11"])
+def test_a_charuco_board_that_was_printed_is_found_as_its_tables_say(dictionary) -> None:
+    # A side of 24 mm has squares of 32 mm: whole pixels, again.
+    board = Tags("board", None, dictionary, 24.0, columns=4, rows=3)
+    square_m, x, rotation = 1e-3 * face_mm(board), np.array([-0.02, -0.02, 0.40]), facing(0, 12, 0)
+    # The upper left square is black, and the first tag is beside it.
+    frame = photographed(sheet(board, "A4"), plate(4, 3, 0.0), rotation, x - square_m * rotation[:, 0], square_m)
+    fix = tracked(tables(board), frame)
+    assert np.abs(fix.x - x).max() < 3e-4
+    assert Rotation.from_matrix(rotation.T @ Rotation.from_quat(fix.R).as_matrix()).magnitude() < np.radians(0.2)
 
 
 @pytest.mark.parametrize("dictionary", ["aruco_6x6_250", "aruco_mip_36h12"])

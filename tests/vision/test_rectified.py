@@ -17,8 +17,7 @@ from bodyschema.vision.calibration.calibrate import Asked, calibrate
 from bodyschema.vision.calibration.check import check
 from bodyschema.vision.calibration.view import View
 from bodyschema.vision.rig.rectified import Rectification, RectifiedCamera
-from bodyschema.vision.rig.stereo_rig import CalibrationError, StereoRig
-from bodyschema.vision.rig.triangulated import triangulated
+from bodyschema.vision.rig.stereo_rig import CalibrationError, StereoRig, triangulated
 
 
 @pytest.mark.parametrize("fisheye", [False, True], ids=["pinhole", "fisheye"])

@@ -157,13 +157,20 @@ def test_no_camera_moves_a_corner_far(look) -> None:
     assert np.abs(tag.corners_px - corners_in_the_left_eye(rotation)).max() < 0.1
 
 
-@pytest.mark.parametrize("look", [replace(WALL, tone=1 / 2.2), replace(WALL, exposure=2.2)], ids=["tone", "exposure"])
+BLEEDING = {
+    "tone curve": replace(WALL, tone=1 / 2.2),
+    "overexposed": replace(WALL, exposure=2.2),
+    "far overexposed": replace(WALL, exposure=4.0),
+}
+
+
+@pytest.mark.parametrize("look", BLEEDING.values(), ids=BLEEDING)
 def test_white_that_bleeds_into_black_makes_no_tag_smaller(look) -> None:
     rotation = tilted([1.0, -0.5, 0.0], 15.0)
     tag, true = measured(sheet(rotation=rotation), look), corners_in_the_left_eye(rotation)
     assert isinstance(tag, TagImage)
     outward = (true - true.mean(axis=0)) / np.linalg.norm(true - true.mean(axis=0), axis=1)[:, None]
-    assert abs(float(((tag.corners_px - true) * outward).sum(axis=1).mean())) < 0.06
+    assert abs(float(((tag.corners_px - true) * outward).sum(axis=1).mean())) < 0.07
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -195,7 +202,7 @@ def test_a_covered_pattern_leaves_bleeding_unknown() -> None:
 def test_the_least_error_of_an_edge_is_not_added_to_noise(monkeypatch) -> None:
     answers = []
     for least_px in (0.0, 0.0007):
-        monkeypatch.setattr("bodyschema.vision.tags.edge._FLOOR_PX", least_px)
+        monkeypatch.setattr("bodyschema.vision.tags.edge._Settings.floor_px", least_px)
         answers.append(measured(sheet()))
     first, then = answers
     assert isinstance(first, TagImage)
@@ -295,7 +302,8 @@ def test_a_tag_printed_in_another_size_is_a_size_mismatch(printed) -> None:
 
 def test_rows_that_disagree_are_epipolar() -> None:
     frame = seen(sheet())
-    assert reason(tracker().track(replace(frame, right=np.roll(frame.right, 4, axis=0)))) is Reason.EPIPOLAR
+    left, right = frame.images
+    assert reason(tracker().track(StereoFrame(frame.t, left, np.roll(right, 4, axis=0)))) is Reason.EPIPOLAR
 
 
 def test_eyes_that_are_interchanged_are_epipolar() -> None:

@@ -15,30 +15,8 @@ from bodyschema.vision.images import WHITE
 
 from .colour import Gate
 from .outline import Outline, fit_outline, refine_outline
+from .settings import PatchSettings as _Settings
 from .sphere import Pinhole
-
-# A patch that fills a smaller share of its enclosing circle is not a ball.
-_LEAST_FILL = 0.45
-# Below this share a patch may be the ball joined with a background of similar hue.
-_WHOLE_DISC_FILL = 0.8
-# Shares of the strongest colour that separate the ball from its background.
-_STRONG_SHARES = (0.5, 0.7)
-# Parts with the same box are one patch if their fill differs by less.
-_SAME_FILL = 0.02
-# Part of a ball or a brick has an edge on some sides only; on the others its surroundings are as colourful.
-_MOST_UNEVEN = 0.3
-# The ball is occluded if a larger share of its outline leaves the ellipse.
-_MOST_OFF = 0.15
-# Largest share of over-exposed pixels on a ball that can be measured.
-_MOST_WHITE = 0.35
-# Radius of the ball to which `max_centre_sigma_px` applies [px].
-_SMALL_PX = 5.0
-# 1-sigma of the centre of a patch that could not be measured, as a share of its radius.
-_ROUGH_SIGMA = 0.1
-# A patch at the border is a partly visible ball if its outline lies on a circle, within this share of the radius.
-_ROUND = 0.1
-# Margin around a patch for its outline [px].
-_APRON_PX = 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +65,7 @@ class Patch:
     @property
     def is_whole(self) -> bool:
         """True if the patch may be a ball alone, without a background of similar hue."""
-        return self.fill >= _WHOLE_DISC_FILL
+        return self.fill >= _Settings.whole_disc_fill
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +99,7 @@ def find_patches(image: ImageArray, region: Region, gate: Gate, config: VisionCo
     for patch in list(patches):
         if not patch.is_whole:
             for part in _brighter_parts(image, patch, gate, config):
-                if not any(part.box == other.box and abs(part.fill - other.fill) < _SAME_FILL for other in patches):
+                if not any(part.box == other.box for other in patches):
                     patches.append(part)
     return sorted(patches, key=lambda patch: -patch.fill)[: config.max_candidates]
 
@@ -139,7 +117,7 @@ def patch_at(image: ImageArray, centre_px: FloatArray, radius_px: float, gate: G
     box = Region(*low.tolist(), *high.tolist())
     mask = gate.mask(box.crop(image))
     fill = float(mask[box.circle_mask(centre_px, radius_px)].mean()) / 255.0
-    return Patch(box, centre_px, radius_px, fill) if fill >= _LEAST_FILL else None
+    return Patch(box, centre_px, radius_px, fill) if fill >= _Settings.least_fill else None
 
 
 def measure(image: ImageArray, patch: Patch, eye: Pinhole, gate: Gate, config: VisionConfig) -> Disc | Reason:
@@ -149,9 +127,9 @@ def measure(image: ImageArray, patch: Patch, eye: Pinhole, gate: Gate, config: V
         return Reason.AT_BORDER
     if config.marker != "bright_ball" and _washed_out(image, patch):
         return Reason.SATURATED
-    if patch.fill < _LEAST_FILL:
+    if patch.fill < _Settings.least_fill:
         return Reason.OCCLUDED
-    around = patch.box.grown(_APRON_PX, (width, height))
+    around = patch.box.grown(_Settings.apron_px, (width, height))
     corner = np.array([around.left, around.top], dtype=np.float64)
     pixels, shape = around.crop(image).astype(np.float32), eye.shape(patch.centre_px)
     outline = fit_outline(pixels, gate, patch.centre_px - corner, patch.radius_px, shape)
@@ -180,7 +158,7 @@ def roughly(image: ImageArray, patch: Patch, gate: Gate) -> Disc | None:
     if circle is None:
         return None
     centre_px, radius_px = circle
-    sigma_px = _ROUGH_SIGMA * radius_px
+    sigma_px = _Settings.rough_share * radius_px
     level = _level(image, patch.box, centre_px, radius_px, gate)
     return Disc(centre_px, radius_px, sigma_px**2 * np.eye(2), sigma_px, level)
 
@@ -204,22 +182,22 @@ def _cut_circle(image: ImageArray, patch: Patch, gate: Gate) -> tuple[FloatArray
     solution = np.linalg.lstsq(design, ((points - middle) ** 2).sum(axis=1), rcond=None)[0]
     centre_px, radius_px = middle + solution[:2], math.sqrt(solution[2] + solution[:2] @ solution[:2])
     off = np.linalg.norm(points - centre_px, axis=1) - radius_px
-    if math.sqrt(np.mean(off**2)) > _ROUND * radius_px or radius_px > math.hypot(width, height):
+    if math.sqrt(np.mean(off**2)) > _Settings.rough_share * radius_px or radius_px > math.hypot(width, height):
         return None
     return centre_px, radius_px + 0.5
 
 
 def _is_sure(outline: Outline, config: VisionConfig) -> bool:
     """Return True if the centre is sure enough; the limit is that of a small ball and grows with the radius."""
-    limit_px = config.max_centre_sigma_px * max(1.0, outline.radius_px / _SMALL_PX)
+    limit_px = config.max_centre_sigma_px * max(1.0, outline.radius_px / _Settings.small_px)
     return math.sqrt(float(outline.cov_px.diagonal().max())) <= limit_px
 
 
 def _not_whole(outline: Outline, config: VisionConfig) -> Reason | None:
     """Return the reason why an outline is not that of a whole ball, or None."""
-    if outline.visible < config.min_visible or outline.off > _MOST_OFF:
+    if outline.visible < config.min_visible or outline.off > _Settings.most_off:
         return Reason.OCCLUDED
-    return Reason.LOW_CONTRAST if outline.uneven > _MOST_UNEVEN else None
+    return Reason.LOW_CONTRAST if outline.uneven > _Settings.most_uneven else None
 
 
 def _level(image: ImageArray, box: Region, centre_px: FloatArray, radius_px: float, gate: Gate) -> float:
@@ -233,10 +211,10 @@ def _level(image: ImageArray, box: Region, centre_px: FloatArray, radius_px: flo
 def _washed_out(image: ImageArray, patch: Patch) -> bool:
     """Return True if much of the ball is white in all channels, so that neither colour nor shading is usable."""
     white = cv2.inRange(patch.box.crop(image), (WHITE,) * 3, (255,) * 3)
-    if cv2.countNonZero(white) <= _MOST_WHITE * np.pi / 4 * white.size:
+    if cv2.countNonZero(white) <= _Settings.most_white * np.pi / 4 * white.size:
         return False
     # The corners of the box show the background.
-    return float(white[patch.box.circle_mask(patch.centre_px, patch.radius_px)].mean()) > 255.0 * _MOST_WHITE
+    return float(white[patch.box.circle_mask(patch.centre_px, patch.radius_px)].mean()) > 255.0 * _Settings.most_white
 
 
 def _clear_of_border(box: Region, margin_px: float, size: tuple[int, int]) -> bool:
@@ -275,7 +253,7 @@ def _patch(mask: ImageArray, points: NDArray[np.int32], region: Region) -> Patch
     radius = float(np.sqrt(moments["m00"] / np.pi)) + 0.5
     enclosing += 0.5
     fill = (radius / enclosing) ** 2
-    if fill >= _WHOLE_DISC_FILL:
+    if fill >= _Settings.whole_disc_fill:
         x, y = moments["m10"] / moments["m00"], moments["m01"] / moments["m00"]
     else:
         radius = enclosing
@@ -296,6 +274,6 @@ def _brighter_parts(image: ImageArray, patch: Patch, gate: Gate, config: VisionC
     strongest = float(np.partition(amount[own], place)[place])
     return [
         part
-        for share in _STRONG_SHARES
+        for share in _Settings.strong_shares
         for part in _patches((own & (amount > share * strongest)).astype(np.uint8), patch.box, config)
     ]

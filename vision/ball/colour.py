@@ -11,13 +11,9 @@ from numpy.typing import NDArray
 from bodyschema.interfaces.records import ImageArray
 from bodyschema.vision.config import HueBand, VisionConfig
 
+from .settings import ColourSettings as _Settings
+
 Float32Array = NDArray[np.float32]
-
-
-# Share of the way to the ball's present colour that the band moves at a fix; limit of its total shift (half-widths).
-_FOLLOWED, _FARTHEST = 0.05, 0.5
-# Lower limits of saturation and brightness, relative to the ball's own.
-_ROOM = 0.6
 
 
 class Gate(Protocol):
@@ -51,7 +47,7 @@ class ColourGate:
     """Gate for pixels of one band of hues.
 
     The band follows the ball's colour through changing light: slowly, only by pixels of accepted fixes, and never
-    farther from where it began than `_FARTHEST` says, so that it cannot walk off to another thing.
+    farther from where it began than `_Settings.farthest` says, so that it cannot walk off to another thing.
     """
 
     shading_sigma = 0.3
@@ -64,17 +60,17 @@ class ColourGate:
         """Learn from BGR pixels (height, width, 3) of the middle of a ball that was accepted."""
         hsv = cv2.cvtColor(pixels, cv2.COLOR_BGR2HSV).reshape(-1, 3).astype(np.float64)
         off_deg = (2.0 * hsv[:, 0] - self._band.hue_deg + 180.0) % 360.0 - 180.0
-        first, rate = self._first, _FOLLOWED
+        first, rate = self._first, _Settings.followed
         drift_deg = (self._band.hue_deg - first.hue_deg + 180.0) % 360.0 - 180.0 + rate * float(np.median(off_deg))
-        most_deg = _FARTHEST * first.half_width_deg
+        most_deg = _Settings.farthest * first.half_width_deg
         low = len(hsv) // 10
         saturation, value = (float(np.partition(hsv[:, channel], low)[low]) / 255.0 for channel in (1, 2))
         self._use(
             HueBand(
                 (first.hue_deg + min(max(drift_deg, -most_deg), most_deg)) % 360.0,
                 first.half_width_deg,
-                _followed(self._band.min_saturation, _ROOM * saturation, first.min_saturation),
-                _followed(self._band.min_value, _ROOM * value, first.min_value),
+                _followed(self._band.min_saturation, _Settings.room * saturation, first.min_saturation),
+                _followed(self._band.min_value, _Settings.room * value, first.min_value),
             )
         )
 
@@ -122,7 +118,7 @@ class BrightGate:
     def follow(self, pixels: ImageArray) -> None:
         """Take half of the ball's brightness for the limit, between half of the configured one and that."""
         seen = float(np.median(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)))
-        self._lowest = _followed(self._lowest, _ROOM * seen, self._first)
+        self._lowest = _followed(self._lowest, _Settings.room * seen, self._first)
 
     def reset(self) -> None:
         """Restore the configured brightness."""
@@ -140,7 +136,7 @@ def gate_of(config: VisionConfig) -> Gate:
 
 def _followed(limit: float, wanted: float, first: float) -> float:
     """Move `limit` one step towards `wanted`, clipped to between half of `first` and `first`."""
-    return min(max(limit + _FOLLOWED * (wanted - limit), 0.5 * first), first)
+    return min(max(limit + _Settings.followed * (wanted - limit), 0.5 * first), first)
 
 
 def _hsv_ranges(band: HueBand) -> list[tuple[ImageArray, ImageArray]]:

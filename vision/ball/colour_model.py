@@ -14,17 +14,7 @@ from bodyschema.interfaces.records import FloatArray, ImageArray
 from bodyschema.vision.config import HueBand
 from bodyschema.vision.image_file import read_image
 
-# Radius around a click for the first colour [px]; the ball is the connected region of nearly that colour.
-_SEED_PX = 3
-# Pixels nearer to grey or black than this have no usable hue (parts of 255).
-_LEAST_SATURATION, _LEAST_VALUE = 64, 40
-# Quantile of the ball's hues cut off on either side, and margin for other light [°].
-_SHARE, _MARGIN_DEG = 0.02, 8.0
-# Lowest saturation and brightness of the ball in other light, relative to those seen here.
-_DIMMER_SATURATION, _DIMMER_VALUE = 0.6, 0.35
-# Change that marks a moving pixel [grey levels], and the fewest moving pixels of a ball.
-_CHANGED, _LEAST_PIXELS = 25, 30
-_HUES_OF_A_CLICK_DEG = 25.0
+from .settings import ColourSettings as _Settings
 
 
 class ColourUnlearnt(BodyschemaError):
@@ -45,7 +35,10 @@ def colour_at(image: ImageArray, u: float, v: float) -> HueBand:
     if not (0 <= column < width and 0 <= row < height):
         raise ColourUnlearnt(f"({u:g}, {v:g}) is outside the image of {width}x{height} pixels")
     hsv = cv2.cvtColor(image, cv2.COLOR_BGR2HSV)
-    near = hsv[max(row - _SEED_PX, 0) : row + _SEED_PX + 1, max(column - _SEED_PX, 0) : column + _SEED_PX + 1]
+    near = hsv[
+        max(row - _Settings.seed_px, 0) : row + _Settings.seed_px + 1,
+        max(column - _Settings.seed_px, 0) : column + _Settings.seed_px + 1,
+    ]
     seed = _colourful(near.reshape(-1, 3))
     if len(seed) < near.shape[0] * near.shape[1] // 2:
         raise ColourUnlearnt(
@@ -53,7 +46,7 @@ def colour_at(image: ImageArray, u: float, v: float) -> HueBand:
             remedy='Click on the middle of the ball, beside its highlight. A ball without colour is a "bright_ball"',
         )
     middle = _mean_hue_deg(seed)
-    alike = (_apart_deg(hsv[..., 0] * 2.0, middle) < _HUES_OF_A_CLICK_DEG) & _is_colourful(hsv)
+    alike = (_apart_deg(hsv[..., 0] * 2.0, middle) < _Settings.hues_of_a_click_deg) & _is_colourful(hsv)
     _, labels = cv2.connectedComponents(alike.astype(np.uint8), connectivity=4)
     label = labels[row, column]
     pixels = hsv[labels == label] if label else seed
@@ -74,7 +67,7 @@ def colour_of_the_moving(images: Iterable[ImageArray]) -> HueBand:
     behind = np.median(np.stack(frames[:: max(1, len(frames) // 15)]), axis=0).astype(np.uint8)
     moved = [_colourful(_moving_pixels(frame, behind)) for frame in frames]
     pixels = np.concatenate(moved)
-    if len(pixels) < _LEAST_PIXELS * len(frames):
+    if len(pixels) < _Settings.least_pixels * len(frames):
         raise ColourUnlearnt(
             "nothing colourful moves in these images", remedy="Move the ball across the view, and keep the camera still"
         )
@@ -82,7 +75,7 @@ def colour_of_the_moving(images: Iterable[ImageArray]) -> HueBand:
     counts = np.bincount(pixels[:, 0], weights=weight, minlength=180)
     smooth = np.convolve(np.concatenate([counts[-5:], counts, counts[:5]]), np.hanning(11), mode="valid")
     peak_deg = 2.0 * int(np.argmax(smooth))
-    return _band(pixels[_apart_deg(pixels[:, 0] * 2.0, peak_deg) < _HUES_OF_A_CLICK_DEG])
+    return _band(pixels[_apart_deg(pixels[:, 0] * 2.0, peak_deg) < _Settings.hues_of_a_click_deg])
 
 
 def read_images(files: Sequence[Path]) -> list[ImageArray]:
@@ -110,13 +103,13 @@ def colour_table(band: HueBand) -> str:
 
 
 def _moving_pixels(frame: ImageArray, behind: ImageArray) -> ImageArray:
-    changed = (cv2.absdiff(frame, behind).max(axis=2) > _CHANGED).astype(np.uint8)
+    changed = (cv2.absdiff(frame, behind).max(axis=2) > _Settings.changed).astype(np.uint8)
     changed = cv2.morphologyEx(changed, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     return cv2.cvtColor(frame, cv2.COLOR_BGR2HSV)[changed > 0].astype(np.uint8)
 
 
 def _is_colourful(hsv: np.ndarray) -> np.ndarray:
-    return (hsv[..., 1] >= _LEAST_SATURATION) & (hsv[..., 2] >= _LEAST_VALUE)
+    return (hsv[..., 1] >= _Settings.least_saturation) & (hsv[..., 2] >= _Settings.least_value)
 
 
 def _colourful(pixels: np.ndarray) -> ImageArray:
@@ -135,11 +128,11 @@ def _apart_deg(hue_deg: NDArray[np.floating], other_deg: float) -> FloatArray:
 def _band(pixels: ImageArray) -> HueBand:
     """Return the band around the pixels' hues (n, 3 of HSV), with room for other light."""
     middle = _mean_hue_deg(pixels)
-    reach = float(np.quantile(_apart_deg(pixels[:, 0] * 2.0, middle), 1.0 - 2 * _SHARE)) + _MARGIN_DEG
-    saturation, value = (float(np.quantile(pixels[:, channel], 2 * _SHARE)) / 255.0 for channel in (1, 2))
+    reach = float(np.quantile(_apart_deg(pixels[:, 0] * 2.0, middle), 1.0 - 2 * _Settings.share)) + _Settings.margin_deg
+    saturation, value = (float(np.quantile(pixels[:, channel], 2 * _Settings.share)) / 255.0 for channel in (1, 2))
     return HueBand(
         hue_deg=round(middle, 1) % 360.0,
         half_width_deg=round(reach, 1),
-        min_saturation=round(_DIMMER_SATURATION * saturation, 2),
-        min_value=round(_DIMMER_VALUE * value, 2),
+        min_saturation=round(_Settings.dimmer_saturation * saturation, 2),
+        min_value=round(_Settings.dimmer_value * value, 2),
     )

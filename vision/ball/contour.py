@@ -22,23 +22,11 @@ from numpy.typing import NDArray
 from bodyschema.interfaces.records import FloatArray
 
 from .colour import Float32Array, Gate
-from .contour_filters import STEP_PX, Filters, filters, places
+from .contour_filters import Filters, filters, places
 from .polar import ball_colour, mean_of_three, median, rays_round, sample
+from .settings import LimbSettings as _Settings
 
-# Number of samples on the ball for its colour and the noise, and where they begin (share of the radius).
-_INNER_PART, _INNER = 0.3, np.linspace(0.0, 1.0, 4)
-# Least noise of a sample [grey levels]; share of the rays whose background is assumed to show little but noise.
-_LEAST_NOISE, _EVEN_RAYS = 1.0, 0.3
-# Distance from the edge beyond which the ball no longer shows, in blurs.
-_BEYOND_BLURS = 2.0
-# Smallest sigma of a ray's edge; a ray with a sigma above the largest is ignored [px].
-_BEST_SIGMA_PX, _WORST_SIGMA_PX = 0.03, 0.5
-# The channels' disagreement (chi-squared, 2 degrees of freedom): more than this, and than this times the median of the
-# ball's rays, is no noise, and makes a ray's variance larger by that power of it; what its median is of noise alone.
-_LEAST_DISAGREEMENT, _USUAL_DISAGREEMENT, _DISAGREEMENT_POWER, _OF_NOISE = 2.0, 1.5, 3, 3.0
-_NOTHING = 1e-12  # keeps from dividing by information that is 0
-# Largest factor of the blur's change from one iteration to the next.
-_LARGEST_WIDENING = 1.5
+_NOTHING = np.finfo(np.float64).tiny  # keeps from dividing by information that is 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +55,7 @@ class Limb:
     @property
     def noise_share(self) -> float:
         """Share of pixel noise in the variances of `offset_px`, averaged over the rays with weight."""
-        return 1.0 - _BEST_SIGMA_PX**2 * float(self.weight[self.weight > 0].mean())
+        return 1.0 - _Settings.best_sigma_px**2 * float(self.weight[self.weight > 0].mean())
 
 
 def find_limb(
@@ -82,16 +70,16 @@ def find_limb(
     """
     rays = rays_round(radius_px)
     at = places(radius_px, blur_px)
-    first_px, last_px = _INNER_PART * radius_px, max(radius_px + float(at[0]), 0.5 * radius_px)
-    inner = first_px + (last_px - first_px) * _INNER
+    first_px, last_px = _Settings.inner_part * radius_px, max(radius_px + float(at[0]), 0.5 * radius_px)
+    inner = first_px + (last_px - first_px) * _Settings.inner
     samples = sample(image, centre_px, rays, np.concatenate([inner, radius_px + at]), shape)
-    colour = ball_colour(samples[:, : len(_INNER)], gate)
+    colour = ball_colour(samples[:, : len(_Settings.inner)], gate)
     if colour is None:
         return None
     turned = cv2.transform(samples, _own_colour_first(colour))
     channels = np.stack(cast("list[Float32Array]", cv2.split(turned)))
-    limb = channels[..., len(_INNER) :]
-    noise = _noise(channels[1:, :, : len(_INNER)], limb[..., at > _BEYOND_BLURS * blur_px])
+    limb = channels[..., len(_Settings.inner) :]
+    noise = _noise(channels[1:, :, : len(_Settings.inner)], limb[..., at > _Settings.beyond_blurs * blur_px])
     return _filtered(rays, limb / np.float32(noise), filters(radius_px, blur_px), blur_px)
 
 
@@ -115,15 +103,15 @@ def _filtered(rays: FloatArray, channels: Float32Array, both: tuple[Filters, Fil
     wider_px = float((contrast * widening)[:, 1:].sum()) / widening_information
     information, moved = informations.sum(axis=1), shifts.sum(axis=1)
     mean = moved / np.maximum(information, _NOTHING)
-    doubt, excess = _doubt(informations, shifts, mean, information > _WORST_SIGMA_PX**-2)
+    doubt, excess = _doubt(informations, shifts, mean, information > _Settings.worst_sigma_px**-2)
     information /= doubt
-    told = information > _WORST_SIGMA_PX**-2
+    told = information > _Settings.worst_sigma_px**-2
     information[~told] = 1.0
     return Limb(
         rays,
         np.where(told, mean, 0.0),
-        told / (1.0 / information + _BEST_SIGMA_PX**2),
-        blur_px * min(max(1.0 + wider_px / blur_px, 1 / _LARGEST_WIDENING), _LARGEST_WIDENING),
+        told / (1.0 / information + _Settings.best_sigma_px**2),
+        blur_px * min(max(1.0 + wider_px / blur_px, 1 / _Settings.largest_widening), _Settings.largest_widening),
         excess,
     )
 
@@ -142,8 +130,8 @@ def _doubt(
     off = shifts - informations * mean[:, None]
     disagreement = mean_of_three((off * off / np.maximum(informations, _NOTHING)).sum(axis=1))
     middle = median(disagreement[told]) if told.any() else 0.0
-    usual = max(_LEAST_DISAGREEMENT, _USUAL_DISAGREEMENT * middle)
-    return np.maximum(1.0, disagreement / usual) ** _DISAGREEMENT_POWER, max(1.0, middle / _OF_NOISE)
+    usual = max(_Settings.least_disagreement, _Settings.usual_disagreement * middle)
+    return np.maximum(1.0, disagreement / usual) ** _Settings.disagreement_power, max(1.0, middle / _Settings.of_noise)
 
 
 def _own_colour_first(colour: FloatArray) -> FloatArray:
@@ -164,8 +152,8 @@ def _noise(inside: Float32Array, beyond: Float32Array) -> float:
     ball, shape (3, n, columns).
     """
     on_ball = 1.4826 * median(np.abs(inside[:, 1:] - inside[:, :-1]).ravel()) / math.sqrt(2.0)
-    apart = round(1.0 / STEP_PX)
+    apart = round(1.0 / _Settings.step_px)
     change = beyond[..., apart:] - beyond[..., :-apart]
     rough = mean_of_three(np.einsum("cnm,cnm->n", change, change)) / (3 * change.shape[2])
-    even = int(_EVEN_RAYS * (len(rough) - 1))
-    return max(_LEAST_NOISE, on_ball, math.sqrt(0.5 * float(np.partition(rough, even)[even])))
+    even = int(_Settings.even_rays * (len(rough) - 1))
+    return max(_Settings.least_noise, on_ball, math.sqrt(0.5 * float(np.partition(rough, even)[even])))

@@ -22,24 +22,7 @@ import numpy as np
 from bodyschema.interfaces.records import FloatArray
 
 from .colour import Float32Array
-
-STEP_PX = 0.5
-# Sampled lengths on the ball and beyond [px], for a blur of USUAL_BLUR_PX; a wider blur needs longer ones.
-_INSIDE_PX, _OUTSIDE_PX, USUAL_BLUR_PX = 4.0, 8.0, 0.86
-# Textures that are told apart: 1-sigma of the random walk over 1 px, and the slope's variance [1/px²], in units of the
-# noise.
-_TEXTURES = ((0.02, 0.003), (0.5, 1.0), (2.0, 1.0), (8.0, 1.0), (30.0, 1.0))
-# Priors' variances, in units of the noise: what is free, the ball's level across its own colour, and a blur that is not
-# quite the true one, times the contrast.
-_FREE, _ACROSS, _BLUR = 1e4, 0.1, 300.0
-# Gloss and uneven light: 1-sigma that a sample on the ball gets for each px² from where the edge's blur ends.
-_GLOSS, _EDGE_BLURS = 2.0, 1.4
-# Integration step of what the lens blurs [px].
-_FINE_PX = 0.05
-
-
-# Directions in which two textures' precisions differ by less tell them apart by less than thousandths.
-_SAME = 1e-9
+from .settings import LimbSettings as _Settings
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,10 +55,12 @@ def places(radius_px: float, blur_px: float) -> FloatArray:
 
     A small ball has fewer samples inside; a wide blur needs more on both sides.
     """
-    wider = max(1.0, blur_px / USUAL_BLUR_PX)
-    inside = min(round(_INSIDE_PX * wider / STEP_PX), max(3, round(0.9 * radius_px / (2 * STEP_PX))))
-    outside = round(_OUTSIDE_PX * wider / STEP_PX)
-    return np.arange(-inside + 0.5, outside) * STEP_PX
+    wider = max(1.0, blur_px / _Settings.usual_blur_px)
+    inside = min(
+        round(_Settings.inside_px * wider / _Settings.step_px), max(3, round(0.9 * radius_px / (2 * _Settings.step_px)))
+    )
+    outside = round(_Settings.outside_px * wider / _Settings.step_px)
+    return np.arange(-inside + 0.5, outside) * _Settings.step_px
 
 
 def filters(radius_px: float, blur_px: float) -> tuple[Filters, Filters]:
@@ -100,21 +85,21 @@ def _filters(at: tuple[float, ...], radius_px: float, blur_px: float, own_colour
     wider = slope * t / blur_px
     beyond = 1.0 - ball
     # The ball's level at t = 0 and how it falls towards the limb.
-    level, fall = (_FREE, _FREE) if own_colour else (_ACROSS, _ACROSS)
+    level, fall = (_Settings.free, _Settings.free) if own_colour else (_Settings.across, _Settings.across)
     normal = _blurred_normal(t, radius_px, blur_px)
-    gloss = (_GLOSS * np.clip(-t - _EDGE_BLURS * blur_px, 0.0, None) ** 2) ** 2
+    gloss = (_Settings.gloss * np.clip(-t - _Settings.edge_blurs * blur_px, 0.0, None) ** 2) ** 2
     known = np.eye(len(t)) + np.diag(gloss) + level * np.outer(ball, ball) + fall * np.outer(normal, normal)
     # Of a random walk from 0 to both sides.
     walk = 0.5 * (np.abs(t)[:, None] + np.abs(t) - np.abs(t[:, None] - t))
     rows: list[tuple[FloatArray | float, ...]] = []
-    for roughness, slope_variance in _TEXTURES:
-        background = _FREE + slope_variance * np.outer(t, t) + roughness**2 * walk
+    for roughness, slope_variance in _Settings.textures:
+        background = _Settings.free + slope_variance * np.outer(t, t) + roughness**2 * walk
         cov: FloatArray = (known + np.outer(beyond, beyond) * background).astype(np.float64)
-        shift, shift_information = _best_filter(cov + _BLUR * np.outer(wider, wider), slope)
-        widening, widening_information = _best_filter(cov + _FREE * np.outer(slope, slope), wider)
-        cov += _BLUR * np.outer(wider, wider) + _FREE * np.outer(slope, slope)
+        shift, shift_information = _best_filter(cov + _Settings.blur * np.outer(wider, wider), slope)
+        widening, widening_information = _best_filter(cov + _Settings.free * np.outer(slope, slope), wider)
+        cov += _Settings.blur * np.outer(wider, wider) + _Settings.free * np.outer(slope, slope)
         precision: FloatArray = np.linalg.inv(cov).astype(np.float64)
-        contrast = (level * ball - _FREE * beyond) @ precision
+        contrast = (level * ball - _Settings.free * beyond) @ precision
         log_determinant = float(np.linalg.slogdet(cov)[1])
         rows.append((precision, log_determinant, shift, widening, contrast, shift_information, widening_information))
     precisions, log_determinants, *finding, shift_informations, widening_informations = (
@@ -134,7 +119,7 @@ def _filters(at: tuple[float, ...], radius_px: float, blur_px: float, own_colour
 def _root(matrix: FloatArray) -> FloatArray:
     """Return a (m, l) whose product with its transpose is a positive semidefinite matrix (m, m)."""
     values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
-    kept = values > _SAME
+    kept = values > np.sqrt(np.finfo(np.float64).eps)  # less tells two textures apart by less than thousandths
     return np.asarray(vectors[:, kept] * np.sqrt(values[kept]), np.float64)
 
 
@@ -149,7 +134,7 @@ def _best_filter(cov: FloatArray, signal: FloatArray) -> tuple[FloatArray, float
 def _blurred_normal(t: FloatArray, radius_px: float, blur_px: float) -> FloatArray:
     """Return the line-of-sight component of a sphere's normal, 0 outside the sphere, blurred as in the image."""
     reach = 4.0 * blur_px
-    fine = np.arange(t[0] - reach, t[-1] + reach, _FINE_PX)
+    fine = np.arange(t[0] - reach, t[-1] + reach, _Settings.fine_px)
     normal = np.sqrt(np.clip(1.0 - (1.0 + np.minimum(fine, 0.0) / radius_px) ** 2, 0.0, None))
     weight = np.exp(-0.5 * ((t[:, None] - fine) / blur_px) ** 2)
     return weight @ normal / weight.sum(axis=1)

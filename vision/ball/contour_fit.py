@@ -11,30 +11,9 @@ from bodyschema.interfaces.records import FloatArray
 
 from .colour import Float32Array, Gate
 from .contour import Limb, find_limb
-from .contour_filters import USUAL_BLUR_PX
 from .contour_spectrum import waves
 from .polar import fit_circle, median
-
-# Most iterations; converged when the limb and its blur changed by less than these [px].
-_LOOKS, _SETTLED_PX, _SETTLED_BLUR_PX = 4, 0.06, 0.05
-# An edge sharper than this after interpolation [px] was not anti-aliased: coverage is then the better measure.
-_ALIASED_PX = 0.55
-# Student's degrees of freedom of an edge's error, which set the weight of outliers; residual limit [px]; iterations.
-_FREEDOM, _FARTHEST_PX, _ROUNDS = 4.0, 1.0, 3
-# The wave once round is at least so large: this, and so many times the noise that the channels show; that the other
-# waves are small is no sign that it is. Beside that it is this part of what the few waves tell, and where they tell of
-# far more it is the square, over the last: a bend that shows is a sign of one that the fit has removed.
-_LEAST_DENSITY, _NOISE, _TOLD, _USUAL_DENSITY = 0.5, 1.75, 0.4, 12.0
-# If a smaller share of the rays carries the circle, their errors are not averaged out: sigma grows in proportion.
-_LEAST_EVENNESS = 0.5
-# What covers a ball breaks its limb at sharp corners, which shows in the quick waves; what is behind it bends whole
-# arcs, in the slow ones, which the claim follows. Beyond so many times the variance of the samples, as far as the
-# channels agree on that, it is no ball's limb alone.
-_LARGEST_DENSITY = 10.0
-# A larger deviation from the circle (RMS without noise, share of the radius, and of the blur) is angular: a square.
-_MOST_ANGULAR, _MOST_ANGULAR_BLURS = 0.05, 0.25
-# Smaller deviations (RMS, share of the radius) occur on every ball (seams, dust, dents) and are no occlusion.
-_ROUND = 0.0075
+from .settings import LimbSettings as _Settings
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +64,7 @@ def fit_limb(
     Return None if there is no ball's limb all around. If the iteration has not settled, its last step is added to the
     covariance.
     """
-    blur_px, looks = USUAL_BLUR_PX, 0
+    blur_px, looks = _Settings.usual_blur_px, 0
     while True:
         limb = find_limb(image, gate, centre_px, radius_px, shape, blur_px)
         fit = None if limb is None else _fit(limb)
@@ -95,26 +74,26 @@ def fit_limb(
         centre_px, radius_px = centre_px + shape @ fit.solution[:2], radius_px + growth
         moved_px, widened_px = max(math.hypot(u, v), abs(growth)), limb.blur_px - blur_px
         blur_px, looks = limb.blur_px, looks + 1
-        settled = moved_px < _SETTLED_PX and abs(widened_px) < _SETTLED_BLUR_PX
-        if settled or looks == _LOOKS:
+        settled = moved_px < _Settings.settled_px and abs(widened_px) < _Settings.settled_px
+        if settled or looks == _Settings.looks:
             break
-    excess, fewer = limb.excess, max(1.0, _LEAST_EVENNESS / limb.evenness)
+    excess, fewer = limb.excess, max(1.0, _Settings.least_evenness / limb.evenness)
     around, told = waves(np.sqrt(fit.used) * fit.residual, radius_px), limb.weight > 0
-    off = np.minimum(np.abs(fit.residual[told]), _FARTHEST_PX)
+    off = np.minimum(np.abs(fit.residual[told]), _Settings.farthest_px)
     off_px = math.sqrt(max(0.0, float(np.mean(off**2 - 1.0 / limb.weight[told]))))  # RMS without noise
-    aliased = blur_px < _ALIASED_PX
-    is_angular = off_px > max(_MOST_ANGULAR * radius_px, _MOST_ANGULAR_BLURS * blur_px)
-    if (is_angular or around.quick > _LARGEST_DENSITY * excess) and not aliased:
+    aliased = blur_px < _Settings.aliased_px
+    is_angular = off_px > max(_Settings.most_angular * radius_px, _Settings.most_angular_blurs * blur_px)
+    if (is_angular or around.quick > _Settings.largest_density * excess) and not aliased:
         return None
     pulled = waves(_pulls(limb.weight, fit.weight, fit.residual), radius_px).mean
-    usual = _LEAST_DENSITY + _NOISE * limb.noise_share * excess
-    density = math.hypot(usual, (_TOLD + pulled / _USUAL_DENSITY) * pulled)
+    usual = _Settings.least_density + _Settings.channels_noise * limb.noise_share * excess
+    density = math.hypot(usual, (_Settings.told + pulled / _Settings.usual_density) * pulled)
     cov = fewer**2 * density * fit.inverse
     if not settled:
         cov += np.outer(fit.solution, fit.solution)
     # A blurred disc's edge, where it is steepest, is nearer to the centre than the disc's.
     radius_px += blur_px**2 / (2.0 * radius_px)
-    is_round = off_px < _ROUND * radius_px
+    is_round = off_px < _Settings.round_share * radius_px
     unrest = 0.0 if is_round else math.sqrt(around.slow * around.quick) / excess
     return Circle(centre_px, radius_px, shape @ cov[:2, :2] @ shape, math.sqrt(cov[2, 2]), unrest, aliased)
 
@@ -130,8 +109,10 @@ def _fit(limb: Limb) -> _Fit | None:
         residual = limb.offset_px - limb.rays @ fitted[0]
         square, rounds, used = residual**2 * limb.weight, rounds + 1, weight
         usual = max(1.0, 1.4826**2 * median(square[told]))
-        weight = np.where(np.abs(residual) < _FARTHEST_PX, limb.weight / (1.0 + square / usual / _FREEDOM), 0.0)
-        if rounds == _ROUNDS:
+        weight = np.where(
+            np.abs(residual) < _Settings.farthest_px, limb.weight / (1.0 + square / usual / _Settings.freedom), 0.0
+        )
+        if rounds == _Settings.rounds:
             return _Fit(*fitted, used, weight, residual)
 
 

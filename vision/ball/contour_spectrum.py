@@ -14,10 +14,7 @@ import numpy as np
 
 from bodyschema.interfaces.records import FloatArray, frozen_array
 
-# Least number of slow waves; larger outlines count those up to the wave number radius / _WAVE_RADIUS_PX.
-_LEAST_WAVES, _WAVE_RADIUS_PX = 3, 3.0
-# Lens and interpolation smooth along the outline too, which takes power from the quicker waves (1-sigma) [px].
-_SMOOTHING_PX = 1.0
+from .settings import LimbSettings as _Settings
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,11 +50,15 @@ def waves(residual: FloatArray, radius_px: float) -> Waves:
     """Return the waves in the residuals (n,) of an outline's points, evenly spread around it; 0 if there are none."""
     first = 2  # the fit of a circle takes the slower ones out
     quickest = len(residual) // 2
-    last_slow = min(max(first + _LEAST_WAVES - 1, round(radius_px / _WAVE_RADIUS_PX)), quickest - 1)
+    last_slow = min(max(first + _Settings.least_waves - 1, round(radius_px / _Settings.wave_radius_px)), quickest - 1)
     last_quick = min(max(last_slow + 1, min(2 * last_slow, round(radius_px))), quickest)
     squares, share, count = _band(first, last_slow, last_quick)
     parts = np.fft.rfft(residual)[first : last_quick + 1]
-    power = np.square(np.abs(parts)) * np.exp(squares * (_SMOOTHING_PX / radius_px) ** 2) / np.count_nonzero(residual)
+    power = (
+        np.square(np.abs(parts))
+        * np.exp(squares * (_Settings.smoothing_px / radius_px) ** 2)
+        / np.count_nonzero(residual)
+    )
     return Waves(float(share @ power[: len(share)]), float(power[len(share) :].mean()), count)
 
 

@@ -15,16 +15,7 @@ from bodyschema.vision.config import VisionConfig
 from bodyschema.vision.triangulate import Location, locate
 
 from .blob import Disc
-
-# A mirror gives back less than this of the light, and its copy stands farther off.
-_MIRRORED_LIGHT = 0.8
-# Fingertips over a limb show in both eyes: where both limbs leave their ellipses by more, in variances of the samples,
-# something covers the ball. What is behind it is not the same in both.
-_MOST_UNREST = 4.2
-# What calibration leaves of a difference between the sizes that the eyes see (1-sigma, relative).
-_SIZE_TOLERANCE = 0.002
-# Discs of the two eyes that may be one thing; and how much of a thing's place has to show its colour.
-_SAME_SIZE, _SAME_ROW_PX, _LEAST_SHOWN = 1.2, 2.0, 0.6
+from .settings import TrackSettings as _Settings
 
 
 class StereoMatcher:
@@ -38,7 +29,7 @@ class StereoMatcher:
         outcomes = [self._check(one, other) for one, other in product(left, right)]
         found = _without_reflections([outcome for outcome in outcomes if isinstance(outcome, Location)])
         if len(found) == 1:
-            return found[0] if found[0].unrest < _MOST_UNREST else Reason.OCCLUDED
+            return found[0] if found[0].unrest < _Settings.most_unrest else Reason.OCCLUDED
         if found:
             return Reason.AMBIGUOUS
         # The check that the best pair failed at.
@@ -72,10 +63,10 @@ class StereoMatcher:
             found: the marker.
             in_left: True if `disc` is the left eye's.
         """
-        if any(_alike(disc, other) for other in others):
+        if any(self._alike(disc, other) for other in others):
             return False
         radius_px = self._calibration.focal_px * self._config.radius_m / float(found.x[2])
-        if disc.level < _MIRRORED_LIGHT * found.level and disc.radius_px < radius_px:
+        if disc.level < _Settings.mirrored_light * found.level and disc.radius_px < radius_px:
             return False
         u, v = disc.centre_px
         disparity_px = self._calibration.baseline_m * disc.radius_px / self._config.radius_m
@@ -92,7 +83,7 @@ class StereoMatcher:
             columns = columns[np.abs(columns - own_u) > radius_px + half]
         total = np.concatenate([[0.0], np.cumsum(rows.mean(axis=0) / 255.0)])
         shares = (total[columns + half + 1] - total[columns - half]) / (2 * half + 1)
-        return bool((shares > _LEAST_SHOWN).any())
+        return bool((shares > _Settings.least_shown).any())
 
     def _check(self, left: Disc, right: Disc) -> Location | Reason:
         location = locate(self._calibration, self._config.radius_m, left, right)
@@ -107,22 +98,22 @@ class StereoMatcher:
         sizes: list[float] = location.sizes.tolist()
         if not self._sizes_fit(sizes, size_sigma):
             return Reason.SIZE_MISMATCH
-        apart = math.log(sizes[0] / sizes[1]) / math.hypot(size_sigma, _SIZE_TOLERANCE), (vl - vr) / sigma
+        apart = math.log(sizes[0] / sizes[1]) / math.hypot(size_sigma, _Settings.size_tolerance), (vl - vr) / sigma
         # What pulls one eye's centre does not pull both alike: it shows in the sizes and in the rows.
         # Birge's ratio, squared, less the 1 that chance makes of it.
         doubt = max(1.0, (apart[0] ** 2 + apart[1] ** 2) / len(apart) - 1.0)
         return replace(location, cov=doubt * location.cov)
 
+    def _alike(self, one: Disc, other: Disc) -> bool:
+        """Return True if two discs, one of each eye, are at the same row and of the same size."""
+        size = max(one.radius_px, other.radius_px) / min(one.radius_px, other.radius_px)
+        rows_px = abs(float(one.centre_px[1] - other.centre_px[1]))
+        return size <= self._config.eye_size_ratio and rows_px <= self._config.epipolar_px
+
     def _sizes_fit(self, sizes: Sequence[float], sigma: float) -> bool:
         between_eyes = max(sizes) / min(sizes) / (1.0 + self._config.epipolar_sigmas * sigma)
         against_depth = max(*sizes, 1.0 / min(sizes))
         return between_eyes <= self._config.eye_size_ratio and against_depth <= self._config.depth_size_ratio
-
-
-def _alike(one: Disc, other: Disc) -> bool:
-    """Return True if two discs, one of each eye, are roughly at the same row and of the same size."""
-    size = max(one.radius_px, other.radius_px) / min(one.radius_px, other.radius_px)
-    return size < _SAME_SIZE and abs(float(one.centre_px[1] - other.centre_px[1])) < _SAME_ROW_PX
 
 
 def _without_reflections(found: list[Location]) -> list[Location]:
@@ -135,4 +126,4 @@ def _without_reflections(found: list[Location]) -> list[Location]:
 
 def is_reflection_of(one: Location, level: float, distance_m: float) -> bool:
     """Return True if `one` may be the mirrored copy of a marker of `level` [grey levels] at `distance_m` [m]."""
-    return one.level < _MIRRORED_LIGHT * level and float(np.linalg.norm(one.x)) > distance_m
+    return one.level < _Settings.mirrored_light * level and float(np.linalg.norm(one.x)) > distance_m

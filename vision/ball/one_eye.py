@@ -11,11 +11,8 @@ from bodyschema.vision.images import check_calibration, check_images
 
 from .blob import Disc, Region, find_patches, measure
 from .colour import gate_of
-from .size import RADIUS_SIGMA
+from .settings import TrackSettings as _Settings
 from .sphere import Pinhole
-
-# Distances that follow from the ball's size, each better than the last by a factor of its squared size in the image.
-_ROUNDS = 5
 
 
 class OneEyeBallTracker:
@@ -74,7 +71,7 @@ class OneEyeBallTracker:
         radius_m = self.config.radius_m
         distance = radius_m * self._eye.distance_over_radius(disc.centre_px, disc.radius_px)
         sight = self._sight(disc, distance)
-        for _ in range(_ROUNDS):
+        for _ in range(_Settings.distance_rounds):
             outline = self._eye.outline(distance * sight, radius_m)
             if outline is None:
                 return Reason.SIZE_MISMATCH
@@ -84,7 +81,7 @@ class OneEyeBallTracker:
         # A pixel error only turns the line of sight; the error along it comes from the size.
         across = (np.eye(3) - np.outer(sight, sight))[:, :2] * x[2] / self._eye.focal_px
         pixels = disc.cov_px + self.calibration.pixel_sigma**2 * np.eye(2)
-        depth = (disc.radius_sigma_px / disc.radius_px) ** 2 + RADIUS_SIGMA**2
+        depth = (disc.radius_sigma_px / disc.radius_px) ** 2 + _Settings.radius_sigma**2
         return x, across @ pixels @ across.T + depth * np.outer(x, x)
 
     def _sight(self, disc: Disc, distance: float) -> FloatArray:

@@ -24,42 +24,12 @@ from bodyschema.interfaces.records import FloatArray
 from .colour import Float32Array, Gate
 from .contour_fit import fit_limb
 from .contour_spectrum import waves
-from .polar import ENOUGH_RAYS, ball_colour, fit_circle, mean_of_three, median, rays_round, sample
+from .polar import ball_colour, fit_circle, mean_of_three, median, rays_round, sample
+from .settings import OutlineSettings as _Settings
 
 BoolArray = NDArray[np.bool_]
 
-# Half-widths [px] of the ring in which the edge is searched: about a circle right to a pixel, and about others.
-_NARROW_PX, _WIDE_PX = 2.0, 4.0
-# A fit in the narrow ring is final if it moved the circle by less than the first of these [px]; a rough circle that is
-# off by more than the second one is fitted in the wide ring.
-_SETTLED_PX, _ROUGH_PX = 0.5, 1.0
-_RING_STEP_PX = 0.5
-_BACKGROUND_PX = 2.0
-_INNER = np.linspace(0.0, 1.0, 6)  # places on the ball that show its colour
-# Difference of any channel between the limb and a little inside, apart from brightness (1-sigma, grey levels).
-_CHANNEL_SIGMA = 4.0
-# A ray shows the edge if ball and background differ by this many of these sigmas.
-_LEAST_SEPARATION = 3.0
-# A limb with less than this share of the usual level is occluded.
-_LEAST_LEVEL = 0.2
-# Error of one edge point before an even background [px]; an uneven one adds to it.
-_EDGE_SIGMA_PX = 0.06
-# Where the background makes a larger one [px], an edge elsewhere hides nothing.
-_UNEVEN_PX = 0.4
-# Residuals beyond this are no longer edge noise [px], whatever the spread is.
-_LEAST_GATE_PX, _LARGEST_GATE_PX, _GATE_SIGMAS = 0.8, 2.0, 3.5
-# An arc is not the ball's edge if its mean is off by more than this: arc's share of the outline, least number of rays
-# to either side, limit [px], and limit as a share of the radius: real balls have seams, dimples and dark undersides.
-_ARC, _LEAST_HALF_ARC, _OFF_PX, _OFF_SHARE = 0.1, 3, 0.35, 0.05
-# Number of arcs of the outline; any three give a candidate circle.
-_ARCS = 10
-# If this share of the points is no farther than this from the circle through all [px], they are the ones.
-_NEARLY_ALL, _AGREED_PX = 0.9, 0.4
-_TRIPLES = np.array(list(combinations(range(_ARCS), 3)))
-# Systematic error that averaging does not reduce [px].
-_FLOOR_PX = 0.001
-# A larger disagreement between coverage and limb, in sigmas, is added to the covariance.
-_LARGEST_CONTRADICTION = 4.0
+_TRIPLES = np.array(list(combinations(range(_Settings.arcs), 3)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,21 +107,21 @@ def fit_outline(
         radius_px: rough radius [px], right to about a fifth.
         shape: the ellipse's shape (2, 2), see `sphere.Ellipse`.
     """
-    fit, moved_px = _step(image, gate, centre_px, radius_px, shape, _NARROW_PX)
-    windows_px = (_NARROW_PX, _NARROW_PX)
-    if moved_px > _ROUGH_PX:
-        fit, moved_px = None, _ROUGH_PX
-        windows_px = (_WIDE_PX, *windows_px)  # a fit in the wide ring is not final
+    fit, moved_px = _step(image, gate, centre_px, radius_px, shape, _Settings.narrow_px)
+    windows_px = (_Settings.narrow_px, _Settings.narrow_px)
+    if moved_px > _Settings.rough_px:
+        fit, moved_px = None, _Settings.rough_px
+        windows_px = (_Settings.wide_px, *windows_px)  # a fit in the wide ring is not final
     for window_px in windows_px:
-        if moved_px < _SETTLED_PX:
+        if moved_px < _Settings.settled_px:
             break
         if fit is not None:
             centre_px, radius_px = centre_px + shape @ fit.solution[:2], float(fit.solution[2])
         fit, moved_px = _step(image, gate, centre_px, radius_px, shape, window_px)
         if moved_px > max(2.0, 0.5 * radius_px):
             return None
-        if window_px == _WIDE_PX:
-            moved_px = _ROUGH_PX
+        if window_px == _Settings.wide_px:
+            moved_px = _Settings.rough_px
     return None if fit is None else _outline(fit, centre_px, shape)
 
 
@@ -163,9 +133,9 @@ def refine_outline(image: Float32Array, gate: Gate, rough: Outline, shape: Float
     if fitted.aliased:
         return rough
     moved_px = fitted.centre_px - rough.centre_px
-    cov_px = fitted.cov_px + _FLOOR_PX**2 * np.eye(2)
+    cov_px = fitted.cov_px + _Settings.floor_px**2 * np.eye(2)
     contradiction = float(moved_px @ np.linalg.solve(cov_px + rough.cov_px, moved_px))
-    if contradiction > _LARGEST_CONTRADICTION**2:
+    if contradiction > _Settings.largest_contradiction**2:
         cov_px += np.outer(moved_px, moved_px)
     return replace(
         rough,
@@ -193,11 +163,13 @@ def _find_edges(
     image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray, half_px: float
 ) -> _Edges | None:
     rays = rays_round(radius_px)
-    cells = max(2, round(2 * half_px / _RING_STEP_PX))
+    cells = max(2, round(2 * half_px / _Settings.step_px))
     step = 2 * half_px / cells
-    inner = 0.3 * radius_px + (0.7 * radius_px - half_px) * _INNER
+    inner = 0.3 * radius_px + (0.7 * radius_px - half_px) * _Settings.inner
     ring = radius_px - half_px + (np.arange(cells) + 0.5) * step
-    outer = radius_px + half_px + (np.arange(round(_BACKGROUND_PX / _RING_STEP_PX)) + 0.5) * _RING_STEP_PX
+    outer = (
+        radius_px + half_px + (np.arange(round(_Settings.background_px / _Settings.step_px)) + 0.5) * _Settings.step_px
+    )
     radii = np.asarray(np.concatenate([inner, ring, outer]), np.float64)
     samples = sample(image, centre_px, rays, radii, shape)
     inside = samples[:, : len(inner)]
@@ -206,19 +178,19 @@ def _find_edges(
         return None
     limb = gate.amount(inside[:, -2:])
     level = np.maximum(mean_of_three(0.5 * (limb[:, 0] + limb[:, 1])), 0.0)
-    covered = level < _LEAST_LEVEL * median(level)
+    covered = level < _Settings.least_level * median(level)
     channels = np.stack(cast("list[Float32Array]", cv2.split(samples)))[..., len(inner) :]
     background = mean_of_three(channels[..., cells:].mean(axis=2).T)
     towards, separation = _discriminant(level, colour, background, gate.shading_sigma)
-    told = (separation > _LEAST_SEPARATION**2) & ~covered
+    told = (separation > _Settings.least_separation**2) & ~covered
     towards /= np.where(told, separation, 1.0)[:, None]
     # The share of ball in each sample: 1 on the ball, 0 on the background.
     apart = (channels - background.T[..., None].astype(np.float32)) * towards.T[..., None].astype(np.float32)
     share = apart.sum(axis=0)
     distance = radius_px - half_px + step * share[:, :cells].sum(axis=1, dtype=np.float64)
     unevenness_px = half_px * np.sqrt(np.square(share[:, cells:]).mean(axis=1, dtype=np.float64))
-    weight = told / (1.0 + (unevenness_px / _EDGE_SIGMA_PX) ** 2)
-    return _Edges(rays, distance, weight, covered, ~told | (unevenness_px > _UNEVEN_PX))
+    weight = told / (1.0 + (unevenness_px / _Settings.edge_sigma_px) ** 2)
+    return _Edges(rays, distance, weight, covered, ~told | (unevenness_px > _Settings.uneven_px))
 
 
 def _discriminant(
@@ -238,8 +210,8 @@ def _discriminant(
     apart = level[:, None] * colour - background
     along = (shading_sigma * level) ** 2
     # Inverse of σ_c² I + along · colour colourᵀ by Sherman and Morrison.
-    share = along * (apart @ colour) / (_CHANNEL_SIGMA**2 + along * (colour @ colour))
-    direction = (apart - share[:, None] * colour) / _CHANNEL_SIGMA**2
+    share = along * (apart @ colour) / (_Settings.channel_sigma**2 + along * (colour @ colour))
+    direction = (apart - share[:, None] * colour) / _Settings.channel_sigma**2
     return direction, np.einsum("nc,nc->n", direction, apart)
 
 
@@ -254,7 +226,7 @@ def _fit(edges: _Edges) -> _Fit | None:
             return None
         residual = edges.distance_px - edges.rays @ fitted[0]
         spread = 1.4826 * median(np.abs(residual[told]))
-        gate = min(max(_GATE_SIGMAS * spread, _LEAST_GATE_PX), _LARGEST_GATE_PX)
+        gate = min(max(_Settings.gate_sigmas * spread, _Settings.least_gate_px), _Settings.narrow_px)
         agreeing = np.where(np.abs(residual) < gate, edges.weight, 0.0)
         fit = _Fit(edges, *fitted, residual, weight, agreeing == 0)
         if np.array_equal(weight, agreeing):
@@ -272,11 +244,11 @@ def _outline(fit: _Fit, centre_px: FloatArray, shape: FloatArray) -> Outline:
     return Outline(
         centre_px=centre_px + shape @ fit.solution[:2],
         radius_px=radius_px,
-        cov_px=shape @ inverse[:2, :2] @ shape + _FLOOR_PX**2 * np.eye(2),
+        cov_px=shape @ inverse[:2, :2] @ shape + _Settings.floor_px**2 * np.eye(2),
         radius_sigma_px=math.sqrt(inverse[2, 2]),
         visible=1.0 - np.count_nonzero(hidden) / len(hidden),
         uneven=np.count_nonzero(edges.uneven | (apart & ~hidden)) / len(hidden),
-        off=_share_off(edges.weight, residual, max(_OFF_PX, _OFF_SHARE * radius_px)),
+        off=_share_off(edges.weight, residual, max(0.35, _Settings.off_share * radius_px)),
     )
 
 
@@ -285,8 +257,8 @@ def _share_off(weight: FloatArray, residual: FloatArray, limit_px: float) -> flo
 
     Noise and aliasing change from ray to ray; an object that covers part of the ball moves the edge in a whole arc.
     """
-    half = max(_LEAST_HALF_ARC, round(len(weight) * _ARC / 2))
-    clipped = weight * np.clip(residual, -_LARGEST_GATE_PX, _LARGEST_GATE_PX)
+    half = round(len(weight) / (2 * _Settings.arcs))
+    clipped = weight * np.clip(residual, -_Settings.narrow_px, _Settings.narrow_px)
     moved, among = _arc_sums(clipped, half), _arc_sums(weight, half)
     return float(weight @ (np.abs(moved) > limit_px * among) / weight.sum())
 
@@ -304,21 +276,16 @@ def _agreeing(edges: _Edges) -> FloatArray:
     nearly half of the outline, and all of them pull inwards: plain least squares would follow them.
     """
     told = np.flatnonzero(edges.weight > 0)
-    fitted = fit_circle(edges.distance_px, edges.weight)
-    if fitted is not None:
-        agree = np.abs(edges.distance_px - edges.rays @ fitted[0]) < _AGREED_PX
-        if np.count_nonzero(agree[told]) >= _NEARLY_ALL * len(told):
-            return np.where(agree, edges.weight, 0.0)
-    if len(told) < 2 * _ARCS:
+    if len(told) < 2 * _Settings.arcs:
         return edges.weight
     points = np.column_stack([edges.rays[told], edges.distance_px[told]])
-    begins = np.arange(_ARCS) * len(told) // _ARCS
+    begins = np.arange(_Settings.arcs) * len(told) // _Settings.arcs
     means = (np.add.reduceat(points, begins) / np.diff(begins, append=len(told))[:, None])[_TRIPLES]
-    told = told[:: max(1, len(told) // ENOUGH_RAYS)]
+    told = told[:: max(1, len(told) // _Settings.enough_rays)]
     circles = np.linalg.solve(means[..., :3] + 1e-9 * np.eye(3), means[..., 3:])[..., 0]
     off = np.abs(edges.distance_px[told] - circles @ edges.rays[told].T)
     middle = len(told) // 2
     spread = np.partition(off, middle, axis=1)[:, middle]
     best = int(np.argmin(spread))
-    gate = min(max(_GATE_SIGMAS * 1.4826 * float(spread[best]), _LEAST_GATE_PX), _LARGEST_GATE_PX)
+    gate = min(max(_Settings.gate_sigmas * 1.4826 * float(spread[best]), _Settings.least_gate_px), _Settings.narrow_px)
     return np.where(np.abs(edges.distance_px - edges.rays @ circles[best]) < gate, edges.weight, 0.0)

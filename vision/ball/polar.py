@@ -13,11 +13,7 @@ from numpy.typing import NDArray
 from bodyschema.interfaces.records import FloatArray, frozen_array
 
 from .colour import Float32Array, Gate
-
-# Below this, relative to the cubed trace, an outline does not determine centre and radius.
-_LEAST_DETERMINANT = 1e-6
-# Rays that suffice for the ball's colour, and to find the circle that most of them agree on.
-ENOUGH_RAYS = 60
+from .settings import OutlineSettings as _Settings
 
 
 def rays_round(radius_px: float) -> FloatArray:
@@ -47,7 +43,7 @@ def fit_circle(distance_px: FloatArray, weight: FloatArray) -> tuple[FloatArray,
     a, b, c, d, e, f = (weight @ products).tolist()
     A, B, C = d * f - e * e, c * e - b * f, b * e - c * d
     determinant = a * A + b * B + c * C
-    if not determinant >= _LEAST_DETERMINANT * (a + d + f) ** 3 or determinant <= 0:
+    if not determinant > np.finfo(np.float64).eps * (a + d + f) ** 3:
         return None
     D, E, F = a * f - c * c, b * c - a * e, a * d - b * b
     inverse = np.array([[A, B, C], [B, D, E], [C, E, F]]) / determinant
@@ -66,7 +62,7 @@ def sample(
 
 def ball_colour(inside: Float32Array, gate: Gate) -> FloatArray | None:
     """Return the ball's colour (3,) per unit of its amount; the median excludes highlights."""
-    samples = inside[:: max(1, len(inside) // ENOUGH_RAYS)].reshape(-1, 3)
+    samples = inside[:: max(1, len(inside) // _Settings.enough_rays)].reshape(-1, 3)
     amount = gate.amount(samples)
     coloured = amount > 1.0
     if np.count_nonzero(coloured) < len(amount) // 2:

@@ -16,14 +16,7 @@ from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray, Reason
 from bodyschema.vision.triangulate import Location, triangulate
 
-# Relative 1-sigma of a ball's radius measured by hand, and of the size from one place to another after calibration.
-RADIUS_SIGMA, _TOLERANCE = 0.03, 0.004
-# Number of fixes that are remembered.
-_MEMORY = 31
-# A size error of fewer sigmas is ignored.
-_FREE_SIGMAS = 1.5
-# After this many fixes a size that differs by more sigmas, and by more than this share, is another object.
-_FEWEST, _MOST_SIGMAS, _MOST_OFF = 5, 4.0, 0.06
+from .settings import TrackSettings as _Settings
 
 
 class BallSize:
@@ -32,7 +25,7 @@ class BallSize:
     def __init__(self, calibration: StereoCalibration) -> None:
         """Start with the configured radius."""
         self._calibration = calibration
-        self._shares: deque[tuple[float, float]] = deque(maxlen=_MEMORY)
+        self._shares: deque[tuple[float, float]] = deque(maxlen=_Settings.memory)
         self._known = self._estimated()
 
     def forget(self) -> None:
@@ -42,17 +35,17 @@ class BallSize:
 
     def contradicts(self, found: Location) -> Reason | None:
         """Return SIZE_MISMATCH if the size differs too much from that of the previous fixes."""
-        if len(self._shares) < _FEWEST:
+        if len(self._shares) < _Settings.fewest:
             return None
         off, sigma = self._off(found)
-        is_other = (np.abs(off) > np.maximum(_MOST_SIGMAS * sigma, _MOST_OFF)).all()
+        is_other = (np.abs(off) > np.maximum(_Settings.most_sigmas * sigma, _Settings.most_off)).all()
         return Reason.SIZE_MISMATCH if is_other else None
 
     def doubted(self, found: Location) -> Location:
         """Return `found` with each centre's covariance inflated by its size error, beyond what noise explains."""
         off, sigma = self._off(found)
         # [px²], in both directions: the direction of the shift is unknown.
-        excess = np.maximum(0.0, off**2 - (_FREE_SIGMAS * sigma) ** 2) * found.radii_px**2
+        excess = np.maximum(0.0, off**2 - (_Settings.free_sigmas * sigma) ** 2) * found.radii_px**2
         if not excess.any():
             return found
         pulled = triangulate(self._calibration, found.centres_px, np.repeat(np.maximum(excess, 1e-12), 2))
@@ -71,16 +64,16 @@ class BallSize:
     def _estimated(self) -> tuple[float, float]:
         """Return the estimated share and its 1-sigma."""
         if not self._shares:
-            return 1.0, RADIUS_SIGMA
+            return 1.0, _Settings.radius_sigma
         shares, sigmas = np.array(self._shares).T
         # The median is robust to fixes whose centre was shifted.
         order = np.argsort(shares)
         weights = sigmas[order] ** -2
         median = shares[order][np.searchsorted(np.cumsum(weights), 0.5 * weights.sum())]
-        sum_of_weights = RADIUS_SIGMA**-2 + weights.sum()
-        return float(RADIUS_SIGMA**-2 + weights.sum() * median) / sum_of_weights, sum_of_weights**-0.5
+        sum_of_weights = _Settings.radius_sigma**-2 + weights.sum()
+        return float(_Settings.radius_sigma**-2 + weights.sum() * median) / sum_of_weights, sum_of_weights**-0.5
 
 
 def _variances(found: Location) -> FloatArray:
     """Return the variance of each eye's size, shape (2,), from its radius and its depth."""
-    return found.size_sigmas**2 + found.cov[2, 2] / found.x[2] ** 2 + _TOLERANCE**2
+    return found.size_sigmas**2 + found.cov[2, 2] / found.x[2] ** 2 + _Settings.place_tolerance**2

@@ -93,8 +93,8 @@ class BoardDetector:
                 wanted = f"{self.board.columns}x{self.board.rows}"
                 text = f"the board has {seen} squares, not {wanted}. Give --squares {seen}, or take the right board"
                 if seen == wanted:
-                    text = "the markers are not where this board has them: mirrored, bent, or not made by this program"
-                return NotFound("other_squares", text)
+                    text = "the markers are not where this board has them: bent, or not made by this program"
+                return self._mirrored(grey, len(markers)) or NotFound("other_squares", text)
         if numbers is None or len(numbers) < _LEAST_CORNERS:
             return self._nothing(grey, len(markers))
         order = np.argsort(np.ravel(numbers))
@@ -103,9 +103,9 @@ class BoardDetector:
         return Corners(*found) if len(found[0]) >= _LEAST_CORNERS else self._nothing(grey, len(markers))
 
     def _nothing(self, grey: ImageArray, markers: int) -> NotFound:
-        mirrored = _markers(np.ascontiguousarray(grey[:, ::-1]), self.board.dictionary_name)
-        if len(mirrored) >= max(_LEAST_MARKERS, markers + 1):
-            return NotFound("mirrored", "the board is mirrored: print it again as it is, or mirror the images back")
+        mirrored = self._mirrored(grey, markers)
+        if mirrored is not None:
+            return mirrored
         if markers:
             return NotFound("not_found", f"too little of the board: {markers} of its markers. Bring it into view")
         other = self._other_dictionary(grey, self.board.dictionary_name)
@@ -119,6 +119,13 @@ class BoardDetector:
             text = f"a plain chessboard of {seen} squares. Give --pattern chessboard --squares {seen}"
             return NotFound("other_pattern", text)
         return NotFound("not_found", "no board. Bring it into view, larger, and not in glare")
+
+    def _mirrored(self, grey: ImageArray, markers: int) -> NotFound | None:
+        """Return the fault if a mirrored image has more markers; some of them mirrored look like others."""
+        mirrored = _markers(np.ascontiguousarray(grey[:, ::-1]), self.board.dictionary_name)
+        if len(mirrored) < max(_LEAST_MARKERS, markers + 1):
+            return None
+        return NotFound("mirrored", "the board is mirrored: print it again as it is, or mirror the images back")
 
     def _plain(self, grey: ImageArray) -> Corners | NotFound:
         size = (self.board.columns - 1, self.board.rows - 1)

@@ -16,6 +16,7 @@ from bodyschema.vision.rig.stereo_rig import CalibrationError, lenses_of
 from .view import EYES, View
 
 POSE = 6
+UNDETERMINED = "the views do not determine the lenses. Take more views, tilted and all over the image"
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ def solve(
     weighed = tuple(np.ones(view.corner_count) for view in views) if weights is None else tuple(weights)
     prior = np.zeros(len(vector)) if prior is None else prior
 
-    def stepped(now: _Linear, damping: float) -> _Linear | None:
+    def stepped(now: Linear, damping: float) -> Linear | None:
         step = now.step(damping)
         if step is None:
             return None
@@ -92,7 +93,7 @@ def solve(
 
     linear = minimised(_linearised(views, corners_m, model, vector, poses, weighed, prior), stepped)
     if not np.isfinite(linear.squares):
-        raise CalibrationError("the views do not determine the lenses. Take more views, tilted and all over the image")
+        raise CalibrationError(UNDETERMINED)
     return Bundle(model, linear.vector, linear.poses, tuple(linear.residuals), weighed, linear.reduced(0.0)[0], prior)
 
 
@@ -106,7 +107,7 @@ def view_residuals(
         weights: corner weights, shape (corners,).
     """
 
-    def stepped(now: _Linear, damping: float) -> _Linear:
+    def stepped(now: Linear, damping: float) -> Linear:
         H = now.pose_normals[0]
         step = np.linalg.solve(H + damping * np.diag(np.diag(H)), now.pose_gradients[0])
         return _linearised([view], corners_m, model, vector, now.poses + step, [weights])
@@ -163,7 +164,7 @@ def _in_right_eye(pose: FloatArray, right_eye: FloatArray) -> tuple[FloatArray, 
 
 
 @dataclass
-class _Linear:
+class Linear:
     """Residuals and normal equations at a point: of the rig, of each pose, and mixed."""
 
     vector: FloatArray
@@ -194,7 +195,9 @@ class _Linear:
         """Return the next step of rig and poses; None if the equations have no solution."""
         try:
             normal, gradient, poses = self.reduced(damping)
-            scale = 1.0 / np.sqrt(np.maximum(np.diag(normal), 1e-300))
+            if (np.diag(normal) <= 0.0).any():  # by rounding, far from any solution
+                return None
+            scale = 1.0 / np.sqrt(np.diag(normal))
             rig = scale * np.linalg.solve(normal * np.outer(scale, scale), scale * gradient)
             left = self.pose_gradients - np.einsum("vij,i->vj", self.mixed, rig)
             return rig, np.linalg.solve(poses, left[..., None])[..., 0]
@@ -215,10 +218,10 @@ def _linearised(
     poses: FloatArray,
     weights: Sequence[FloatArray],
     prior: FloatArray | None = None,
-) -> _Linear:
+) -> Linear:
     p, m = len(vector), len(views)
     known = np.zeros(p) if prior is None else prior
-    linear = _Linear(
+    linear = Linear(
         vector,
         poses,
         [],

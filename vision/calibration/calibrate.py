@@ -20,18 +20,15 @@ from .guidance import Coverage
 from .held_out import HeldOut, covariance, held_out
 from .refocus import focal_spread, refocused
 from .requirements import contradicts, lacking, misplaced, together, unsure
+from .settings import FitSettings as _Settings
 from .start import start
 from .view import EYES, ONE_EYE, Eye, View
 from .weights import weighed
 
 ModelChoice = Literal["auto", "pinhole", "fisheye", "rational"]
 
-_OUTLIER_SPREADS = 8.0
-_MOST_LEFT_OUT = 0.35
-# Power of the distance from the axis in the last term of the distortion, and the 1-sigma of that term at the image's
-# corner where it would fold the image over: a lens of a webcam has 0.01.
+# Power of the distance from the axis in the last term of the distortion.
 _STEEPEST_POWER: dict[Model, int] = {"pinhole": 6, "fisheye": 8, "rational": 6}
-_STEEPEST_TERM = 0.02
 _NUMBERS = re.compile(r"-?\d+(\.\d+)?")
 
 
@@ -201,7 +198,7 @@ def _fit(
             break
         rms = bundle.view_rms_px()
         left_out.append(LeftOut(kept.pop(worst).name, float(rms[worst]), float(np.median(rms))))
-        if len(left_out) > _MOST_LEFT_OUT * len(views):
+        if len(left_out) > _Settings.most_left_out * len(views):
             if (spread := focal_spread(kept, corners_m, solve(kept, corners_m, model, vector, poses))) is not None:
                 raise CalibrationError(refocused(spread))
             raise CalibrationError(
@@ -231,7 +228,7 @@ def _stiffened(views: Sequence[View], corners_m: FloatArray, bundle: Bundle, ima
         # The last coefficient is of the largest power.
         corner = 0.5 * np.linalg.norm(np.array(image_size_px) / np.array(lens.focal_px))
         last = (number + 1) * count - 1
-        prior[last] = (bundle.sigma_px * corner ** _STEEPEST_POWER[bundle.model] / _STEEPEST_TERM) ** 2
+        prior[last] = (bundle.sigma_px * corner ** _STEEPEST_POWER[bundle.model] / _Settings.steepest_term) ** 2
         vector[last] = 0.0
     stiff = solve(views, corners_m, bundle.model, vector, bundle.poses, bundle.weights, prior)
     return weighed(views, corners_m, stiff)
@@ -257,7 +254,7 @@ def _outlier(rms_px: FloatArray) -> int | None:
     usual = float(np.median(rms_px))
     spread = 1.4826 * float(np.median(np.abs(rms_px - usual)))
     worst = int(np.argmax(rms_px))
-    return worst if rms_px[worst] > usual + _OUTLIER_SPREADS * spread else None
+    return worst if rms_px[worst] > usual + _Settings.outlier_spreads * spread else None
 
 
 def _require_places(model: Model, vector: FloatArray) -> None:

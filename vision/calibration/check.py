@@ -10,21 +10,21 @@ from scipy.spatial.distance import pdist
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.vision.board import Board
 from bodyschema.vision.rig.rectified import Rectification
-from bodyschema.vision.rig.spread import covariance_of
-from bodyschema.vision.rig.stereo_rig import CalibrationError, StereoRig
-from bodyschema.vision.rig.triangulated import triangulated
+from bodyschema.vision.rig.stereo_rig import CalibrationError, StereoRig, covariance_of, triangulated
 
 from .view import View
 
-_LEAST_CORNERS = 8
-_SIGMAS = 4.0
-# Drift allowed for focus, temperature and a bent board, beyond the covariance.
-_FREE_ROWS_PX = 0.15
-_FREE_SQUARE = 0.002
-_STEP_PX = 1e-3
-# Exchanged or upside-down images are recognised if correcting them reduces the row differences to this share, with
-# square sizes right within this share.
-_MISPLACED_ROWS, _MISPLACED_SIZE = 0.1, 0.03
+
+class _Settings:
+    """Settings of the check: how much may change without a warning."""
+
+    least_corners, sigmas = 8, 4.0  # corners that both eyes see; multiple of the uncertainty
+    # Drift allowed for focus, temperature and a bent board, beyond the covariance: of rows, and of a square's size.
+    free_rows_px, free_square = 0.15, 0.002
+    step_px = 1e-3  # for derivatives
+    # Exchanged or upside-down images are recognised if correcting them reduces the row differences to this share, with
+    # square sizes right within this share.
+    misplaced_rows, misplaced_size = 0.1, 0.03
 
 
 @dataclass(frozen=True)
@@ -65,10 +65,10 @@ def check(rig: StereoRig, view: View, board: Board) -> Check:
         CalibrationError: one of the eyes does not see enough of the board.
     """
     numbers, left, right = _shared(view)
-    if len(numbers) < _LEAST_CORNERS:
+    if len(numbers) < (least := _Settings.least_corners):
         raise CalibrationError(
-            f"both eyes see {len(numbers)} corners of the board, at least {_LEAST_CORNERS} are needed. Hold it into "
-            "the middle of both images"
+            f"both eyes see {len(numbers)} corners of the board, at least {least} are needed. Hold it into the "
+            "middle of both images"
         )
     model = board.corners_m[numbers]
     covariance = covariance_of(rig, lambda other: _figures(other, left, right, model))
@@ -121,10 +121,10 @@ def _misplaced(rig: StereoRig, left: FloatArray, right: FloatArray, model: Float
         ("the right image is upside down: turn that camera, or its images", left, turned_right),
         ("both images are upside down: turn both cameras, or their images", turned_left, turned_right),
     )
-    most = _MISPLACED_ROWS * _rows_apart(rig, left, right)
+    most = _Settings.misplaced_rows * _rows_apart(rig, left, right)
     for text, one, other in placed:
         size = _figures(rig, one, other, model)[2]
-        if _rows_apart(rig, one, other) < most and abs(size - 1.0) < _MISPLACED_SIZE:
+        if _rows_apart(rig, one, other) < most and abs(size - 1.0) < _Settings.misplaced_size:
             return text
     return None
 
@@ -143,16 +143,18 @@ def _noise(rig: StereoRig, left: FloatArray, right: FloatArray, model: FloatArra
     slopes = []
     for place in np.ndindex(px.shape):
         moved = px.copy()
-        moved[place] += _STEP_PX
+        moved[place] += _Settings.step_px
         slopes.append(_figures(rig, moved[: len(left)], moved[len(left) :], model))
-    J = (np.array(slopes) - _figures(rig, left, right, model)) / _STEP_PX
+    J = (np.array(slopes) - _figures(rig, left, right, model)) / _Settings.step_px
     return J.T @ J
 
 
 def _wrong(found: FloatArray, sigma: FloatArray, focal_px: float, width_px: int, nominal_m: float) -> list[str]:
     rows_px, roll_deg, square_m = found.tolist()
-    free = np.array([_FREE_ROWS_PX, np.degrees(4.0 * _FREE_ROWS_PX / width_px), _FREE_SQUARE * nominal_m])
-    off = np.abs(found - np.array([0.0, 0.0, nominal_m])) > _SIGMAS * sigma + free
+    free = np.array(
+        [_Settings.free_rows_px, np.degrees(4.0 * _Settings.free_rows_px / width_px), _Settings.free_square * nominal_m]
+    )
+    off = np.abs(found - np.array([0.0, 0.0, nominal_m])) > _Settings.sigmas * sigma + free
     texts = (
         f"rows are {rows_px:+.2f} px apart: a camera has been turned up or down by "
         f"{np.degrees(abs(rows_px) / focal_px):.2f}°",

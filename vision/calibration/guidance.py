@@ -13,17 +13,14 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.vision.board import Board, Corners
 from bodyschema.vision.rig.lens import Lens
 
+from .settings import ViewSettings as _Settings
 from .start import pose_of
 from .view import EYES, Eye, View, all_px, image_of, seen_by
 
 GRID = (3, 3)
 _ROWS, _COLUMNS = ("upper", "middle", "lower"), ("left", "middle", "right")
-# Share of the image's width: focal length of a typical webcam, used before calibration.
-_USUAL_FOCAL = 0.9
 CORNERS_A_CELL = 8
-_TILT_DEG = 15.0
 TILTED_EACH_WAY = 2
-_NEAR, _FAR = 0.55, 0.40  # extent of the board as a share of the image
 WANTED_VIEWS = 20
 
 
@@ -82,22 +79,22 @@ class Coverage:
         """Return the number of views in which each edge of the board is farther away than the opposite one."""
         about_upright, about_level = self.tilts_deg[:, 0], self.tilts_deg[:, 1]
         ways = {
-            "right": about_upright > _TILT_DEG,
-            "left": about_upright < -_TILT_DEG,
-            "lower": about_level > _TILT_DEG,
-            "upper": about_level < -_TILT_DEG,
+            "right": about_upright > _Settings.tilt_deg,
+            "left": about_upright < -_Settings.tilt_deg,
+            "lower": about_level > _Settings.tilt_deg,
+            "upper": about_level < -_Settings.tilt_deg,
         }
         return {edge: int(np.count_nonzero(tilted)) for edge, tilted in ways.items()}
 
     @property
     def has_near(self) -> bool:
         """True if a view shows the board near."""
-        return bool(np.any(self.extents > _NEAR))
+        return bool(np.any(self.extents > _Settings.near))
 
     @property
     def has_far(self) -> bool:
         """True if a view shows the board far away."""
-        return bool(np.any(self.extents < _FAR))
+        return bool(np.any(self.extents < _Settings.far))
 
     def _tilts_missing(self) -> list[str]:
         return [
@@ -152,7 +149,7 @@ def rough_tilt_deg(corners: Corners, board: Board, image_size_px: tuple[int, int
     plane shows no perspective anywhere in the image, and does not determine the focal length.
     """
     width, height = image_size_px
-    focal = _USUAL_FOCAL * width
+    focal = _Settings.usual_focal * width
     lens = Lens("pinhole", (focal, focal), (0.5 * (width - 1), 0.5 * (height - 1)), (0.0,) * 5)
     normal = cv2.Rodrigues(pose_of(corners, board.corners_m, lens)[:3])[0][:, 2]
     right, lower = np.degrees(np.arcsin(-normal[:2] * np.sign(normal[2]))).tolist()

@@ -12,10 +12,9 @@ from bodyschema.interfaces.records import FloatArray
 
 from .bundle import POSE, Bundle, solve, view_residuals
 from .influence import inverse_of
+from .settings import FitSettings as _Settings
 from .view import View
 from .weights import weighed
-
-_FOLDS = 10
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ def held_out(views: Sequence[View], corners_m: FloatArray, whole: Bundle) -> Hel
     Args:
         whole: the fit of all views, from which each part's fit starts. Corners rejected there do not count here.
     """
-    groups = np.arange(len(views)) % min(_FOLDS, len(views))
+    groups = np.arange(len(views)) % min(_Settings.folds, len(views))
     squares = np.zeros(len(views))
     for group in range(groups.max() + 1):
         kept = np.flatnonzero(groups != group).tolist()

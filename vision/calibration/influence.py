@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.vision.rig.stereo_rig import CalibrationError
 
-from .bundle import Bundle, lenses_and_rest, seen_with_slopes
+from .bundle import UNDETERMINED, Bundle, lenses_and_rest, seen_with_slopes
 from .view import View
 
 
@@ -45,6 +46,12 @@ def influences(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> 
 
 
 def inverse_of(normal: FloatArray) -> FloatArray:
-    """Return the inverse of a normal matrix whose parameters have different units."""
+    """Return the inverse of a normal matrix whose parameters have different units.
+
+    Raises:
+        CalibrationError: it is not positive definite.
+    """
+    if not (np.diag(normal) > 0.0).all():
+        raise CalibrationError(UNDETERMINED)
     scale = 1.0 / np.sqrt(np.diag(normal))
     return np.linalg.inv(normal * np.outer(scale, scale)) * np.outer(scale, scale)

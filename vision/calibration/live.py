@@ -15,11 +15,8 @@ from bodyschema.vision.board import Board, BoardDetector
 from .gather import Detector, Gathered, Unusable, eyes_of, looked_at
 from .guidance import CORNERS_A_CELL, cell_counts, rough_tilt_deg
 from .images import ImagePair
+from .settings import ViewSettings as _Settings
 from .view import EYES, Eye, View, all_px
-
-_STILL_PX = 1.0  # between two frames; the median of all corners
-# A view is new if its corners differ by this share of the image's width from all others, or its tilt by this angle.
-_NEW_SHARE, _NEW_TILT_DEG = 0.06, 10.0
 
 
 class Outcome(StrEnum):
@@ -97,7 +94,7 @@ class LiveViews:
         if not self._is_new(view, seeing):
             return Outcome.KNOWN
         before = self._before
-        if before is None or any(_apart_px(view, before, eye) >= _STILL_PX for eye in seeing):
+        if before is None or any(_apart_px(view, before, eye) >= _Settings.still_px for eye in seeing):
             return Outcome.MOVING
         return Outcome.TAKEN
 
@@ -107,9 +104,9 @@ class LiveViews:
         return bool((shown & ~self.coverage.covered(eye)).any())
 
     def _is_new(self, view: View, seeing: Sequence[Eye]) -> bool:
-        least, tilt = _NEW_SHARE * self.found.image_size_px[0], self._tilt(view)
+        least, tilt = _Settings.new_share * self.found.image_size_px[0], self._tilt(view)
         return all(
-            any(_apart_px(view, other, eye) > least for eye in seeing) or math.dist(tilt, its) > _NEW_TILT_DEG
+            any(_apart_px(view, other, eye) > least for eye in seeing) or math.dist(tilt, its) > _Settings.new_tilt_deg
             for other, its in zip(self.found.views, self._tilts, strict=True)
         )
 

@@ -11,12 +11,8 @@ from scipy.special import chdtri
 from bodyschema.interfaces.records import FloatArray
 
 from .bundle import Bundle, lenses_and_rest, seen_with_slopes
+from .settings import FitSettings as _Settings
 from .view import View
-
-# A focal length of its own for each view has to explain this many times what any other freedom explains that views do
-# not have. On nineteen public sets without autofocus it explains at most once as much.
-_CLEARLY = 2.0
-_FALSE_ALARMS = 1e-3  # of independent corners
 
 
 def focal_spread(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> float | None:
@@ -64,7 +60,7 @@ def focal_spread(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -
         freedom += len(off) - 6 - len(normal)
     variance = squares / max(freedom, 1)
     explained = np.mean(by_focal) / max(variance, np.mean(by_others, axis=0).max())
-    if explained < max(_CLEARLY, float(chdtri(len(by_focal), _FALSE_ALARMS)) / len(by_focal)):
+    if explained < max(_Settings.clearly, float(chdtri(len(by_focal), _Settings.false_alarms)) / len(by_focal)):
         return None
     spread = float(np.mean(np.square(factors))) - variance * float(np.mean(variances))
     return float(np.sqrt(max(spread, 0.0)))

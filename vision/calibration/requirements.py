@@ -11,19 +11,10 @@ from bodyschema.vision.rig.rectified import Rectification
 from bodyschema.vision.rig.stereo_rig import CalibrationError, Rig, StereoRig
 
 from .guidance import Coverage, cell_name
+from .settings import ViewSettings as _Settings
 from .view import image_of
 
 LEAST_VIEWS = 8
-_LEAST_CELLS = 6
-_TILTED_DEG = 10.0
-_LEAST_TILTED = 3
-# Sigmas are those of whole views, two to six times those of independent corners: fifteen good pairs at 640×480 leave
-# 0.9 %, 0.5 % and 2.2 %. A principal point that is off turns the frame, and changes little else.
-_MOST_SIGMA = 0.01  # of the focal length, and of the baseline
-_MOST_CENTRE_SIGMA = 0.03  # of the image's width
-_MOST_HELD_OUT = 0.0015  # of the image's width
-_MOST_TURNED_RAD = np.radians(45.0)
-_MOST_HAND_ERROR_M = 0.0015
 
 
 def lacking(coverage: Coverage) -> list[str]:
@@ -34,15 +25,15 @@ def lacking(coverage: Coverage) -> list[str]:
         reasons.append(
             f"too few views: {who} the board in {coverage.whole_views}, at least {LEAST_VIEWS} are needed, 20 are good"
         )
-    tilted = np.count_nonzero(coverage.largest_tilts_deg > _TILTED_DEG)
-    if coverage.whole_views and tilted < _LEAST_TILTED:
+    tilted = np.count_nonzero(coverage.largest_tilts_deg > _Settings.tilted_deg)
+    if coverage.whole_views and tilted < _Settings.least_tilted:
         reasons.append(
             f"the board faces the cameras in all views{f' but {tilted}' if tilted else ''}: focal length and distance "
             "cannot be told apart. Tilt it by 20° to 40°, each way"
         )
     for eye in coverage.eyes:
         covered = coverage.covered(eye)
-        if np.count_nonzero(covered) < _LEAST_CELLS:
+        if np.count_nonzero(covered) < _Settings.least_cells:
             empty = ", ".join(cell_name(r, c) for r, c in np.argwhere(~covered).tolist())
             reasons.append(f"the board was hardly ever in these parts of the {image_of(eye, coverage.eyes)}: {empty}")
     return reasons
@@ -55,12 +46,12 @@ def misplaced(R_right_left: FloatArray, translation_m: FloatArray) -> str | None
         R_right_left, translation_m: a point x of the left eye's frame is at R x + t in the right one's.
     """
     about_sight = abs(np.arctan2(R_right_left[1, 0], R_right_left[0, 0]))
-    if about_sight > np.pi - _MOST_TURNED_RAD:
+    if about_sight > np.pi - _Settings.most_turned_rad:
         return (
             "one camera is upside down: the images are turned by "
             f"{np.degrees(about_sight):.0f}° against each other. Turn that camera, or its images where it is configured"
         )
-    if about_sight > _MOST_TURNED_RAD:
+    if about_sight > _Settings.most_turned_rad:
         return f"one camera lies on its side: the images are turned by {np.degrees(about_sight):.0f}°. Turn it upright"
     right_eye = -R_right_left.T @ translation_m
     if abs(right_eye[0]) < np.max(np.abs(right_eye[1:])):
@@ -78,9 +69,9 @@ def unsure(rig: Rig) -> list[str]:
     """Return messages for the parameters that are not determined well enough."""
     reasons = []
     width = rig.image_size_px[0]
-    if rig.made.held_out_px > _MOST_HELD_OUT * width:
+    if rig.made.held_out_px > (most_px := _Settings.most_held_out * width):
         reasons.append(
-            f"views that were not fitted are off by {rig.made.held_out_px:.2f} px, {_MOST_HELD_OUT * width:.2f} px is "
+            f"views that were not fitted are off by {rig.made.held_out_px:.2f} px, {most_px:.2f} px is "
             "the most. Is the board flat and held still, the right lens model chosen, focus fixed?"
         )
     sigma = dict(zip(rig.names, rig.sigma.tolist(), strict=True))
@@ -88,12 +79,12 @@ def unsure(rig: Rig) -> list[str]:
     for eye in ("left", "right")[: len(rig.serials)]:
         whose = f"{eye} " if len(rig.serials) > 1 else ""
         focal = max(sigma[f"{eye}.f{axis}_px"] / value[f"{eye}.f{axis}_px"] for axis in "xy")
-        if focal > _MOST_SIGMA:
+        if focal > _Settings.most_sigma:
             reasons.append(
                 f"the {whose}focal length is known to {focal:.1%} only. Take views with the board tilted more"
             )
         centre = max(sigma[f"{eye}.c{axis}_px"] for axis in "xy")
-        if centre > _MOST_CENTRE_SIGMA * width:
+        if centre > _Settings.most_centre_sigma * width:
             reasons.append(
                 f"the {whose}principal point is known to {centre:.1f} px only. Take tilted views near corners"
             )
@@ -104,7 +95,7 @@ def unsure(rig: Rig) -> list[str]:
     if not isinstance(rig, StereoRig):
         return reasons
     share = rig.baseline_sigma_m / rig.baseline_m
-    if share > _MOST_SIGMA:
+    if share > _Settings.most_sigma:
         reasons.append(
             f"the baseline is known to {share:.1%} only. Take more views that both eyes see, near and tilted"
         )
@@ -113,7 +104,7 @@ def unsure(rig: Rig) -> list[str]:
 
 def contradicts(rig: StereoRig, baseline_m: float) -> str | None:
     """Return a message if the baseline measured by hand contradicts the calibrated one, else None."""
-    allowed = np.hypot(3.0 * rig.baseline_sigma_m, _MOST_HAND_ERROR_M)
+    allowed = np.hypot(3.0 * rig.baseline_sigma_m, _Settings.most_hand_error_m)
     ratio = baseline_m / rig.baseline_m
     if abs(baseline_m - rig.baseline_m) <= allowed:
         return None

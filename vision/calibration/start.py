@@ -13,10 +13,8 @@ from bodyschema.vision.board import Corners
 from bodyschema.vision.rig.lens import DISTORTION_NAMES, Lens, Model
 from bodyschema.vision.rig.stereo_rig import CalibrationError
 
+from .settings import FitSettings as _Settings
 from .view import EYES, Eye, View, seen_by
-
-# of the image's width: candidate focal lengths of a fisheye lens
-_FISHEYE_FOCALS = (0.25, 0.35, 0.5, 0.7, 1.0)
 
 
 def start(
@@ -65,9 +63,9 @@ def _lens(seen: Sequence[Corners], corners_m: FloatArray, size_px: tuple[int, in
     if len(seen) < 3:
         raise CalibrationError(f"the board is in {len(seen)} {eye} images. Take at least 3, better 20")
     if model == "fisheye":
-        return min((_fisheye(seen, corners_m, size_px, share) for share in _FISHEYE_FOCALS), key=lambda each: each[1])[
-            0
-        ]
+        return min(
+            (_fisheye(seen, corners_m, size_px, share) for share in _Settings.fisheye_focals), key=lambda each: each[1]
+        )[0]
     count = len(DISTORTION_NAMES[model])
     try:
         _, matrix, distortion, _, _ = cv2.calibrateCamera(

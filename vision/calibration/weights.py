@@ -21,12 +21,9 @@ from bodyschema.interfaces.records import FloatArray
 
 from .bundle import Bundle, solve
 from .influence import influences
+from .settings import FitSettings as _Settings
 from .view import View
 
-_REWEIGHTED = 3
-_FARTHEST = 5.0  # 1-sigmas: a corner farther off is an outlier
-_GROUP = 60  # corners with squares of similar width
-_SHARED = 6.0  # prior weight of the usual variance, in corners, against an image's own
 # A squared distance in the plane over twice the coordinate variance is exponential; this is the median.
 _MEDIAN = np.log(2.0)
 
@@ -42,7 +39,7 @@ class _Spread:
     def usual(self, share: FloatArray, kept: NDArray[np.bool_], *, robust: bool) -> FloatArray:
         """Return the variance of corners by the width of their squares, with the share of each image taken out."""
         order = np.flatnonzero(kept)[np.argsort(self.width[kept], kind="stable")]
-        groups = np.array_split(order, max(len(order) // _GROUP, 1))
+        groups = np.array_split(order, max(len(order) // _Settings.group, 1))
         left = self.own / share
         level = [float(np.median(left[each])) / _MEDIAN if robust else float(left[each].mean()) for each in groups]
         falling = np.asarray(isotonic_regression(level, increasing=False).x, dtype=np.float64)
@@ -53,7 +50,7 @@ class _Spread:
         """Return the variance of each corner's image relative to the usual one."""
         among = kept.astype(np.float64)
         count, total = np.bincount(self.image, among), np.bincount(self.image, among * self.own / usual)
-        return ((total + _SHARED) / (count + _SHARED))[self.image]
+        return ((total + _Settings.shared) / (count + _Settings.shared))[self.image]
 
     def fitting(self, usual: FloatArray) -> NDArray[np.bool_]:
         """Return which corners are not outliers."""
@@ -61,7 +58,7 @@ class _Spread:
         for number in range(int(self.image.max()) + 1):
             mine = np.flatnonzero(self.image == number)
             off = self.own[mine] / usual[mine]
-            fits[mine] = off <= 0.5 * _FARTHEST**2 * max(float(np.median(off)) / _MEDIAN, 1.0)
+            fits[mine] = off <= 0.5 * _Settings.farthest**2 * max(float(np.median(off)) / _MEDIAN, 1.0)
         return fits
 
 
@@ -82,7 +79,7 @@ def corner_weights(views: Sequence[View], corners_m: FloatArray, bundle: Bundle)
 
 def weighed(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> Bundle:
     """Refit with weights that follow the accuracy of each image's corners."""
-    for _ in range(_REWEIGHTED):
+    for _ in range(_Settings.reweighted):
         weights = corner_weights(views, corners_m, bundle)
         bundle = solve(views, corners_m, bundle.model, bundle.vector, bundle.poses, weights, bundle.prior)
     return bundle

@@ -7,15 +7,7 @@ from pathlib import Path
 
 from bodyschema.interfaces.protocols import Clock
 
-from .config import (
-    CamerasConfig,
-    ImagesConfig,
-    OneConfig,
-    RealsenseConfig,
-    SideBySideConfig,
-    TwoConfig,
-    VideosConfig,
-)
+from .config import CamerasConfig, ImagesConfig, OneConfig, RealsenseConfig, SideBySideConfig, TwoConfig, VideosConfig
 from .film import Film, Roll
 from .images import ImageRoll
 from .live import LiveEyes

@@ -110,6 +110,14 @@ def plate(columns: int, rows: int, fold_deg: float) -> Shape:
     return _folded(f"a plate of {columns}x{rows} tags", Face((0, 0), np.eye(3), np.zeros(3)), links)
 
 
+def chessboard(columns: int, rows: int) -> Shape:
+    """Return the white squares of a board whose upper left square is black; its frame is that of the first tag."""
+    cells = [(c, r) for r in range(rows) for c in range(columns) if (c + r) % 2 == 1]
+    centres = [np.array([c - 1.0, -r, 0.0]) for c, r in cells]
+    faces = tuple(Face(cell, np.eye(3), centre) for cell, centre in zip(cells, centres, strict=True))
+    return Shape(f"a board of {columns}x{rows} squares", faces)
+
+
 def _folded(name: str, first: Face, links: Sequence[tuple[Cell, Cell, float]]) -> Shape:
     """Build a shape from its first face and the fold angles [deg] of links, each from a known face to a neighbour."""
     faces = {first.cell: first}

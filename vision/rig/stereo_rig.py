@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -235,3 +236,32 @@ def lenses_of(model: Model, vector: FloatArray) -> tuple[Lens, ...]:
     """Return the lenses in a vector of all parameters: one, or left and right."""
     alone = lens_of_one(model, vector)
     return split(model, vector)[:2] if alone is None else (alone,)
+
+
+def triangulated(rig: StereoRig, left_px: FloatArray, right_px: FloatArray) -> FloatArray:
+    """Return points (n, 3) [m] in the left camera's own frame, seen at (n, 2) [px] by each eye.
+
+    The middle of the shortest line between both rays.
+    """
+    a = np.column_stack([rig.left.directions(left_px), np.ones(len(left_px))])
+    b = np.column_stack([rig.right.directions(right_px), np.ones(len(right_px))]) @ rig.R_right_left
+    eye = -rig.R_right_left.T @ rig.translation_m
+    aa, bb, ab = (np.einsum("ni,ni->n", *pair) for pair in ((a, a), (b, b), (a, b)))
+    ae, be = a @ eye, b @ eye
+    nearness = aa * bb - ab**2
+    along_a = (ae * bb - ab * be) / nearness
+    along_b = (ab * ae - aa * be) / nearness
+    return 0.5 * (along_a[:, None] * a + eye + along_b[:, None] * b)
+
+
+def covariance_of(rig: StereoRig, figures: Callable[[StereoRig], FloatArray]) -> FloatArray:
+    """Return the covariance (m, m) of figures (m,) computed from a rig, to first order."""
+    vector, sigma = rig.vector, rig.sigma
+    slopes = []
+    for k, step in enumerate(1e-3 * sigma):
+        forward, backward = (
+            figures(rig.with_vector(vector + sign * step * np.eye(len(vector))[k])) for sign in (1, -1)
+        )
+        slopes.append((forward - backward) / (2.0 * step))
+    J = np.array(slopes)
+    return J.T @ rig.covariance @ J

@@ -9,6 +9,8 @@ black ones.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -16,10 +18,15 @@ from scipy.special import ndtr
 
 from bodyschema.interfaces.records import FloatArray, ImageArray
 
-from .edge import SQUARE, leave, sampled
+from .edge import SQUARE, Mask, leave, sampled
 
 # Most samples along a row of modules; else one a pixel.
 _MOST = 80
+# Most rounds of the fit: a fourth moves bleeding of a pixel by 0.002 px; converged when the last moved it by less than
+# this [px], as corners are. Step of the derivative, in parts of the blur.
+_ROUNDS, _SETTLED_PX, _STEP = 3, 0.003, 0.01
+# Bleeding by this share of a module leaves nothing of it.
+_WIDEST = 0.5
 # Share of the samples that the pattern has to explain; the usual bleeding, in parts of the blur, where it does not.
 _FITS, _UNSEEN = 0.9, 0.3
 # Relative error on nine photographed grids (RMS): modules inside are not drawn and lit exactly as the edges are.
@@ -30,7 +37,8 @@ def bleed(grey: ImageArray, corners_px: FloatArray, blur_px: float, modules: Flo
     """Return how far white bleeds over the edges of black [px] and its variance [px²]; 0 where the pattern hides it.
 
     The levels of the tag are fitted by those of black and white, with a gradient each, and by two derivatives of the
-    blurred pattern: by its edges' shift, and by its blur.
+    blurred pattern: by its edges' shift, and by its blur. The pattern is then drawn with its edges shifted, and fitted
+    again (Gauss and Newton).
 
     Args:
         grey: the image.
@@ -53,33 +61,28 @@ def bleed(grey: ImageArray, corners_px: FloatArray, blur_px: float, modules: Flo
         return unseen
     levels = sampled(grey, spots)
     printed = np.pad(modules, 1, constant_values=1.0)
-    white, by_x, by_xx = _blurred(x + 1.0, width, blur_px, len(printed))
-    white_y, by_y, by_yy = _blurred(y + 1.0, height, blur_px, len(printed))
-    pattern = white_y @ printed @ white.T
-    slope_x, slope_y = white_y @ printed @ by_x.T, by_y @ printed @ white.T
-    wider = white_y @ printed @ by_xx.T + by_yy @ printed @ white.T
     half = 0.5 * length
     right, below = across / half - 1.0, down / half - 1.0
-    # The grid itself comes from edges that have bled towards the tag's middle.
-    bled = np.hypot(slope_x, slope_y) - right * slope_x - below * slope_y
     lit = np.stack([np.ones_like(right), right, below])
-    design = np.concatenate([lit, lit * pattern, [wider, bled]]).reshape(8, -1)
-    try:
-        found = np.linalg.solve(design @ design.T, design @ levels)
-        kept = np.abs(levels - found @ design) < 0.5 * found[3]  # the rest show the other colour
-        if not found[3] >= 1.0 or kept.mean() < _FITS:  # white is not one grey level brighter than black, or hidden
-            return unseen
-        cov = np.linalg.inv((design * kept) @ design.T)
-    except np.linalg.LinAlgError:  # too few modules, or too sharp, to tell shift and blur apart
+
+    def pattern_at(bled_px: float) -> tuple[FloatArray, FloatArray]:
+        # The grid itself comes from edges that have bled towards the tag's middle.
+        shifts = bled_px / width, bled_px / height
+        true = [half + (at - half) * (1.0 - shift / half) for at, shift in zip((x, y), shifts, strict=True)]
+        (white, wide), (white_y, wide_y) = map(_blurred, true, shifts, (width, height), [blur_px] * 2, [length] * 2)
+        drawn = _bled(printed, bled_px)
+        return white_y @ drawn @ white.T, white_y @ drawn @ wide.T + wide_y @ drawn @ white.T
+
+    fit = _fitted(levels, lit, pattern_at, _STEP * blur_px)
+    if fit is None or not abs(fit.moved) < _WIDEST * min(width, height):
         return unseen
-    found = cov @ (design @ (levels * kept))
-    moved = float(found[7] / found[3])
+    moved, found, cov, design, kept = fit
     # What a module pulls at the shift: its samples share pixels, and print and light.
     pulls = (cov[7] @ design * kept * (levels - found @ design)).reshape(across.shape)
     rows, columns = (np.flatnonzero(np.diff(np.floor(at), prepend=-1.0)) for at in (y, x))
     pulls = np.add.reduceat(np.add.reduceat(pulls, rows, axis=0), columns, axis=1)
     by_chance = float(np.square(pulls).sum() / found[3] ** 2) * pulls.size / (pulls.size - len(design))
-    if not math.isfinite(moved) or not by_chance > 0.0:
+    if not by_chance > 0.0:
         return unseen
     # Many cameras do not bleed at all. How likely that is follows from two densities of what was found: by chance
     # alone, and by chance and the usual bleeding.
@@ -92,11 +95,66 @@ def bleed(grey: ImageArray, corners_px: FloatArray, blur_px: float, modules: Flo
     return bleeds * moved, variance
 
 
+class _Fit(NamedTuple):
+    """Shift [px], weights of the rows of a design (8, n) and their covariance, the design, and samples it explains."""
+
+    moved: float
+    found: FloatArray
+    cov: FloatArray
+    design: FloatArray
+    kept: Mask
+
+
+def _fitted(
+    levels: FloatArray, lit: FloatArray, pattern_at: Callable[[float], tuple[FloatArray, FloatArray]], step_px: float
+) -> _Fit | None:
+    """Fit levels (n,) by the pattern at the shift that explains them best; None if something hides it."""
+    moved, kept = 0.0, np.ones(levels.shape, np.bool_)
+    fit = None
+    for _ in range(_ROUNDS):
+        pattern, wider = pattern_at(moved)
+        bled = (pattern_at(moved + step_px)[0] - pattern) / step_px
+        design = np.concatenate([lit, lit * pattern, [wider, bled]]).reshape(8, -1)
+        try:
+            found = np.linalg.solve((design * kept) @ design.T, design @ (levels * kept))
+            kept = np.abs(levels - found @ design) < 0.5 * found[3]  # the rest show the other colour
+            if not found[3] >= 1.0 or kept.mean() < _FITS:  # white is not one grey level brighter than black, or hidden
+                return None
+            cov = np.linalg.inv((design * kept) @ design.T)
+        except np.linalg.LinAlgError:  # too few modules, or too sharp, to tell shift and blur apart
+            return None
+        found = cov @ (design @ (levels * kept))
+        change = float(found[7] / found[3])
+        moved += change
+        if not math.isfinite(moved):
+            return None
+        fit = _Fit(moved, found, cov, design, kept)
+        if abs(change) < _SETTLED_PX:
+            break
+    return fit
+
+
+def _bled(printed: FloatArray, bled_px: float) -> FloatArray:
+    """Return the colours (2 n − 1, 2 n − 1) of n by n modules and of the strips between, which white or black takes."""
+    taken = np.maximum if bled_px >= 0.0 else np.minimum
+    rows = np.empty((2 * len(printed) - 1, len(printed)))
+    rows[::2], rows[1::2] = printed, taken(printed[1:], printed[:-1])
+    drawn = np.empty((len(rows), len(rows)))
+    drawn[:, ::2], drawn[:, 1::2] = rows, taken(rows[:, 1:], rows[:, :-1])
+    return drawn
+
+
 def _blurred(
-    places: FloatArray, module_px: float, blur_px: float, count: int
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the shares (n, count) of modules in a row at `places` (n,) in modules, and derivatives by 1 and 2 px."""
-    t = (places[:, None] - np.arange(count + 1)) * (module_px / blur_px)
+    places: FloatArray, shift: float, module_px: float, blur_px: float, length: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the shares (n, m) of modules and strips in a row at `places` (n,), and their second derivatives [1/px²].
+
+    Places and shift are in modules. A strip is as wide as two edges' shift.
+    """
+    between = np.arange(length + 1.0)
+    lines = np.column_stack([between - abs(shift), between + abs(shift)]).ravel()
+    lines = np.concatenate([[-1.0], lines, [length + 1.0]])
+    t = (places[:, None] - lines) * (module_px / blur_px)
     density = np.exp(-0.5 * t * t) / (blur_px * math.sqrt(2.0 * math.pi))
-    first, *derivatives = (step[:, :-1] - step[:, 1:] for step in (ndtr(t), density, -t * density / blur_px))
-    return first, derivatives[0], derivatives[1]
+    share, wider = (step[:, :-1] - step[:, 1:] for step in (ndtr(t), -t * density / blur_px))
+    return share, wider

@@ -21,38 +21,15 @@ from scipy.special import ndtr
 from bodyschema.interfaces.records import FloatArray, ImageArray, Reason
 
 from .config import TagConfig
+from .settings import EdgeSettings as _Settings
 
 # Black border, data and border of all dictionaries that are offered: 6 + 2 modules.
 MODULES = 8.0
-# Distance in blurs that lines across an edge keep from the ends of black border and white margin (one module each), so
-# that little of the modules beyond shows; on small tags they reach over this share of the module. Their distance in
-# blurs from the tag's corners, which are rounded off: at 1.8 without noise tags come out larger by 0.0004 px an edge.
-_CLEAR_BLURS, _CLEAR_SHARE, _CORNER_BLURS = 1.7, 0.5, 2.6
-LONGEST_REACH_PX = 6.0
-_SAMPLE_PX = 0.5
-_FEWEST_POINTS, _MOST_POINTS = 6, 80
-# The sharpest edge (1-sigma) [px].
-SHARPEST_PX = 0.45
 # Variance that interpolation between pixels adds to a blur [px²].
 INTERPOLATION = 1.0 / 6.0
 # Fourth cumulant along an axis of a square pixel and of the interpolation between them [px⁴]: no such blur reaches as
 # far as a Gaussian.
 PIXEL_CUMULANT = -1.0 / 40.0
-# Relative error of the correction for the modules beyond: no lens blurs exactly like a Gaussian.
-_BEYOND_SHARE = 0.2
-# Least error of an edge [px]: images without noise leave 0.0004 to 0.0007, as levels are whole numbers. Noise spreads
-# that error over the points, whose scatter has it then.
-_FLOOR_PX = 0.0007
-# Points farther from their line than this, in medians of all points' distances, are outliers. So much [px] paper that
-# is not flat and a camera's sharpening may bring.
-_STRAY_MEDIANS, _WAVY_PX = 5.2, 0.15
-# What is added to the blur of the filter for an edge's shift [px].
-_WIDER_PX = 1.5
-# Prior variances in units of the noise: of the levels, and of their gradients across the edge [1/px²].
-_FREE, _LEVEL, _GRADIENT = 1e4, 0.5, 0.01
-# Ends of the lines across that show plain black and plain white where an edge may be pixels off, as a share of their
-# reach.
-_PLAIN = 0.35
 # Corners as they go round, in parts of the side.
 SQUARE = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
 # A tag's modules from those of the frame of each edge, in which the edge goes from (0, 0) to (8, 0).
@@ -178,7 +155,7 @@ def find_edges(
     """
     begin, end = corners_px, corners_px[[1, 2, 3, 0]]
     lengths = np.linalg.norm(end - begin, axis=1)
-    if lengths.min() < _FEWEST_POINTS:
+    if lengths.min() < _Settings.fewest_points:
         return Reason.NO_MARKER
     along = (end - begin) / lengths[:, None]
     normals = np.column_stack([along[:, 1], -along[:, 0]])  # corners go round clockwise: out of the tag
@@ -236,21 +213,21 @@ def _rays(
     to_modules = np.asarray(np.linalg.inv(to_px), np.float64)
     quads = corners_px[(np.arange(4)[:, None] + np.arange(4)) % 4]
     modules = np.abs(_module_ends(to_modules, quads[:, :2].mT, normals)).min(axis=(1, 2))
-    share = _CLEAR_SHARE * modules
-    clear = np.minimum(np.maximum(modules - _CLEAR_BLURS * blur_px, share), LONGEST_REACH_PX)
+    share = _Settings.clear_share * modules
+    clear = np.minimum(np.maximum(modules - _Settings.clear_blurs * blur_px, share), _Settings.longest_reach_px)
     reaches = shorter * (np.maximum(clear, share) if rough else clear)
     # At an acute corner, nearby lines leave the tag through its other side.
     sides = quads[:, [3, 2]] - quads[:, :2]
     leaning = (sides * along[:, None]).sum(axis=2) / (sides * normals[:, None]).sum(axis=2)
-    free = _CORNER_BLURS * blur_px + np.maximum(leaning * np.outer(reaches, (-1.0, 1.0)), 0.0)
-    counts = np.minimum((lengths - free.sum(axis=1)).astype(np.intp), _MOST_POINTS)
-    if counts.min() < _FEWEST_POINTS:
+    free = _Settings.corner_blurs * blur_px + np.maximum(leaning * np.outer(reaches, (-1.0, 1.0)), 0.0)
+    counts = np.minimum((lengths - free.sum(axis=1)).astype(np.intp), _Settings.most_points)
+    if counts.min() < _Settings.fewest_points:
         return Reason.NO_MARKER
     number = np.arange(counts.max())
     first, last = (2.0 * free / lengths[:, None] - 1.0).T * np.array([[1.0], [-1.0]])
     share = np.minimum(number / (counts[:, None] - 1.0), 1.0)
     s = first[:, None] + (last - first)[:, None] * share
-    samples = 2 * np.ceil(reaches / _SAMPLE_PX).astype(np.intp)[:, None]
+    samples = 2 * np.ceil(reaches / _Settings.sample_px).astype(np.intp)[:, None]
     sample = np.arange(samples.max())
     steps = (np.minimum(sample, samples - 1) + 0.5) * (2.0 * reaches[:, None] / samples) - reaches[:, None]
     points = origins[..., None] + (0.5 * lengths[:, None] * along)[..., None] * s[:, None]
@@ -310,7 +287,7 @@ def sampled(grey: ImageArray, places: FloatArray) -> FloatArray:
 def _ideal(places: FloatArray, origins: FloatArray, normals: FloatArray, blur_px: float) -> FloatArray:
     """Return the shares of white of edges through `origins` at places (2, 4, n, m), interpolated from pixels."""
     # Interpolation adds to the pixels' own blur.
-    normals = normals / math.sqrt(max(blur_px**2, SHARPEST_PX**2) - INTERPOLATION)
+    normals = normals / math.sqrt(max(blur_px**2, _Settings.sharpest_px**2) - INTERPOLATION)
     whole = np.floor(places)
     u, v = normals.T[:, :, None, None]
     level = whole[0] * u + whole[1] * v - (origins * normals).sum(axis=1)[:, None, None]
@@ -328,7 +305,7 @@ def _interpolated(pixels: list[FloatArray], parts: FloatArray) -> FloatArray:
 def _rough_points(profiles: FloatArray, rays: _Rays, blur_px: float, min_contrast: float) -> _Points | Reason:
     """Return the points from the share of black on each line (4, n, m): rough, but from anywhere on the lines."""
     samples = rays.weights.sum(axis=1)[:, None]
-    plain = np.maximum(1.0, np.rint(0.5 * _PLAIN * samples))
+    plain = np.maximum(1.0, np.rint(0.5 * _Settings.plain * samples))
     number = np.arange(rays.weights.shape[1])
     ends = np.stack([number < plain, (number >= samples - plain) & (number < samples)], axis=1) / plain[..., None]
     black, white = np.einsum("enm,ekm,en->ke", profiles, ends, rays.used) / rays.counts
@@ -435,14 +412,19 @@ def _filters(steps: FloatArray, weights: FloatArray, blur_px: float) -> tuple[Fl
     An edge along the rows or columns has the same place within the pixels all along, so that what a pixel makes of its
     shape does not average out. Filters for the shift are wider than the edge: they hardly depend on that shape.
     """
-    wide = math.hypot(blur_px, _WIDER_PX)
+    wide = math.hypot(blur_px, _Settings.wider_px)
     blurs = np.array([blur_px, wide, wide])[:, None, None]
     places = steps / blurs
     white, slope = ndtr(places), np.exp(-0.5 * places**2) / (blurs * math.sqrt(2.0 * math.pi))
     sides = np.stack([1.0 - white, white], axis=2)
     basis = np.concatenate([sides, np.stack([-slope, -slope * places], axis=2), sides * steps[:, None]], axis=2)
     basis *= weights[:, None]
-    priors = 1.0 / np.array([[level, level, np.inf, _FREE, _GRADIENT, _GRADIENT] for level in (_FREE, _FREE, _LEVEL)])
+    priors = 1.0 / np.array(
+        [
+            [level, level, np.inf, _Settings.free, _Settings.gradient, _Settings.gradient]
+            for level in (_Settings.free, _Settings.free, _Settings.level)
+        ]
+    )
     cov = np.linalg.inv(basis @ basis.mT + (priors[:, :, None] * np.eye(6))[:, None])
     narrow, *shifts = cov[:, :, :4] @ basis
     free, steady = (-shift[:, 2] / (shift[:, 2] * slope[0]).sum(axis=1)[:, None] for shift in shifts)
@@ -467,13 +449,13 @@ def _fitted(
     The result is `places`, `slopes`, `scatter`, `shared` and `residuals`, see `Edges`.
     """
     kept = points.clear
-    fewest = np.maximum(config.min_visible * rays.counts, _FEWEST_POINTS - 1)
+    fewest = np.maximum(config.min_visible * rays.counts, _Settings.fewest_points - 1)
     for _ in range(3):
         if (kept.sum(axis=1) < fewest).any():
             return Reason.OCCLUDED
         line = _line_filters(rays.s, kept) @ points.steady[..., None]
         far = np.abs(points.steady - line[:, 0] - line[:, 1] * rays.s)
-        most = np.maximum(_STRAY_MEDIANS * _medians(far, kept), _WAVY_PX)
+        most = np.maximum(_Settings.stray_medians * _medians(far, kept), _Settings.wavy_px)
         agreeing = points.clear & (far <= most[:, None])
         if (agreeing == kept).all():
             break
@@ -483,13 +465,13 @@ def _fitted(
     lines = filters @ both  # (4, 2, 2)
     residuals = (both - lines[:, None, 0] - lines[:, None, 1] * rays.s[..., None]) * kept[..., None]
     freedom = kept.sum(axis=1) - 2.0
-    squares = np.maximum(np.square(residuals).sum(axis=1), freedom[:, None] * _FLOOR_PX**2)
+    squares = np.maximum(np.square(residuals).sum(axis=1), freedom[:, None] * _Settings.floor_px**2)
     # With few points the scatter may be larger than it seems: Student's t has this variance.
     sigmas = np.sqrt(squares / np.maximum(freedom - 2.0, 1.0)[:, None])
     scatter = sigmas[:, :, None] * (filters @ filters.mT) * sigmas[:, None]
     beyond = filters @ points.beyond[..., None]
-    floor = np.maximum(_FLOOR_PX**2 - scatter, 0.0) * np.eye(2)
-    shared = floor + _BEYOND_SHARE**2 * beyond @ beyond.mT + points.unlit[..., None] * np.eye(2)
+    floor = np.maximum(_Settings.floor_px**2 - scatter, 0.0) * np.eye(2)
+    shared = floor + _Settings.beyond_share**2 * beyond @ beyond.mT + points.unlit[..., None] * np.eye(2)
     waves = residuals[..., 1] * np.sqrt(freedom / squares[:, 1])[:, None]
     return (
         lines[:, 0, 0],

@@ -14,11 +14,10 @@ from bodyschema.interfaces.records import FloatArray, ImageArray, Reason
 from .config import TagConfig
 from .dictionary import DICTIONARIES, OTHER_DICTIONARIES, tags_of
 from .image import TagImage, measure_tag
+from .settings import TagSettings as _Settings
 
 _log = logging.getLogger(__name__)
 
-# Squares are two where their corners are on the mean so far apart, as a share of the perimeter.
-_APART_SHARE = 0.03
 
 Region = tuple[int, int, int, int]
 Seen = dict[int, TagImage | Reason]
@@ -58,7 +57,8 @@ class TagFinder:
             self._suspect, self._warned = (self._suspect + 1) % len(names), False
         elif not self._warned:
             self._warned = True
-            _log.warning("%s, not one of %s", name or "a mirrored tag", self._config.dictionary)
+            kind = f"tag of {name}" if name else "mirrored tag"
+            _log.warning("a %s is in view, not one of %s", kind, self._config.dictionary)
         return reason
 
     def find(self, grey: ImageArray, region: Region | None = None) -> Seen:
@@ -81,7 +81,7 @@ def _detector(dictionary: Any, *, exact: bool = False) -> cv2.aruco.ArucoDetecto
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE  # `measure_tag` does better
     # Else a tag's paper, one module wider all around, is taken for the same square, and the tag is not found.
-    parameters.minMarkerDistanceRate = _APART_SHARE
+    parameters.minMarkerDistanceRate = _Settings.apart_share
     parameters.perspectiveRemovePixelPerCell = 8  # with OpenCV's 4, small and oblique tags are missed
     if exact:
         parameters.errorCorrectionRate = parameters.maxErroneousBitsInBorderRate = 0.0

@@ -17,24 +17,9 @@ from bodyschema.interfaces.records import FloatArray, ImageArray, Reason, frozen
 from .bleed import bleed
 from .config import TagConfig
 from .dictionary import tag_modules
-from .edge import INTERPOLATION, LONGEST_REACH_PX, MODULES, SHARPEST_PX, Edges, Light, find_edges
-
-# Most rounds with rough corners, and half of all; converged when no corner would move by more than this [px].
-_ROUNDS, _SETTLED_PX = 4, 0.003
-# Corners are rough until they move by less than this share of a module.
-_ROUGH_SHARE = 0.3
-# Usual blur of lens and interpolation (1-sigma) [px]; its prior spread, in an image with a noise of one grey level.
-_USUAL_BLUR_PX, _USUAL_SIGMA_PX = 0.85, 0.1
-# A blur that is a larger share of a module is the cause where corners are not sure.
-_MOST_BLUR = 0.5
-# Weight in waves along the edges of the power that interpolation alone gives them.
-_SMOOTHED_WAVES = 10
-# Slow waves have half-periods of at least this many points; least upper bound of their indices.
-_SLOW, _LEAST_QUICKEST = 4, 4
-# Standard deviations of chance that a random walk along the edges has to exceed.
-_CHANCE = 2.5
-# Share of their length that lines across edges keep where the usual ones leave the margin.
-_SHORTER = 0.5
+from .edge import INTERPOLATION, MODULES, Edges, Light, find_edges
+from .settings import EdgeSettings
+from .settings import TagSettings as _Settings
 
 _BEFORE = np.array([3, 0, 1, 2])  # edges before each edge
 _EVEN = Light(np.zeros((2, 2)), np.zeros((2, 2, 2)))
@@ -60,7 +45,7 @@ def measure_tag(grey: ImageArray, id: int, corners_px: FloatArray, config: TagCo
     found = _measured(grey, id, corners_px, 1.0, config)
     if isinstance(found, Reason):
         # The margin may be narrower than a module, the tag very oblique, or near the image's border.
-        again = _measured(grey, id, corners_px, _SHORTER, config)
+        again = _measured(grey, id, corners_px, _Settings.shorter, config)
         return again if isinstance(again, TagImage) else found
     return found
 
@@ -69,7 +54,7 @@ def _measured(
     grey: ImageArray, id: int, corners_px: FloatArray, shorter: float, config: TagConfig
 ) -> TagImage | Reason:
     """Measure the tag with lines across its edges that are so much shorter than usual."""
-    blur_px = _USUAL_BLUR_PX
+    blur_px = _Settings.usual_blur_px
     light: Light | None = None
     number, before_px = 0, math.inf
     while True:
@@ -80,16 +65,16 @@ def _measured(
         moved = _meetings(edges)
         moved_px = float(np.abs(moved - corners_px).max())
         module_px = 2.0 * float(edges.half_lengths.min()) / MODULES
-        if moved_px > max(LONGEST_REACH_PX, module_px):
+        if moved_px > max(EdgeSettings.longest_reach_px, module_px):
             return Reason.OCCLUDED
         corners_px, blur_px = moved, _blur(edges, blur_px)
         if light is None:
             before_px = moved_px
-            light = _EVEN if moved_px < _ROUGH_SHARE * module_px or number >= _ROUNDS else None
+            light = _EVEN if moved_px < _Settings.rough_share * module_px or number >= _Settings.rounds else None
             continue
         light = _light(edges)
         # Each round moves the corners less, by about the same factor.
-        if min(moved_px, moved_px * moved_px / before_px) < _SETTLED_PX or number >= 2 * _ROUNDS:
+        if min(moved_px, moved_px * moved_px / before_px) < _Settings.settled_px or number >= 2 * _Settings.rounds:
             break
         before_px = moved_px
     shortest_px = 2.0 * float(edges.half_lengths.min())
@@ -99,15 +84,13 @@ def _measured(
     edges = replace(edges, places=edges.places + bled_px)
     cov_px = _corner_covariance(edges, bled_var)
     if math.sqrt(float(np.diag(cov_px).max())) > config.max_corner_sigma * shortest_px:
-        return Reason.BLURRED if blur_px * MODULES > _MOST_BLUR * shortest_px else Reason.NOT_STRAIGHT
+        return Reason.BLURRED if blur_px * MODULES > _Settings.most_blur * shortest_px else Reason.NOT_STRAIGHT
     return TagImage(id, _meetings(edges), cov_px)
 
 
 def _blur(edges: Edges, before_px: float) -> float:
     """Estimate the blur (1-sigma) [px] of all edges, from the previous estimate `before_px`."""
-    usual = _USUAL_SIGMA_PX**-2
-    wider = edges.widening + usual * (_USUAL_BLUR_PX - before_px)
-    return max(before_px + wider / (usual + edges.information), SHARPEST_PX)
+    return max(before_px + edges.widening / edges.information, EdgeSettings.sharpest_px)
 
 
 def _light(edges: Edges) -> Light:
@@ -137,7 +120,7 @@ def _likeness(edges: Edges) -> FloatArray:
     smoothed = max(math.sqrt(4.0 * math.pi * INTERPOLATION) * float(np.mean(1.0 / apart)), 1.0)
     power = np.append(power, smoothed)
     design = np.stack([np.ones_like(power), np.append(index**-2.0, 0.0)])
-    count = np.append(np.ones_like(index), _SMOOTHED_WAVES)
+    count = np.append(np.ones_like(index), _Settings.smoothed_waves)
     even = np.append(index**-1.0, 1.0) * count
     alone = float(even @ power / even.sum())
     cov = np.linalg.inv(design * count @ design.T)
@@ -145,14 +128,14 @@ def _likeness(edges: Edges) -> FloatArray:
     noise, steep = max(float(level[0]), 0.0), max(float(level[1]), 1e-9)
     chance = math.sqrt(2.0 * float(cov[1, 1])) * max(noise, smoothed)
     # Walks that chance may show are left out, larger ones are taken for a little smaller (James and Stein).
-    walk = steep * max(1.0 - (_CHANCE * chance / steep) ** 2, 0.0)
+    walk = steep * max(1.0 - (_Settings.chance * chance / steep) ** 2, 0.0)
     return (noise if walk else alone) + walk * np.array([4.0, 1.0])
 
 
 @lru_cache
 def _slow_waves(count: int) -> FloatArray:
     """Return the cosine waves (k, n) of unit power along n points, from index 2 on, that are slow."""
-    index = np.arange(2, min(max(count // _SLOW, _LEAST_QUICKEST), count))
+    index = np.arange(2, min(max(count // _Settings.slow, _Settings.slow), count))
     angles = np.pi / count * np.outer(index, np.arange(count) + 0.5)
     return frozen_array(math.sqrt(2.0 / count) * np.cos(angles))
 

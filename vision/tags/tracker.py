@@ -29,16 +29,10 @@ from .config import TagConfig
 from .dictionary import require_tag
 from .finder import Seen, TagFinder
 from .image import TagImage
+from .settings import TagSettings as _Settings
 
 _log = logging.getLogger(__name__)
 
-# Margin of the search region around the last frame's corners: share of their extent, plus pixels.
-_REGION_SHARE, _REGION_PX = 0.6, 30
-# Poses farther apart than this [rad] are distinct; the worse must be less likely by this difference of squares.
-_TWO_POSES_RAD, _CLEARLY_WORSE = 0.05, 12.0
-# Of two poses that the image does not distinguish, take one that is no farther from the last frame's pose than this
-# share of the angle between the two.
-_STAYED = 1.0 / 3.0
 # Reasons, the most informative first, for a frame in which all tags were rejected.
 _TELLING = (
     Reason.AMBIGUOUS,
@@ -179,7 +173,7 @@ class TagTracker:
         misfit = best.squares / freedom
         if misfit > self.config.max_reprojection**2:
             return Reason.REPROJECTION
-        if len(poses) > 1 and (poses[1].squares - best.squares) / max(misfit, 1.0) < _CLEARLY_WORSE:
+        if len(poses) > 1 and (poses[1].squares - best.squares) / max(misfit, 1.0) < _Settings.clearly_worse:
             stayed = self._stayed(t, poses[:2])
             if stayed is None:
                 return Reason.AMBIGUOUS
@@ -195,7 +189,7 @@ class TagTracker:
             for turn in (rotation, self._mirrored(rotation, x, seen)):
                 pose = estimator.refine(turn, x)
                 if pose is not None and all(
-                    angle_between(pose.rotation, other.rotation) > _TWO_POSES_RAD for other in poses
+                    angle_between(pose.rotation, other.rotation) > _Settings.two_poses_rad for other in poses
                 ):
                     poses.append(pose)
         return sorted(poses, key=lambda pose: pose.squares)
@@ -207,7 +201,7 @@ class TagTracker:
         turned = [angle_between(self._last[2], pose.rotation) for pose in poses]
         nearest = int(np.argmin(turned))
         apart = angle_between(poses[0].rotation, poses[1].rotation)
-        return poses[nearest] if turned[nearest] < _STAYED * apart else None
+        return poses[nearest] if turned[nearest] < _Settings.stayed * apart else None
 
     def _starts(self, seen: list[dict[int, TagImage]]) -> list[tuple[FloatArray, FloatArray]]:
         """Return a first pose from the corners that all eyes see."""
@@ -247,7 +241,7 @@ class TagTracker:
         regions = []
         for corners in self._last[1]:
             low, high = corners.min(axis=0), corners.max(axis=0)
-            room = _REGION_SHARE * (high - low).max() + _REGION_PX
+            room = _Settings.region_share * (high - low).max() + _Settings.region_px
             low, high = np.floor(low - room).astype(int), np.ceil(high + room).astype(int)
             regions.append((max(low[0], 0), max(low[1], 0), min(high[0], width), min(high[1], height)))
         return regions

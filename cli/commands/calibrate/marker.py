@@ -40,8 +40,11 @@ Family = Annotated[
 def print_tags(
     *,
     shape: Annotated[
-        Literal["tags", "plate", "cube"],
-        Parameter(help="Single tags to cut apart; a plate, flat or folded between its columns; a cube to fold."),
+        Literal["tags", "plate", "cube", "board"],
+        Parameter(
+            help="Single tags to cut apart; a plate, flat or folded between its columns; a cube to fold; a ChArUco "
+            "board, which calibrates cameras, too."
+        ),
     ] = "tags",
     ids: Annotated[
         str | None,
@@ -51,8 +54,8 @@ def print_tags(
     side_mm: Annotated[
         float, Parameter(help="Side of a tag's black square [mm].", validator=Number(gte=5, lte=500))
     ] = 40.0,
-    columns: Annotated[int, Parameter(help="Of a plate.", validator=Number(gte=1, lte=20))] = 2,
-    rows: Annotated[int, Parameter(help="Of a plate.", validator=Number(gte=1, lte=20))] = 1,
+    columns: Annotated[int, Parameter(help="Of a plate, or a board.", validator=Number(gte=1, lte=20))] = 2,
+    rows: Annotated[int, Parameter(help="Of a plate, or a board.", validator=Number(gte=1, lte=20))] = 1,
     fold_deg: Annotated[
         float, Parameter(help="By how much each column of a plate is folded away from the one before [°].")
     ] = 0.0,
@@ -85,7 +88,7 @@ def print_tags(
     rulers = f"each is {across:g} mm" if across == upright else f"{across:g} mm below, {upright:g} mm beside the tags"
     said = f"{out} written. Print it at 100 %, then measure both rulers: {rulers}."
     if drawn.body is not None:
-        said += f" Each face is {face_mm(tags):.1f} mm wide."
+        said += f" Each {'square' if shape == 'board' else 'face'} is {face_mm(tags):.1f} mm wide."
     say(said, stderr=True)
     sys.stdout.write(tables(tags))
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from bodyschema.diagnosis.report.panels import Panel
-from bodyschema.diagnosis.report.plot import Plot, span
+from bodyschema.diagnosis.report.plot import Layout, Plot, span
 from bodyschema.diagnosis.report.residuals import POINTS, Residuals, binned
 from bodyschema.effects import Effect
 
-from .plots import CUT, attributed
+from .plots import attributed
 from .presenter import Found, Presenter, Workshop
 
 
@@ -39,7 +39,7 @@ class Backlash(Presenter):
             f"{effect.where} [{residuals.unit(k)[1]}]",
             f"{effect.where}: true less read [{residuals.unit(k)[1]}]",
             span(x[rows]),
-            span(y[rows], cut=CUT),
+            span(y[rows], cut=Layout.cut),
         )
         marks = []
         ends = np.array(plot.x)

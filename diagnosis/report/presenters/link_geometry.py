@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.rpy import rpy_of
 
 from .presenter import Found, Presenter, Workshop, pose, short
+
+# Share of the largest amount below which one is left out: it changes the size of all by less than 2 %.
+_SMALL_PART = 0.2
 
 
 class LinkGeometry(Presenter):
@@ -17,7 +20,9 @@ class LinkGeometry(Presenter):
     noun = "a wrong link before joint {joint}"
 
     def finding(self, found: Found) -> str:
-        parts = ((found.shift, "in", found.shifts), (found.turn, "about", found.turns))
+        shifts = {axis: found.numbers[f"{axis}_m"] for axis in found.shifts}
+        turns = {axis: found.numbers[f"r{axis}_rad"] for axis in found.turns}
+        parts = ((found.shift, "in", shifts), (found.turn, "about", turns))
         said = [f"{amount}{_axes(how, axes)}" for amount, how, axes in parts if axes]
         return f"the link before {found.at} is off by {' and '.join(said)}"
 
@@ -26,9 +31,13 @@ class LinkGeometry(Presenter):
         return f"In the URDF, give joint {found.where} the {_origin(origin)}{workshop.in_urdf}."
 
 
-def _axes(how: str, axes: Sequence[str]) -> str:
+def _axes(how: str, amounts: Mapping[str, float]) -> str:
     """Return along or about which axes of its frame a link is off; empty for all three."""
-    return "" if len(axes) == len("xyz") else f" {how} {' and '.join(axes)}"
+    least = _SMALL_PART * max(map(abs, amounts.values()))
+    axes = [axis for axis, amount in amounts.items() if abs(amount) >= least]
+    if len(axes) == len("xyz"):
+        return ""
+    return f"{', mainly' if len(axes) < len(amounts) else ''} {how} {' and '.join(axes)}"
 
 
 def _origin(T: FloatArray) -> str:

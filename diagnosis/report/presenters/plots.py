@@ -6,14 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyschema.diagnosis.report.panels import Panel
-from bodyschema.diagnosis.report.plot import Plot, span
+from bodyschema.diagnosis.report.plot import Layout, Plot, span
 from bodyschema.diagnosis.report.residuals import POINTS, Residuals, binned
 from bodyschema.effects import Effect, Motion
 from bodyschema.effects.moments import after
 from bodyschema.interfaces.records import FloatArray
 
-# Share of single samples at each end that does not set the range of a plot.
-CUT = 0.01
 _FINE = 500
 # A ripple with more cycles is plotted over its phase.
 _MANY_CYCLES = 4.0
@@ -37,7 +35,7 @@ def scatter_plot(
     x, y = points
     some = residuals.some(POINTS, rows)
     bins = binned(x[rows], y[rows])
-    low, high = np.quantile(y[rows], [CUT, 1.0 - CUT])
+    low, high = np.quantile(y[rows], [Layout.cut, 1.0 - Layout.cut])
     plot = Plot(*axes, span(x[rows]), span(np.array([low, high]), curve[1]))
     marks = (
         plot.dots(x[some], y[some], "pale after"),
