@@ -120,6 +120,9 @@ def _two_sided(fit: Fit) -> Rattle | None:
     is_clear = (
         2.0 * half >= _Settings.apart * sigma and worth >= _Settings.named and ratio >= _Settings.beyond_noise**2 - 1.0
     )
+    # A marker that changed its place once has slipped.
+    sure = np.sign(sides[rows & (sides != 0.0)])
+    is_clear = is_clear and int((np.diff(sure) != 0.0).sum()) > 1
     whole = _likelihood(fit, rows) + worth - _Settings.unnamed
     return Rattle(half, ratio, axes[:, 2], ways, sides, whole, is_clear and rarer >= _Settings.fewest)
 

@@ -114,6 +114,16 @@ def test_a_marker_may_lie_anywhere_beside_a_change_of_side() -> None:
     assert np.flatnonzero(play.sides == 0.0).tolist() == sorted([*changes - 1, *changes])
 
 
+def test_a_marker_that_changes_its_side_once_has_no_play() -> None:
+    robot, rng = surveyed_arm(), np.random.default_rng(3)
+    motion = walk(robot, 3)
+    run = Simulation(robot).run(motion)
+    sides = np.where(np.arange(len(motion)) < 120, HALF_M, -HALF_M)
+    ways = run.columns(Effect.at(robot, "tool_offset")) @ np.array([0.6, 0.0, 0.8])
+    x = run.measured + sides[:, None] * ways + SIGMA_M * rng.normal(size=ways.shape)
+    assert rattle(aligned(Observations.of(measured(robot, motion, x), Simulation(robot)), Simulation(robot))) is None
+
+
 @pytest.mark.parametrize(
     ("limit", "factor"),
     [("apart", 0.3), ("apart", 3.0), ("named", 0.3), ("named", 3.0), ("beyond_noise", 0.3), ("rounds", 0.3)],
