@@ -38,9 +38,11 @@ def test_a_link_that_is_off_in_some_directions_has_them_named():
     assert said == "the link before joint elbow is off by 5 mm in x and z and 0.57° about y"
 
 
-def test_a_link_that_is_off_about_one_axis_and_hardly_about_others_has_that_one_named():
+def test_a_link_that_is_off_mainly_about_one_axis_has_it_named():
     said = finding("link_geometry", "elbow", None, {"rx_rad": 0.0117, "ry_rad": -0.0007, "rz_rad": 0.001})
     assert said == "the link before joint elbow is off by 0.67°, mainly about x"
+    said = finding("link_geometry", "elbow", None, {"x_m": 0.003, "y_m": 1e-4, "z_m": 0.0, "ry_rad": 0.01})
+    assert said == "the link before joint elbow is off by 3 mm, mainly in x, and 0.57° about y"
 
 
 def test_a_shift_that_the_recording_does_not_tell_is_in_no_sentence():

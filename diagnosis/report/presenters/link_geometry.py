@@ -24,7 +24,8 @@ class LinkGeometry(Presenter):
         turns = {axis: found.numbers[f"r{axis}_rad"] for axis in found.turns}
         parts = ((found.shift, "in", shifts), (found.turn, "about", turns))
         said = [f"{amount}{_axes(how, axes)}" for amount, how, axes in parts if axes]
-        return f"the link before {found.at} is off by {' and '.join(said)}"
+        between = ", and " if "," in said[0] else " and "
+        return f"the link before {found.at} is off by {between.join(said)}"
 
     def remedy(self, workshop: Workshop, found: Found) -> str:
         origin = workshop.robot.tree.joint(found.where or "").T_parent_joint @ pose(found.numbers)
