@@ -6,11 +6,11 @@ import dataclasses
 
 import numpy as np
 import pytest
-from planted_cases import ELBOW, SHOULDER, desk_arm, motion_of, observed, surveyed_arm, walk
+from planted_cases import BASE, ELBOW, SHOULDER, desk_arm, motion_of, observed, surveyed_arm, walk
 
 from bodyschema.diagnosis.fit.observations import Observations
-from bodyschema.diagnosis.search.hypotheses import Hypotheses
-from bodyschema.effects import EFFECT_TYPES, Motion, Simulation
+from bodyschema.diagnosis.search.hypotheses import Hypotheses, has_simpler_name
+from bodyschema.effects import EFFECT_TYPES, Effect, Motion, Simulation
 from bodyschema.robot.description import RobotDescription
 
 STEREO = """focal_px = 600.0                # from the stereo calibration
@@ -104,3 +104,11 @@ def test_so_few_rows_test_nothing(rows) -> None:
     motion = Motion(full.motion.q[:rows], np.arange(rows) / 4.0, np.zeros(rows, np.int64))
     few = Observations(motion, full.x[:rows], full.stated[:rows], full.rounding[:rows])
     assert Hypotheses.of(Simulation(robot), few).effects == ()
+
+
+def test_the_first_link_has_a_simpler_name_where_the_cameras_pose_may_be_wrong() -> None:
+    robot = surveyed_arm()
+    links = [Effect.at(robot, "link_geometry", joint) for joint in (BASE, ELBOW)]
+    asked = [Effect.at(robot, "camera_pose"), *links]
+    assert [has_simpler_name(one, asked, Simulation(robot)) for one in asked] == [False, True, False]
+    assert not has_simpler_name(links[0], links, Simulation(robot))
