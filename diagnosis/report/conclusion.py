@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import msgspec
 import numpy as np
 
@@ -75,7 +77,8 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
 
 def _tolerances(diagnosis: Diagnosis) -> Tolerances:
     found = diagnosis.tolerated
-    units = np.array([1e3 * LENGTH_M, np.degrees(ANGLE_RAD), np.degrees(DRIVE_RAD)])
+    # A drive errs once and twice per turn, each with a sine and a cosine, of which half the square is the mean.
+    units = np.array([1e3 * LENGTH_M, np.degrees(ANGLE_RAD), np.degrees(math.sqrt(4 / 2) * DRIVE_RAD)])
     sizes, seen = units * np.asarray(found.scales)[:3], found.seen[:3]
     wide = np.exp(_HALF_WIDTH_95 * found.unsure[:3])
     lowest = np.where(seen, sizes / wide, 0.0)

@@ -145,7 +145,7 @@ class Tolerances(msgspec.Struct, frozen=True):
     Attributes:
         length_mm: tolerance of the positions of links.
         angle_deg: tolerance of axes and joint offsets.
-        drive_deg: size of the periodic errors of drives.
+        drive_deg: RMS of a drive's periodic error over a turn.
         links_share_percent, drives_share_percent: shares of the gain of links and axes, and of drives.
         in_extended: False where extended.toml leaves them out, since it would not surely be better elsewhere.
     """

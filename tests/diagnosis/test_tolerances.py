@@ -67,6 +67,12 @@ def test_it_is_told_how_exactly_the_arm_is_made(plain: DiagnosisFile) -> None:
     assert low < plain.tolerances.length_mm.value < high
 
 
+def test_it_is_told_by_how_much_drives_err_over_a_turn(plain: DiagnosisFile) -> None:
+    assert plain.tolerances is not None
+    low, high = plain.tolerances.drive_deg.ci95
+    assert low < np.degrees(DRIVE_RAD) < high
+
+
 def test_tolerances_make_the_simulation_nearly_as_right_as_the_noise(plain: DiagnosisFile) -> None:
     assert plain.rms_mm.noise_floor is not None
     assert plain.rms_mm.extended < 1.5e3 * NOISE_M * np.sqrt(3.0) < 0.5 * plain.rms_mm.aligned
