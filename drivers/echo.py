@@ -23,11 +23,7 @@ class Port(Protocol):
         ...
 
     def write(self, data: bytes) -> None:
-        """Send `data`.
-
-        Raises:
-            BusLost: the port is gone.
-        """
+        """Send `data`; raise BusLost if the port is gone."""
 
     def receive(self, until: float) -> bytes:
         """Return what has arrived, else what arrives next; empty when nothing arrives before `until` on the clock."""

@@ -80,11 +80,7 @@ class Planned:
 
 
 class Storm:
-    """Random faults.
-
-    Attributes:
-        struck: how often each fault occurred.
-    """
+    """Random faults."""
 
     def __init__(self, shares: Mapping[str, tuple[float, Fault]], rng: Random) -> None:
         """Start with all counts at zero.

@@ -26,21 +26,13 @@ LONGEST = 4096
 
 @dataclass(frozen=True, slots=True)
 class Merged:
-    """All joints at one time.
+    """All joints at one time."""
 
-    Attributes:
-        t: the time of a message [s], never between two messages.
-        stamp_ns: that message's stamp.
-        q: positions.
-        gap_s: the longest time between the two messages that a joint's position was interpolated from.
-        sigma_s: the largest 1-sigma of their times.
-    """
-
-    t: float
-    stamp_ns: int
-    q: tuple[float, ...]
-    gap_s: float
-    sigma_s: float
+    t: float  # the time of a message [s], never between two messages
+    stamp_ns: int  # that message's stamp
+    q: tuple[float, ...]  # positions
+    gap_s: float  # the longest time between the two messages that a joint's position was interpolated from
+    sigma_s: float  # the largest 1-sigma of their times
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,7 +185,6 @@ class Ros2Joints:
 
     Attributes:
         joints: names of the joints in the order of q.
-        received: number of messages since creation.
         refused: messages and readings that were not used, by reason.
         lost: messages that never arrived, by the senders' own count.
         stamp_ns: the robot's own stamp of the newest reading [ns], or None before any.
@@ -212,9 +203,7 @@ class Ros2Joints:
 
         Args:
             config: checked; see `Ros2Config.check`.
-            joints: in the order of q.
             prismatic: True for each prismatic joint; none by default.
-            open_link: opens the link to the router.
         """
         self._config, self.joints, self._clock, self._open_link = config, tuple(joints), clock, open_link
         self._wanted = config.ros_names(joints)

@@ -25,17 +25,11 @@ GRAPH_LIMIT_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """A received message.
-
-    Attributes:
-        payload: its bytes.
-        attached: attachment of rmw_zenoh; empty without one.
-        arrived: time of arrival [s].
-    """
+    """A received message."""
 
     payload: bytes
-    attached: bytes
-    arrived: float
+    attached: bytes  # attachment of rmw_zenoh; empty without one
+    arrived: float  # time of arrival [s]
 
 
 class Link(Protocol):

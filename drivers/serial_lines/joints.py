@@ -45,23 +45,16 @@ OpenPort = Callable[[SerialLinesConfig, Clock], Port]
 
 
 def open_serial(config: SerialLinesConfig, clock: Clock) -> Port:
-    """Open the port."""
     return SerialLine.open(config.port, config.baud, clock.now)
 
 
 @dataclass(frozen=True, slots=True)
 class Encoder:
-    """An encoder as announced by the board.
+    """An encoder as announced by the board."""
 
-    Attributes:
-        config: its entry in robot.toml.
-        place: its place in the board's lines.
-        ticks_per_turn: ticks after which the reading repeats.
-    """
-
-    config: EncoderConfig
-    place: int
-    ticks_per_turn: int
+    config: EncoderConfig  # its entry in robot.toml
+    place: int  # its place in the board's lines
+    ticks_per_turn: int  # ticks after which the reading repeats
 
     @property
     def joint(self) -> str:
@@ -115,7 +108,6 @@ class SerialLineJoints:
 
         Args:
             config: checked; see `SerialLinesConfig.check`.
-            joints: in the order of q.
             limits: of each joint [rad]; a range below one turn determines the turn.
             last_pose: last joint angles [rad], shape (d,), from which turns are counted.
         """

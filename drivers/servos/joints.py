@@ -71,8 +71,6 @@ class ServoJoints:
         drives: may move the joints on request.
         servos: as found at the last opening, in the order of the joints.
         epoch: how often it was opened. Only this comparison connects positions of different epochs.
-        dropped: number of dropped readings.
-        make: the vendor.
     """
 
     make: ServoVendor
@@ -92,8 +90,6 @@ class ServoJoints:
 
         Args:
             config: checked; see `ServosConfig.check`.
-            joints: in the order of q.
-            open_port: opens the port of a bus.
             limits: of each joint [rad]; a range below one turn determines the turn.
             last_pose: last joint angles [rad], shape (d,), from which turns are counted.
             drives: may move joints on request; without any, torque stays off.
