@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+from contextlib import suppress
 from typing import Protocol
 
+from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.protocols import Clock
 
 log = logging.getLogger(__name__)
@@ -34,6 +36,12 @@ class Port(Protocol):
 
     def close(self) -> None:
         """Release the port."""
+
+
+def close_quietly(port: Port) -> None:
+    """Close a port, whatever it says."""
+    with suppress(SourceError):
+        port.close()
 
 
 def without_echo(port: Port, clock: Clock, latency_s: float) -> Port:

@@ -18,7 +18,7 @@ ON_THE_WIRE: Mapping[str, Fault] = {
     "checksum": wrong_checksum,
     "corrupt": corrupt(),
     "half": half,
-    "garbage": garbage(),
+    "garbage": garbage,
 }
 OF_ALL = ("power-cycle", "unplug")
 NOW_AND_THEN = ("glitch", *OF_ALL)

@@ -20,7 +20,6 @@ class Counts:
     garbled: int = 0  # damaged lines
     missing: int = 0  # by the gaps in the sequence
     out_of_order: int = 0  # arrived after a later one, or twice
-    of_another_time: int = 0  # rejected by the board's clock
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,7 +125,6 @@ class Board:
             self.counts.missing += ahead - 1
         t = self._clock.time(begun, reading.t_us)
         if t is None:
-            self.counts.of_another_time += 1
             self._doubt()
             return
         self._seq, self._doubts = reading.seq, 0
