@@ -81,6 +81,12 @@ class UrdfTree:
         tree._check()
         return tree
 
+    @property
+    def root(self) -> str:
+        """The link that is the child of no joint."""
+        children = {joint.child for joint in self.joints.values()}
+        return next(link for link in self.links if link not in children)
+
     def joint(self, name: str) -> UrdfJoint:
         """Return the joint called `name`.
 

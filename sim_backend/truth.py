@@ -163,15 +163,9 @@ class JointRoles:
         return cls(gaze=gaze, guided=guided, wrist=wrist, elbow=elbow)
 
 
-def root_link(tree: UrdfTree) -> str:
-    """Return the link that is the child of no joint."""
-    children = {joint.child for joint in tree.joints.values()}
-    return next(link for link in tree.links if link not in children)
-
-
 def chain_from_root(truth: TrueRobot, roles: JointRoles, link: str) -> tuple[RigidChain, tuple[int, ...]]:
     """Return the true chain from the root to a guided link, over reported angles, and its joints' indices in q."""
-    root = root_link(truth.tree)
+    root = truth.tree.root
     on_way = {joint.name for joint, _ in truth.tree.path(root, link)}
     indices = tuple(k for k in roles.guided if truth.robot.joints[k] in on_way)
     names = tuple(truth.robot.joints[k] for k in indices)
@@ -182,6 +176,6 @@ def chain_from_root(truth: TrueRobot, roles: JointRoles, link: str) -> tuple[Rig
 def _origin(tree: UrdfTree, link: str) -> FloatArray:
     """Return the position (3,) of a link's frame in the root link with all joints at zero [m]."""
     T = np.eye(4)
-    for joint, _ in tree.path(root_link(tree), link):
+    for joint, _ in tree.path(tree.root, link):
         T = T @ joint.T_parent_joint
     return T[:3, 3]
