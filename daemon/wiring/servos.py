@@ -35,17 +35,11 @@ Servos = DynamixelConfig | FeetechConfig
 
 @dataclass(frozen=True, slots=True)
 class KnownModel:
-    """A servo model with a driver.
+    """A servo model with a driver."""
 
-    Attributes:
-        table: its vendor's table in robot.toml.
-        bauds: the baud rates that robot.toml accepts for it [bit/s].
-        zero_ticks: the middle of its range.
-    """
-
-    table: str
-    bauds: tuple[int, ...]
-    zero_ticks: int
+    table: str  # its vendor's table in robot.toml
+    bauds: tuple[int, ...]  # the baud rates that robot.toml accepts for it [bit/s]
+    zero_ticks: int  # the middle of its range
 
 
 def servos_of(config: Config) -> Servos | None:
