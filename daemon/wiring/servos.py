@@ -141,7 +141,7 @@ def joint_state_checks(config: Config) -> Iterator[Check]:
     """Check the ROS 2 robot of robot.toml, if it has one. Only listens."""
     robot = config.tables.drivers.ros2
     if robot is not None:
-        from bodyschema.drivers.ros2.checks import joint_state_checks as checks_of_joint_states
+        from bodyschema.drivers.ros2.joints import joint_state_checks as checks_of_joint_states
 
         prismatic = config.robot.chain.prismatic.tolist()
         yield from checks_of_joint_states(robot, config.robot.joints, SystemClock(), prismatic=prismatic)
