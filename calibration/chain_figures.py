@@ -42,19 +42,13 @@ HALF_WIDTH_95 = 1.959964
 
 @dataclass(frozen=True, eq=False)
 class ChainFigures:
-    """Figures (9 + d,): camera xyz [m], rpy [rad] and marker xyz [m] in their links, joint zeros [rad, m].
+    """Figures (9 + d,): camera xyz [m], rpy [rad] and marker xyz [m] in their links, joint zeros [rad, m]."""
 
-    Attributes:
-        robot: the nominal model.
-        beliefs: in its chain, or in that chain placed elsewhere; the most probable first. They change one chain.
-        shares: how probable each is (m,); they add up to 1.
-        prior: what was believed of that chain before any pair.
-    """
-
-    robot: RobotDescription
+    robot: RobotDescription  # the nominal model
+    # in its chain, or in that chain placed elsewhere; the most probable first. They change one chain.
     beliefs: tuple[ChainBelief, ...]
-    shares: FloatArray
-    prior: ChainBelief
+    shares: FloatArray  # how probable each is (m,); they add up to 1
+    prior: ChainBelief  # what was believed of that chain before any pair
 
     @property
     def geometry(self) -> CalibratedGeometry:

@@ -40,14 +40,10 @@ class Distances(msgspec.Struct, frozen=True):
 
 
 class Aligned(msgspec.Struct, frozen=True):
-    """Distances after the second recording is rigidly aligned with the first.
+    """Distances after the second recording is rigidly aligned with the first."""
 
-    Attributes:
-        distances: distances after alignment.
-        shift_mm, turn_deg: translation at its centroid, and rotation.
-    """
-
-    distances: Distances
+    distances: Distances  # distances after alignment
+    # shift_mm, turn_deg: translation at its centroid, and rotation
     shift_mm: tuple[float, float, float]
     turn_deg: float
 
@@ -63,45 +59,35 @@ class WorstRow(msgspec.Struct, frozen=True):
 
 
 class LeftOut(msgspec.Struct, frozen=True):
-    """Rows that were not compared.
+    """Rows that were not compared."""
 
-    Attributes:
-        first, second: number of rows of each recording without a match in the other.
-        first_row: number of the first such row of the first recording; None if there is none.
-        second_row: the same for the second.
-        joint, by: for a first such row, the joint that differs most from the row of the same number in the other
-            recording, and the difference [rad, m].
-    """
-
+    # first, second: number of rows of each recording without a match in the other
     first: int
     second: int
-    first_row: int | None
-    second_row: int | None
+    first_row: int | None  # number of the first such row of the first recording; None if there is none
+    second_row: int | None  # the same for the second
+    # joint, by: for a first such row, the joint that differs most from the row of the same number in the other
+    # recording, and the difference [rad, m]
     joint: str | None
     by: float | None
 
 
 class ComparisonReport(msgspec.Struct, frozen=True, kw_only=True):
-    """Distances between the positions of two recordings; differences are the second minus the first.
-
-    Attributes:
-        rows, other_rows: number of rows of each recording.
-        compared: number of rows at the same joint angles in both.
-        axis_mean_mm, axis_rms_mm: per coordinate.
-        aligned: None with too few rows.
-    """
+    """Distances between the positions of two recordings; differences are the second minus the first."""
 
     first: str
     second: str
     joints: tuple[str, ...]
+    # rows, other_rows: number of rows of each recording
     rows: int
     other_rows: int
-    compared: int
+    compared: int  # number of rows at the same joint angles in both
     left_out: LeftOut
     distances: Distances
+    # axis_mean_mm, axis_rms_mm: per coordinate
     axis_mean_mm: tuple[float, float, float]
     axis_rms_mm: tuple[float, float, float]
-    aligned: Aligned | None
+    aligned: Aligned | None  # None with too few rows
     worst: tuple[WorstRow, ...]
 
 

@@ -22,15 +22,10 @@ class EvaluationError(BodyschemaError):
 
 @dataclass(frozen=True, slots=True)
 class Split:
-    """Selection of held-out rows.
+    """Selection of held-out rows."""
 
-    Attributes:
-        held_out: mask, shape (n,); the other rows are for training.
-        blocks: number of held-out blocks, of the `BLOCKS` contiguous ones.
-    """
-
-    held_out: NDArray[np.bool_]
-    blocks: int
+    held_out: NDArray[np.bool_]  # mask, shape (n,); the other rows are for training
+    blocks: int  # number of held-out blocks, of the `BLOCKS` contiguous ones
 
 
 def split_blocks(rows: int, share: float) -> Split:

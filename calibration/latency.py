@@ -63,15 +63,12 @@ class LatencyError(BodyschemaError):
 
 @dataclass(frozen=True)
 class Wiggle:
-    """Encoder readings and marker fixes, each with its own time stamp.
+    """Encoder readings and marker fixes, each with its own time stamp."""
 
-    Attributes:
-        t_joints, q: times and angles of the encoders [s] (n,), [rad or m] (n, d).
-        t_marker, x: times and positions of the marker [s] (m,), [m] (m, 3).
-    """
-
+    # t_joints, q: times and angles of the encoders [s] (n,), [rad or m] (n, d)
     t_joints: FloatArray
     q: FloatArray
+    # t_marker, x: times and positions of the marker [s] (m,), [m] (m, 3)
     t_marker: FloatArray
     x: FloatArray
 
@@ -113,20 +110,13 @@ def _smooth(values: FloatArray) -> BSpline:
 
 @dataclass(frozen=True, slots=True)
 class Latency:
-    """Result of the estimate.
+    """Result of the estimate."""
 
-    Attributes:
-        latency_s: from the exposure's middle to the time stamp, with its 1-sigma sigma_s [s].
-        fixes: number of positions used.
-        residual_m: RMS distance of these from the positions that the angles predict.
-        speed_m_s: RMS speed of the marker.
-    """
-
-    latency_s: float
+    latency_s: float  # from the exposure's middle to the time stamp, with its 1-sigma sigma_s [s]
     sigma_s: float
-    fixes: int
-    residual_m: float
-    speed_m_s: float
+    fixes: int  # number of positions used
+    residual_m: float  # RMS distance of these from the positions that the angles predict
+    speed_m_s: float  # RMS speed of the marker
 
 
 def latency_of(wiggle: Wiggle, chain: RigidChain) -> Latency:

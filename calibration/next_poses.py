@@ -29,22 +29,14 @@ _BATCH, _BATCHES = 2000, 50
 
 @dataclass(frozen=True, eq=False)
 class NextPoses:
-    """Poses to measure next, the most informative first.
-
-    Attributes:
-        joints: names in the order of q.
-        prismatic: True for each joint (d,) that slides.
-        q: joint readings (n, d) [rad or m].
-        expected_m: mean error of the present calibration over all poses that are allowed [m].
-        expected_after_m: the same once these poses have been measured.
-    """
+    """Poses to measure next, the most informative first."""
 
     robot: str
-    joints: tuple[str, ...]
-    prismatic: NDArray[np.bool_]
-    q: FloatArray
-    expected_m: float
-    expected_after_m: float
+    joints: tuple[str, ...]  # names in the order of q
+    prismatic: NDArray[np.bool_]  # True for each joint (d,) that slides
+    q: FloatArray  # joint readings (n, d) [rad or m]
+    expected_m: float  # mean error of the present calibration over all poses that are allowed [m]
+    expected_after_m: float  # the same once these poses have been measured
 
     @classmethod
     def of(cls, calibration: Calibration, count: int, seed: int = 0) -> NextPoses:

@@ -36,15 +36,10 @@ class _Settings:
 
 @dataclass(frozen=True, slots=True)
 class ToolJump:
-    """A change of the tool.
+    """A change of the tool."""
 
-    Attributes:
-        row: the first row with the other tool, counted from 1.
-        distance_m: distance between the marker positions of the two tools.
-    """
-
-    row: int
-    distance_m: float
+    row: int  # the first row with the other tool, counted from 1
+    distance_m: float  # distance between the marker positions of the two tools
 
 
 def tool_jump(learner: RigidLearner, recording: Recording) -> ToolJump | None:
@@ -53,9 +48,6 @@ def tool_jump(learner: RigidLearner, recording: Recording) -> ToolJump | None:
     This is a change point test (Page 1955): two marker positions instead of one, with all other chain parameters fitted
     along, to first order. The chain was fitted to both tools and is therefore distorted, so distance and row are
     approximate.
-
-    Args:
-        learner: fitted to all pairs in the recording.
     """
     if len(recording) < 2 * _Settings.fewest:
         return None
@@ -138,72 +130,52 @@ class Zero(msgspec.Struct, frozen=True):
 
 
 class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
-    """The answers.
-
-    Attributes:
-        pairs: that were learnt, `outliers` of them left out.
-        camera_link, camera_xyz_mm, camera_rpy_deg: pose of the measurement frame in this link (URDF convention).
-        marker_link, marker_xyz_mm: the marker in this link.
-        zeros: of the joints, in the order of q.
-        noise_mm: 1-sigma of a measured coordinate, as the pairs scatter around the learnt arm.
-        told_noise_mm: the same as it was told with the pairs (RMS), or null; where told, the intervals rest on it.
-        misfit: residuals over what the told noise explains; 1 where it explains them, or was not told.
-        drawn_error_mm: mean distance from the pairs to the drawn arm, with what robot.toml calls not known fitted.
-        learnt_error_mm: mean distance to the learnt arm, over the same pairs, which it was fitted to.
-        axes_deg, points_mm: how well the arm is made, by the pairs: 1-sigma of an axis' tilt and shift; null where the
-            pairs do not tell.
-        shown: independent numbers of the arm that the pairs make three times as sure as they were, of `showable` that
-            positions can.
-        still: joints that hardly moved.
-        first: number of the first row (of a store: pair) that was learnt.
-        other_tool_from: number of the row from which on the marker sits elsewhere on the hand, or null: the figures
-            are then of neither tool.
-        other_tool_mm: how far from there, or null.
-        doubt: why no figure is to be trusted, or null: columns read wrongly, another robot, zeros far off.
-        beyond: why the figures are of no arm as good as was told, or null: a part of `doubt`, for which nothing is
-            written.
-        undirected: joints of which the pairs do not show which way they count.
-        expected_mm, expected_p95_mm: mean distance on poses that were not learnt, and what 95 % of them stay within,
-            from blocks of rows that were held out; null of too few rows.
-        hand_eye: the camera's pose in SI, as ROS takes it.
-        tool_xyz_m: the marker in its link, with the covariance (3 x 3, row by row) in `tool_covariance` [m²].
-        trusted: what was held as the URDF has it.
-        free_expected_mm: `expected_mm` with nothing held, where something is; else null.
-    """
+    """The answers."""
 
     robot: str
     source: str
-    pairs: int
+    pairs: int  # that were learnt, `outliers` of them left out
     outliers: int
+    # camera_link, camera_xyz_mm, camera_rpy_deg: pose of the measurement frame in this link (URDF convention)
     camera_link: str
     camera_xyz_mm: list[Figure]
     camera_rpy_deg: list[Figure]
     marker_link: str
     marker_xyz_mm: list[Figure]
-    zeros: list[Zero]
-    noise_mm: float
+    zeros: list[Zero]  # of the joints, in the order of q
+    noise_mm: float  # 1-sigma of a measured coordinate, as the pairs scatter around the learnt arm
+    # the same as it was told with the pairs (RMS), or null; where told, the intervals rest on it
     told_noise_mm: float | None
-    misfit: float
-    drawn_error_mm: float
-    learnt_error_mm: float
+    misfit: float  # residuals over what the told noise explains; 1 where it explains them, or was not told
+    drawn_error_mm: float  # mean distance from the pairs to the drawn arm, with what robot.toml calls not known fitted
+    learnt_error_mm: float  # mean distance to the learnt arm, over the same pairs, which it was fitted to
+    # axes_deg, points_mm: how well the arm is made, by the pairs: 1-sigma of an axis' tilt and shift; null where the
+    # pairs do not tell
     axes_deg: float | None
     points_mm: float | None
+    # independent numbers of the arm that the pairs make three times as sure as they were, of `showable` that positions
+    # can
     shown: int
     showable: int
-    still: list[str]
-    first: int
+    still: list[str]  # joints that hardly moved
+    first: int  # number of the first row (of a store: pair) that was learnt
+    # number of the row from which on the marker sits elsewhere on the hand, or null: the figures are then of neither
+    # tool
     other_tool_from: int | None
-    other_tool_mm: float | None
-    doubt: str | None
+    other_tool_mm: float | None  # how far from there, or null
+    doubt: str | None  # why no figure is to be trusted, or null: columns read wrongly, another robot, zeros far off
+    # why the figures are of no arm as good as was told, or null: a part of `doubt`, for which nothing is written
     beyond: str | None = None
-    undirected: list[str] = []
+    undirected: list[str] = []  # joints of which the pairs do not show which way they count
+    # expected_mm, expected_p95_mm: mean distance on poses that were not learnt, and what 95 % of them stay within, from
+    # blocks of rows that were held out; null of too few rows
     expected_mm: float | None
     expected_p95_mm: float | None
-    hand_eye: HandEye
-    tool_xyz_m: list[float]
+    hand_eye: HandEye  # the camera's pose in SI, as ROS takes it
+    tool_xyz_m: list[float]  # the marker in its link, with the covariance (3 x 3, row by row) in `tool_covariance` [m²]
     tool_covariance: list[float]
-    trusted: Trusted
-    free_expected_mm: float | None = None
+    trusted: Trusted  # what was held as the URDF has it
+    free_expected_mm: float | None = None  # `expected_mm` with nothing held, where something is; else null
     schema: int = 1
 
     @classmethod
@@ -220,7 +192,6 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
 
         Args:
             seen: plausibility of its recording.
-            source: name of the recording.
             first: number of its first row.
             frame: ROS name of the measurement frame.
             free: the same calibration with nothing fixed to the URDF, for comparison.
@@ -306,12 +277,7 @@ def _far_off(calibration: Calibration, zeros: list[Zero], times: float) -> list[
 
 
 def _many_left_out(calibration: Calibration, first: int) -> list[str]:
-    """Return a message if more pairs are outliers than an instrument gets wrong, or rows in a run; else an empty list.
-
-    Args:
-        calibration: the calibration.
-        first: number of its first row.
-    """
+    """Return a message, if any, on more outliers than an instrument has, or on outliers in a run of rows."""
     off = np.flatnonzero(~calibration.learner.inliers)
     if len(off) <= MOST_OUTLIERS * len(calibration.recording):
         return []

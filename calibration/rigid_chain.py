@@ -71,26 +71,17 @@ class CalibrationError(BodyschemaError):
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """A rigid chain learnt from a recording.
+    """A rigid chain learnt from a recording."""
 
-    Attributes:
-        robot: the nominal model.
-        recording: what was learnt.
-        placed: the nominal chain with what robot.toml calls not known fitted: what learning started from.
-        learners: of all pairs, with the tolerances that the pairs make probable, the most probable first.
-        shares: how probable each is (m,); they add up to 1.
-        noise_told: whether the noise was told, not estimated.
-        trusted: what was held as the URDF has it.
-        common: errors (n, 3, k) [m] that all rows share, at 1 sigma of each of k unknowns; None: none are known.
-    """
-
-    robot: RobotDescription
-    recording: Recording
-    placed: Alignment
+    robot: RobotDescription  # the nominal model
+    recording: Recording  # what was learnt
+    placed: Alignment  # the nominal chain with what robot.toml calls not known fitted: what learning started from
+    # of all pairs, with the tolerances that the pairs make probable, the most probable first
     learners: tuple[RigidLearner, ...]
-    shares: FloatArray
-    noise_told: bool
-    trusted: Trusted = "nothing"
+    shares: FloatArray  # how probable each is (m,); they add up to 1
+    noise_told: bool  # whether the noise was told, not estimated
+    trusted: Trusted = "nothing"  # what was held as the URDF has it
+    # errors (n, 3, k) [m] that all rows share, at 1 sigma of each of k unknowns; None: none are known
     common: FloatArray | None = None
 
     @classmethod

@@ -43,12 +43,7 @@ class Diagnoses:
         history: Callable[[int], History],
         tell: Callable[[DiagnosisDocument], None],
     ) -> None:
-        """Initialise without a diagnosis.
-
-        Args:
-            history: returns this number of the newest pairs.
-            tell: called with the state whenever it changes, from any thread.
-        """
+        """Initialise without a diagnosis."""
         self._robot_file, self._joints, self._history, self._tell = robot_file, joints, history, tell
         self._lock = threading.Lock()
         self._document = DiagnosisDocument()
@@ -68,11 +63,7 @@ class Diagnoses:
         self._folder.cleanup()
 
     def start(self) -> int:
-        """Start a diagnosis and return its number.
-
-        Raises:
-            RequestError: one is running.
-        """
+        """Start a diagnosis and return its number; raise RequestError if one is running."""
         with self._lock:
             if self._thread is not None and self._thread.is_alive():
                 raise RequestError("a diagnosis is running. Wait for it, or stop it")
@@ -84,11 +75,7 @@ class Diagnoses:
         return number
 
     def stop(self) -> None:
-        """End the running diagnosis.
-
-        Raises:
-            RequestError: none is running.
-        """
+        """End the running diagnosis; raise RequestError if none is running."""
         if self._thread is None or not self._thread.is_alive():
             raise RequestError("no diagnosis is running")
         self._end()

@@ -21,76 +21,47 @@ class RobotDocument(msgspec.Struct, frozen=True):
 
 
 class ProcessDocument(msgspec.Struct, frozen=True):
-    """State of one process.
+    """State of one process."""
 
-    Attributes:
-        answers: true if it is alive now.
-        endpoint: its expected endpoint.
-        heard: time of its last message, UTC [s since 1970]; null before.
-        problem: why its last message could not be decoded; null if it could.
-        status: its last status, including fields unknown to this version; null before.
-    """
-
-    answers: bool
-    endpoint: str
-    heard: float | None
-    problem: str | None
-    status: dict[str, Any] | None
+    answers: bool  # true if it is alive now
+    endpoint: str  # its expected endpoint
+    heard: float | None  # time of its last message, UTC [s since 1970]; null before
+    problem: str | None  # why its last message could not be decoded; null if it could
+    status: dict[str, Any] | None  # its last status, including fields unknown to this version; null before
 
 
 class SeriesDocument(msgspec.Struct, frozen=True):
-    """Time series of figures since the view began, columns of equal length.
+    """Time series of figures since the view began, columns of equal length."""
 
-    Attributes:
-        t: UTC [s since 1970].
-        error_m: error on new pairs of the answering model [m], measurement noise included; null while there is none.
-        expected_m: error that the learner expects on new pairs in its support, measurement noise included [m].
-        pairs_per_s: accepted pairs.
-        predict_s: round-trip time of one prediction [s]; null without an answer.
-    """
-
-    t: list[float]
+    t: list[float]  # UTC [s since 1970]
+    # error on new pairs of the answering model [m], measurement noise included; null while there is none
     error_m: list[float | None]
+    # error that the learner expects on new pairs in its support, measurement noise included [m]
     expected_m: list[float | None]
-    pairs_per_s: list[float | None]
-    predict_s: list[float | None]
+    pairs_per_s: list[float | None]  # accepted pairs
+    predict_s: list[float | None]  # round-trip time of one prediction [s]; null without an answer
 
 
 class Change(msgspec.Struct, frozen=True):
-    """Change of the tool, the camera or a joint offset.
+    """Change of the tool, the camera or a joint offset."""
 
-    Attributes:
-        pairs: number of pairs learnt before it.
-        t: when the view received it, UTC [s since 1970].
-        kind: as in the learner's status; null if learning restarted from the prior.
-        told: true if it was reported, false if the learner detected it.
-    """
-
-    pairs: int
-    t: float
-    kind: str | None
-    told: bool
+    pairs: int  # number of pairs learnt before it
+    t: float  # when the view received it, UTC [s since 1970]
+    kind: str | None  # as in the learner's status; null if learning restarted from the prior
+    told: bool  # true if it was reported, false if the learner detected it
 
 
 class Version(msgspec.Struct, frozen=True):
-    """Span of time in which the same kind of model answered.
+    """Span of time in which the same kind of model answered."""
 
-    Attributes:
-        since: UTC [s since 1970].
-        first_pairs, pairs: pairs learnt when it began, and at last.
-        answering: name of the model.
-        model: hash of the newest of them.
-        error_m: its error on new pairs [m].
-        after_change: true if it began with a change of the tool.
-    """
-
-    since: float
+    since: float  # UTC [s since 1970]
+    # first_pairs, pairs: pairs learnt when it began, and at last
     first_pairs: int
     pairs: int
-    answering: str
-    model: str
-    error_m: float | None
-    after_change: bool
+    answering: str  # name of the model
+    model: str  # hash of the newest of them
+    error_m: float | None  # its error on new pairs [m]
+    after_change: bool  # true if it began with a change of the tool
 
 
 class CourseDocument(msgspec.Struct, frozen=True):
@@ -101,164 +72,96 @@ class CourseDocument(msgspec.Struct, frozen=True):
 
 
 class Segment(msgspec.Struct, frozen=True):
-    """Run of pairs.
+    """Run of pairs."""
 
-    Attributes:
-        segment: its number.
-        pairs: their number.
-        utc: when its first known pair was accepted, ISO 8601.
-        lasted_s: from its first to its last pair.
-        complete: true if its first pair is known.
-    """
-
-    segment: int
-    pairs: int
-    utc: str
-    lasted_s: float
-    complete: bool
+    segment: int  # its number
+    pairs: int  # their number
+    utc: str  # when its first known pair was accepted, ISO 8601
+    lasted_s: float  # from its first to its last pair
+    complete: bool  # true if its first pair is known
 
 
 class CloudDocument(msgspec.Struct, frozen=True):
-    """Measured marker positions and the model's residuals there, for learnt pairs.
+    """Measured marker positions and the model's residuals there, for learnt pairs."""
 
-    Attributes:
-        model: hash of the queried model; empty while none answers.
-        x: measured positions [m], measurement frame.
-        residual: measured - predicted [m].
-        segment: of each row.
-        median_m, p95_m: of the residuals' lengths; null without rows.
-    """
-
-    model: str
-    x: list[list[float]]
-    residual: list[list[float]]
-    segment: list[int]
+    model: str  # hash of the queried model; empty while none answers
+    x: list[list[float]]  # measured positions [m], measurement frame
+    residual: list[list[float]]  # measured - predicted [m]
+    segment: list[int]  # of each row
+    # median_m, p95_m: of the residuals' lengths; null without rows
     median_m: float | None
     p95_m: float | None
 
 
 class OutlookDocument(msgspec.Struct, frozen=True):
-    """Expected gain of further pairs. All errors are those expected on new pairs, measurement noise included [m].
+    """Expected gain of further pairs. All errors are those expected on new pairs, measurement noise included [m]."""
 
-    Attributes:
-        sentence: advice in words.
-        pairs: number of pairs that the forecast rests on.
-        now_m: where the arm has been, after these pairs.
-        further_pairs: numbers of further pairs.
-        like_so_far_m: after each number of further pairs, moving as so far.
-        best_motion: the motion that would reduce the error most, in words.
-        best_motion_m: after each number of further pairs of that motion.
-    """
-
-    sentence: str
-    pairs: int
-    now_m: float
-    further_pairs: list[int]
-    like_so_far_m: list[float]
-    best_motion: str
-    best_motion_m: list[float]
+    sentence: str  # advice in words
+    pairs: int  # number of pairs that the forecast rests on
+    now_m: float  # where the arm has been, after these pairs
+    further_pairs: list[int]  # numbers of further pairs
+    like_so_far_m: list[float]  # after each number of further pairs, moving as so far
+    best_motion: str  # the motion that would reduce the error most, in words
+    best_motion_m: list[float]  # after each number of further pairs of that motion
 
 
 class ArmDocument(msgspec.Struct, frozen=True):
-    """The arm at its newest pair, in the root link's frame [m].
+    """The arm at its newest pair, in the root link's frame [m]."""
 
-    Attributes:
-        pair: sequence number of the pair.
-        links: pose of each link of the body document: x, y, z, and the quaternion's x, y, z, w.
-        camera: pose of the measurement frame.
-        hand: number of the link that holds the marker.
-        measured: the marker as it was measured.
-        measured_pose, predicted_pose: measurement and prediction in the measurement frame, as all messages have poses;
-            null without a prediction.
-        trail: where it was measured in the pairs before, the newest last.
-        predicted: the marker by the answering model; null without one.
-        radii: half axes of the ellipsoid around it, along the measurement frame's axes, in which 95 % of measurements
-            should lie by the learner's estimate; null without a prediction, or while the noise is unknown.
-        apart_m: distance of measurement and prediction. The pair may be learnt already.
-        placed: true if the camera's pose is known.
-    """
-
-    pair: int
-    links: list[list[float]]
-    camera: list[float]
-    hand: int
-    measured: list[float]
-    trail: list[list[float]]
-    predicted: list[float] | None
+    pair: int  # sequence number of the pair
+    links: list[list[float]]  # pose of each link of the body document: x, y, z, and the quaternion's x, y, z, w
+    camera: list[float]  # pose of the measurement frame
+    hand: int  # number of the link that holds the marker
+    measured: list[float]  # the marker as it was measured
+    trail: list[list[float]]  # where it was measured in the pairs before, the newest last
+    predicted: list[float] | None  # the marker by the answering model; null without one
+    # measured_pose, predicted_pose: measurement and prediction in the measurement frame, as all messages have poses;
+    # null without a prediction
     measured_pose: MarkerPose
     predicted_pose: MarkerPose | None
+    # half axes of the ellipsoid around it, along the measurement frame's axes, in which 95 % of measurements should lie
+    # by the learner's estimate; null without a prediction, or while the noise is unknown
     radii: list[float] | None
-    apart_m: float | None
-    placed: bool
+    apart_m: float | None  # distance of measurement and prediction. The pair may be learnt already.
+    placed: bool  # true if the camera's pose is known
 
 
 class LinkShape(msgspec.Struct, frozen=True):
-    """A visual shape of a link.
+    """A visual shape of a link."""
 
-    Attributes:
-        kind: box, sphere, cylinder, capsule or mesh. Cylinders and capsules lie along z.
-        sizes: edges of a box; radius; radius and length [m].
-        pose: in its link, as in `ArmDocument`.
-        rgba: its colour; null where the URDF gives none.
-        mesh: number of its mesh; null for other kinds.
-    """
-
-    kind: str
-    sizes: list[float]
-    pose: list[float]
-    rgba: list[float] | None
-    mesh: int | None
+    kind: str  # box, sphere, cylinder, capsule or mesh. Cylinders and capsules lie along z.
+    sizes: list[float]  # edges of a box; radius; radius and length [m]
+    pose: list[float]  # in its link, as in `ArmDocument`
+    rgba: list[float] | None  # its colour; null where the URDF gives none
+    mesh: int | None  # number of its mesh; null for other kinds
 
 
 class CameraShape(msgspec.Struct, frozen=True):
-    """Field of view of the cameras.
+    """Field of view of the cameras."""
 
-    Attributes:
-        eyes: places of the cameras in the measurement frame [m].
-        edges: left, right, upper and lower end of the image at a distance of 1 m.
-    """
-
-    eyes: list[list[float]]
-    edges: list[float]
+    eyes: list[list[float]]  # places of the cameras in the measurement frame [m]
+    edges: list[float]  # left, right, upper and lower end of the image at a distance of 1 m
 
 
 class BodyDocument(msgspec.Struct, frozen=True):
-    """The robot as it looks; constant.
+    """The robot as it looks; constant."""
 
-    Attributes:
-        links: names.
-        shapes: of each link.
-        rods: pairs of links between whose origins a rod stands for shapes that are not there.
-        moving: links that a moving joint carries.
-        camera: null where robot.toml does not describe the cameras.
-        said: what is not shown as the URDF has it, in sentences.
-    """
-
-    links: list[str]
+    links: list[str]  # names
     shapes: list[list[LinkShape]]
-    rods: list[tuple[int, int]]
-    moving: list[int]
-    camera: CameraShape | None
-    said: list[str]
+    rods: list[tuple[int, int]]  # pairs of links between whose origins a rod stands for shapes that are not there
+    moving: list[int]  # links that a moving joint carries
+    camera: CameraShape | None  # null where robot.toml does not describe the cameras
+    said: list[str]  # what is not shown as the URDF has it, in sentences
 
 
 class DiagnosisDocument(msgspec.Struct, frozen=True):
-    """State of the last requested diagnosis.
+    """State of the last requested diagnosis."""
 
-    Attributes:
-        number: of the diagnosis, from 1; 0 before any.
-        state: idle, copying (pairs from the sampler), running, done, failed or stopped.
-        pairs: number of pairs.
-        said: current step, result, or error.
-        started: UTC [s since 1970].
-        verdict: of diagnosis.json; null unless it is done.
-        report: number of the diagnosis whose report is available; null if there is none.
-    """
-
-    number: int = 0
+    number: int = 0  # of the diagnosis, from 1; 0 before any
+    # idle, copying (pairs from the sampler), running, done, failed or stopped
     state: Literal["idle", "copying", "running", "done", "failed", "stopped"] = "idle"
-    pairs: int = 0
-    said: str = ""
-    started: float | None = None
-    verdict: str | None = None
-    report: int | None = None
+    pairs: int = 0  # number of pairs
+    said: str = ""  # current step, result, or error
+    started: float | None = None  # UTC [s since 1970]
+    verdict: str | None = None  # of diagnosis.json; null unless it is done
+    report: int | None = None  # number of the diagnosis whose report is available; null if there is none

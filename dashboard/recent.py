@@ -33,7 +33,6 @@ class RecentPairs:
 
     @property
     def newest(self) -> Pair | None:
-        """Newest pair."""
         return self._pairs[-1] if self._pairs else None
 
     def upto(self, seq: int, count: int) -> list[Pair]:

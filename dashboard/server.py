@@ -46,7 +46,6 @@ def serve(config: Config, port: int, ready: Callable[[str], None]) -> None:
 
     Args:
         port: on loopback; 0 takes one that is free.
-        ready: called with the page's address when a browser may request it.
 
     Raises:
         ConfigError: the port cannot be used.

@@ -46,17 +46,11 @@ _MOST_NEIGHBOURS = 24
 
 
 class LinkShapes(msgspec.Struct, frozen=True):
-    """Result of the child process.
+    """Result of the child process."""
 
-    Attributes:
-        shapes: of each link, by its name.
-        meshes: as `mesh_buffer` returns them.
-        said: what is not shown as the URDF has it, in sentences.
-    """
-
-    shapes: dict[str, list[LinkShape]] = {}
-    meshes: list[bytes] = []
-    said: list[str] = []
+    shapes: dict[str, list[LinkShape]] = {}  # of each link, by its name
+    meshes: list[bytes] = []  # as `mesh_buffer` returns them
+    said: list[str] = []  # what is not shown as the URDF has it, in sentences
 
 
 class Body:

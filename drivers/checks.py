@@ -24,19 +24,12 @@ LONGEST_COMMAND = 60
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """Result of one check.
+    """Result of one check."""
 
-    Attributes:
-        subject: what was checked.
-        state: "wrong" prevents reading the arm, "warning" degrades it.
-        said: what was found.
-        fix: the command to type, or what to do; empty if nothing needs doing.
-    """
-
-    subject: str
-    state: State
-    said: str
-    fix: str = ""
+    subject: str  # what was checked
+    state: State  # "wrong" prevents reading the arm, "warning" degrades it
+    said: str  # what was found
+    fix: str = ""  # the command to type, or what to do; empty if nothing needs doing
 
 
 def warned(subject: str, said: str, fix: str, *, when: bool) -> Check:
@@ -94,7 +87,6 @@ def port_checks(name: str, port: str, root: Path = ROOT, *, ours: Collection[int
 
     Args:
         root: of the file system, for /dev, /proc and /sys.
-        ours: processes that are expected to have it open.
     """
     subject = f"port of {name}"
     if not os.path.exists(port):

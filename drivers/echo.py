@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+from contextlib import suppress
 from typing import Protocol
 
+from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.protocols import Clock
 
 log = logging.getLogger(__name__)
@@ -23,11 +25,7 @@ class Port(Protocol):
         ...
 
     def write(self, data: bytes) -> None:
-        """Send `data`.
-
-        Raises:
-            BusLost: the port is gone.
-        """
+        """Send `data`; raise BusLost if the port is gone."""
 
     def receive(self, until: float) -> bytes:
         """Return what has arrived, else what arrives next; empty when nothing arrives before `until` on the clock."""
@@ -38,6 +36,12 @@ class Port(Protocol):
 
     def close(self) -> None:
         """Release the port."""
+
+
+def close_quietly(port: Port) -> None:
+    """Close a port, whatever it says."""
+    with suppress(SourceError):
+        port.close()
 
 
 def without_echo(port: Port, clock: Clock, latency_s: float) -> Port:

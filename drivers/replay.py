@@ -26,9 +26,6 @@ class Replay:
     exactly the row's. Neither source runs more than a few rows ahead of the other, however fast it is read.
 
     Attributes:
-        joints: the encoders' side.
-        marker: the camera's side.
-        clock: shows the recording's time.
         t: times of the rows [s], shape (n,): `Recording.play_times`.
     """
 
@@ -47,7 +44,6 @@ class Replay:
             speed: 1 as recorded, 2 twice as fast; 0 as fast as it is read.
             sigma_m: 1-sigma per axis of the positions where the recording has no covariances [m]; None takes what
                 `calibration` says, and without that 1 mm.
-            now: the clock for the speed.
         """
         self.t = recording.play_times
         cov = recording.cov if recording.cov is not None else default_covariances(recording, sigma_m, calibration)
@@ -126,7 +122,6 @@ def default_covariances(
     """Return covariances of the positions [m²], shape (n, 3, 3), for a recording without its own.
 
     Args:
-        sigma_m: 1-sigma per axis [m], or None.
         calibration: the stereo camera whose pixel noise decides when `sigma_m` is None.
     """
     if sigma_m is None and calibration is not None and calibration.is_stereo and (recording.x[:, 2] > 0).all():

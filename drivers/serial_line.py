@@ -83,11 +83,7 @@ class SerialLine:
             raise BusLost(str(self.device.port), error) from error
 
     def write(self, data: bytes) -> None:
-        """Send `data`.
-
-        Raises:
-            BusLost: that fails.
-        """
+        """Send `data`; raise BusLost if the port is gone."""
         try:
             self.device.write(data)
         except (OSError, termios.error) as error:

@@ -48,7 +48,6 @@ class TurnCount:
 
     Attributes:
         pose: last joint angles [rad]; None before the first reading.
-        counts: the same [ticks].
         lost: a joint that is not where it was, so that the user must confirm its turn.
     """
 
@@ -61,7 +60,6 @@ class TurnCount:
             limits: of each joint [rad]; a range below one turn determines the turn.
             last_pose: joint angles of the last session [rad], shape (d,).
             max_move_deg: how far a joint may have moved since then, where only the nearest turn determines it.
-            table: of robot.toml, for messages.
         """
         self._limits, self._max_move_deg, self._table = list(limits), max_move_deg, table
         self.pose = None if last_pose is None else [float(q) for q in last_pose]

@@ -24,24 +24,16 @@ Identity = tuple[str, str | None, str | None, int]
 
 @dataclass(frozen=True, eq=False)
 class Effect:
-    """An effect of a robot.
+    """An effect of a robot."""
 
-    Attributes:
-        kind: what it is.
-        where, source: the joint it acts on, and the joint that causes it; None where there is none.
-        values: its numbers (p,), in the order of `parameters`.
-        prismatic: True for a prismatic joint.
-        ordinal: number among several of one kind at one place, counted from 0.
-        free: indices of the amounts that may differ from nominal; None for all.
-    """
-
-    kind: EffectType
+    kind: EffectType  # what it is
+    # where, source: the joint it acts on, and the joint that causes it; None where there is none
     where: str | None
     source: str | None
-    values: FloatArray
-    prismatic: bool = False
-    ordinal: int = 0
-    free: tuple[int, ...] | None = None
+    values: FloatArray  # its numbers (p,), in the order of `parameters`
+    prismatic: bool = False  # True for a prismatic joint
+    ordinal: int = 0  # number among several of one kind at one place, counted from 0
+    free: tuple[int, ...] | None = None  # indices of the amounts that may differ from nominal; None for all
 
     @classmethod
     def at(

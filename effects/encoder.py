@@ -89,6 +89,35 @@ class _WithoutMemory:
         return float(self.effect.correction(motion, self.place, self.values)[0])
 
 
+class Driven(Protocol):
+    """An element driven reading by reading."""
+
+    def begin(self, reading: float, leading: float) -> None:
+        """Start at `reading`, reached in the direction of `leading`; 0 for no direction."""
+
+    def follow(self, reading: float) -> float:
+        """Return its output at the next reading."""
+        ...
+
+
+class LiveDriven:
+    """`scale` times the output of a driven element; the first move determines its initial state."""
+
+    def __init__(self, place: Place, element: Driven, scale: float) -> None:
+        self._joint, self._element, self._scale = place.joint, element, scale
+        self._first: float | None = None
+        self._moved = False
+
+    def at(self, motion: Motion, move: float) -> float:
+        reading = float(motion.q[0, self._joint])
+        if self._first is None:
+            self._first = reading
+        if not self._moved and reading != self._first:
+            self._moved = True
+            self._element.begin(self._first, reading - self._first)
+        return self._scale * self._element.follow(reading)
+
+
 def carried_on(added: FloatArray, kept: FloatArray) -> FloatArray:
     """Solve e_i = added_i + kept_i e_{i-1} for all rows (n,); nothing is kept from before the first."""
     total, kept, back = added.copy(), kept.copy(), 1

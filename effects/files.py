@@ -165,10 +165,6 @@ def write_extended(simulation: Simulation, folder: Path, heading: str, *, replac
     checkpoint go to a folder of their own. Where robot.toml does not know the camera's pose or the marker's position,
     those of the simulation are written in their place and stay marked as unknown.
 
-    Args:
-        heading: one line for the top that names the origin.
-        replace: replace an extended.toml that is there.
-
     Returns:
         The path of the extended.toml.
 

@@ -21,18 +21,12 @@ ROD_KG_PER_M = 1.0
 
 @dataclass
 class Body:
-    """Links between one read joint and the next, which move as one body.
+    """Links between one read joint and the next, which move as one body."""
 
-    Attributes:
-        joint: the joint that carries it; None for the base.
-        carrier: index in q of the joint that carries that joint; None for the base.
-        T_carrier_joint: pose (4, 4) of the joint's frame in its carrier's body, at zero.
-        mass_kg, moment: its mass and mass times centre of mass [kg·m] (3,), in the frame of the joint's child link.
-    """
-
-    joint: UrdfJoint | None
-    carrier: int | None
-    T_carrier_joint: FloatArray
+    joint: UrdfJoint | None  # the joint that carries it; None for the base
+    carrier: int | None  # index in q of the joint that carries that joint; None for the base
+    T_carrier_joint: FloatArray  # pose (4, 4) of the joint's frame in its carrier's body, at zero
+    # mass_kg, moment: its mass and mass times centre of mass [kg·m] (3,), in the frame of the joint's child link
     mass_kg: float = 0.0
     moment: FloatArray = field(default_factory=lambda: np.zeros(3))
 
@@ -219,18 +213,13 @@ def _borne(
 
 @dataclass(frozen=True, eq=False)
 class _Turn:
-    """Motion of a joint into its carrier's frame.
+    """Motion of a joint into its carrier's frame."""
 
-    Attributes:
-        turns: as in `Body`.
-        sine, cosine: of the angle (n,); 0 and 1 for a prismatic joint.
-        origin: of the joint's child link in the carrier's frame [m] (3, n).
-    """
-
-    turns: FloatArray
+    turns: FloatArray  # as in `Body`
+    # sine, cosine: of the angle (n,); 0 and 1 for a prismatic joint
     sine: FloatArray
     cosine: FloatArray
-    origin: FloatArray
+    origin: FloatArray  # of the joint's child link in the carrier's frame [m] (3, n)
 
     @classmethod
     def of(cls, body: Body, q: FloatArray) -> _Turn:

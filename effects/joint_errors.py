@@ -11,40 +11,26 @@ from bodyschema.interfaces.records import FloatArray
 
 @dataclass(frozen=True)
 class Wave:
-    """A periodic error: amplitude · cos(frequency · reading - phase).
+    """A periodic error: amplitude · cos(frequency · reading - phase)."""
 
-    Attributes:
-        name: name of the effect.
-        amplitude: [rad, m].
-        phase: [rad].
-        frequency: radians per unit of the reading.
-    """
-
-    name: str
-    amplitude: float
-    phase: float
-    frequency: float
+    name: str  # name of the effect
+    amplitude: float  # [rad, m]
+    phase: float  # [rad]
+    frequency: float  # radians per unit of the reading
 
 
 @dataclass
 class JointErrors:
-    """Errors between a joint's reading and its true angle.
+    """Errors between a joint's reading and its true angle."""
 
-    Attributes:
-        offset: added to the reading [rad, m].
-        ratios: share of each joint's reading that is added, by the joint; the joint's own is its scale error.
-        waves: periodic errors.
-        play: width of the backlash [rad, m].
-        loose: width [rad, m] of the backlash under gravity, and the friction [N·m, N] that holds it on its side.
-        compliance: [rad/(N·m), m/N].
-    """
-
-    offset: float = 0.0
+    offset: float = 0.0  # added to the reading [rad, m]
+    # share of each joint's reading that is added, by the joint; the joint's own is its scale error
     ratios: dict[str, float] = field(default_factory=dict)
-    waves: list[Wave] = field(default_factory=list)
-    play: float = 0.0
+    waves: list[Wave] = field(default_factory=list)  # periodic errors
+    play: float = 0.0  # width of the backlash [rad, m]
+    # width [rad, m] of the backlash under gravity, and the friction [N·m, N] that holds it on its side
     loose: tuple[float, float] | None = None
-    compliance: float = 0.0
+    compliance: float = 0.0  # [rad/(N·m), m/N]
 
     def add_ratio(self, source: str, ratio: float) -> None:
         """Add a share of a joint's reading."""

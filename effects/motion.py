@@ -17,20 +17,13 @@ _EARLIER_KEPT = 16
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Readings of all encoders, one row per measurement.
+    """Readings of all encoders, one row per measurement."""
 
-    Attributes:
-        q: joint angles as read [rad] (m for a prismatic joint), shape (n, d).
-        t: increasing times [s], shape (n,); None if unknown.
-        segment: run numbers, shape (n,); the motion between two runs was not observed.
-        begun_at: start of all drifts [s]; None for the first row.
-        rows: row numbers (n,) in a longer recording of which this is a part; None for a whole one.
-    """
-
-    q: FloatArray
-    t: FloatArray | None
-    segment: NDArray[np.int64]
-    begun_at: float | None = None
+    q: FloatArray  # joint angles as read [rad] (m for a prismatic joint), shape (n, d)
+    t: FloatArray | None  # increasing times [s], shape (n,); None if unknown
+    segment: NDArray[np.int64]  # run numbers, shape (n,); the motion between two runs was not observed
+    begun_at: float | None = None  # start of all drifts [s]; None for the first row
+    # row numbers (n,) in a longer recording of which this is a part; None for a whole one
     rows: FloatArray | None = None
 
     @classmethod

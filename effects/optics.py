@@ -12,17 +12,12 @@ from bodyschema.interfaces.records import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class Optics:
-    """Differences of the true cameras from the calibration.
+    """Differences of the true cameras from the calibration."""
 
-    Attributes:
-        scale_error: measured over true distances, minus one: the nominal baseline over the true one.
-        focal_error: true over nominal focal length, minus one.
-        k1, k2: radial distortion left in the images: a ray (x, y, 1) is seen at (x, y)·(1 + k1·r² + k2·r⁴) with
-            r² = x² + y².
-    """
-
-    scale_error: float = 0.0
-    focal_error: float = 0.0
+    scale_error: float = 0.0  # measured over true distances, minus one: the nominal baseline over the true one
+    focal_error: float = 0.0  # true over nominal focal length, minus one
+    # k1, k2: radial distortion left in the images: a ray (x, y, 1) is seen at (x, y)·(1 + k1·r² + k2·r⁴) with r² = x² +
+    # y²
     k1: float = 0.0
     k2: float = 0.0
 

@@ -7,26 +7,16 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One number of an effect.
+    """One number of an effect."""
 
-    Attributes:
-        name: with its unit, as in `extended.toml` and `diagnosis.json`.
-        usual: typical size of an effect that is present [the parameter's unit]; start of a search.
-        nominal: value without influence; None for a number of time or shape (a moment, a period).
-        never_negative: True for a backlash, a spring or a lag, which cannot be negative.
-        smooth: True for a shape on which the measured position depends smoothly: a period or a time constant, but not a
-            moment.
-        positive: True for a period or a length, which cannot be zero either.
-        below_one: True for a share that remains, from 0 to below 1.
-    """
-
-    name: str
-    usual: float
-    nominal: float | None = 0.0
-    never_negative: bool = False
+    name: str  # with its unit, as in `extended.toml` and `diagnosis.json`
+    usual: float  # typical size of an effect that is present [the parameter's unit]; start of a search
+    nominal: float | None = 0.0  # value without influence; None for a number of time or shape (a moment, a period)
+    never_negative: bool = False  # True for a backlash, a spring or a lag, which cannot be negative
+    # True for a shape on which the measured position depends smoothly: a period or a time constant, but not a moment
     smooth: bool = False
-    positive: bool = False
-    below_one: bool = False
+    positive: bool = False  # True for a period or a length, which cannot be zero either
+    below_one: bool = False  # True for a share that remains, from 0 to below 1
 
     @property
     def is_amount(self) -> bool:
@@ -39,7 +29,6 @@ T0 = Parameter("t0", 0.0, None)
 
 
 def shifts(usual_m: float) -> tuple[Parameter, ...]:
-    """Return the parameters of a shift."""
     return tuple(Parameter(f"{axis}_m", usual_m) for axis in "xyz")
 
 

@@ -55,20 +55,13 @@ class Residual(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """A robot with effects, and the measurements that its cameras would report.
+    """A robot with effects, and the measurements that its cameras would report."""
 
-    Attributes:
-        robot: the robot as described.
-        effects: effects added to it.
-        residual: correction added to the measurements; None for none. It depends on the readings alone, so no effect
-            changes it.
-        background: small errors everywhere, within manufacturing tolerances; never a finding.
-    """
-
-    robot: RobotDescription
-    effects: tuple[Effect, ...] = ()
+    robot: RobotDescription  # the robot as described
+    effects: tuple[Effect, ...] = ()  # effects added to it
+    # correction added to the measurements; None for none. It depends on the readings alone, so no effect changes it.
     residual: Residual | None = None
-    background: tuple[Effect, ...] = ()
+    background: tuple[Effect, ...] = ()  # small errors everywhere, within manufacturing tolerances; never a finding
 
     @cached_property
     def all_effects(self) -> tuple[Effect, ...]:
@@ -243,7 +236,6 @@ class Simulation:
 
     @cached_property
     def _staged(self) -> dict[Stage, list[Effect]]:
-        """All effects by their stage."""
         staged: dict[Stage, list[Effect]] = {stage: [] for stage in STAGES}
         for effect in self.all_effects:
             staged[effect.kind.stage].append(effect)
@@ -394,27 +386,20 @@ class Simulation:
 
 @dataclass(frozen=True, eq=False)
 class Simulated:
-    """One run of the pipeline, with its derivatives by each effect's parameters.
-
-    Attributes:
-        readings: encoder readings at the time of the images.
-        q: true joint angles (n, d) [rad, m].
-        frames: frames of the joints and the marker (n, d + 1, 4, 4) in the nominal camera's frame.
-        x_true, x_placed, x_camera: the marker (n, 3) [m] seen by the nominal camera, by the camera as it was set up,
-            and by the camera at its present pose.
-        measured: simulated measurements (n, 3) [m].
-    """
+    """One run of the pipeline, with its derivatives by each effect's parameters."""
 
     simulation: Simulation
     motion: Motion
-    readings: Motion
-    q: FloatArray
+    readings: Motion  # encoder readings at the time of the images
+    q: FloatArray  # true joint angles (n, d) [rad, m]
     chain: RigidChain
-    frames: FloatArray
+    frames: FloatArray  # frames of the joints and the marker (n, d + 1, 4, 4) in the nominal camera's frame
+    # x_true, x_placed, x_camera: the marker (n, 3) [m] seen by the nominal camera, by the camera as it was set up, and
+    # by the camera at its present pose
     x_true: FloatArray
     x_placed: FloatArray
     x_camera: FloatArray
-    measured: FloatArray
+    measured: FloatArray  # simulated measurements (n, 3) [m]
 
     @cached_property
     def by_joint(self) -> FloatArray:

@@ -29,17 +29,13 @@ _LARGEST_GRID = 400_000
 
 @dataclass(frozen=True)
 class _Axis:
-    """Functions of one joint: harmonics of a turn; for a prismatic joint, of twice its stroke, also times the path.
-
-    Attributes:
-        low, high: range of a prismatic joint for the function [m].
-        harmonics: number of harmonics; 0 for a revolute joint means no dependence on it.
-    """
+    """Functions of one joint: harmonics of a turn; for a prismatic joint, of twice its stroke, also times the path."""
 
     slides: bool
+    # low, high: range of a prismatic joint for the function [m]
     low: float
     high: float
-    harmonics: int
+    harmonics: int  # number of harmonics; 0 for a revolute joint means no dependence on it
 
     @property
     def scale(self) -> float:

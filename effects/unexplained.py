@@ -46,20 +46,14 @@ _READERS: tuple[Callable[[bytes], StoredModel], ...] = (
 
 @dataclass(frozen=True, eq=False)
 class Unexplained:
-    """A model of the errors that no effect explains.
+    """A model of the errors that no effect explains."""
 
-    Attributes:
-        model: any KB-Map; its outputs are shifts of the measurements [m], in the measurement frame.
-        joints: joints whose readings are its inputs, in order; among them may be `PLACE`, the marker's coordinates [m]
-            by the described robot at the readings.
-        factors: factor on each of these inputs.
-        robot: the robot of these joints.
-    """
-
-    model: StoredModel
+    model: StoredModel  # any KB-Map; its outputs are shifts of the measurements [m], in the measurement frame
+    # joints whose readings are its inputs, in order; among them may be `PLACE`, the marker's coordinates [m] by the
+    # described robot at the readings
     joints: tuple[str, ...]
-    factors: tuple[float, ...]
-    robot: RobotDescription
+    factors: tuple[float, ...]  # factor on each of these inputs
+    robot: RobotDescription  # the robot of these joints
 
     @classmethod
     def of(

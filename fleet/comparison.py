@@ -49,76 +49,48 @@ _quantile = NormalDist().inv_cdf
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """Predictions of one robot's learner at the common poses.
+    """Predictions of one robot's learner at the common poses."""
 
-    Attributes:
-        robot: its name.
-        x: positions (n, 3) in its own measurement frame [m].
-        sigma_m: its predicted error there, root mean square of the distance [m].
-        in_support: share of the poses that lie where it has data.
-        calibration: its calibration; None without one.
-    """
-
-    robot: str
-    x: FloatArray
-    sigma_m: float
-    in_support: float
-    calibration: ChainCalibration | None
+    robot: str  # its name
+    x: FloatArray  # positions (n, 3) in its own measurement frame [m]
+    sigma_m: float  # its predicted error there, root mean square of the distance [m]
+    in_support: float  # share of the poses that lie where it has data
+    calibration: ChainCalibration | None  # its calibration; None without one
 
 
 class Odd(msgspec.Struct, frozen=True):
-    """Figure of a robot that differs from the others' by more than its uncertainty and their spread.
+    """Figure of a robot that differs from the others' by more than its uncertainty and their spread."""
 
-    Attributes:
-        figure: in words, as in `zero of elbow`.
-        difference, half_width: from the median of the robots, with half its 95 % interval [unit].
-        unit: rad or m.
-    """
-
-    figure: str
+    figure: str  # in words, as in `zero of elbow`
+    # difference, half_width: from the median of the robots, with half its 95 % interval [unit]
     difference: float
     half_width: float
-    unit: str
+    unit: str  # rad or m
 
 
 class Unit(msgspec.Struct, frozen=True, kw_only=True):
-    """One robot compared with the others.
+    """One robot compared with the others."""
 
-    Attributes:
-        robot: its name.
-        apart: distance of its model from the median model, after a rigid alignment: cameras may stand anywhere.
-        claimed_mm: predicted error of its learner at the poses, root mean square.
-        in_support: share of the poses that lie where it has data.
-        is_off: true if it is an outlier; null if there are too few robots to decide.
-        odd: its figures that stand out, the most improbable first.
-        camera_moved_mm, camera_turned_deg: from the camera pose in its robot.toml.
-    """
-
-    robot: str
-    apart: Distances
-    claimed_mm: float
-    in_support: float
-    is_off: bool | None
-    odd: tuple[Odd, ...]
+    robot: str  # its name
+    apart: Distances  # distance of its model from the median model, after a rigid alignment: cameras may stand anywhere
+    claimed_mm: float  # predicted error of its learner at the poses, root mean square
+    in_support: float  # share of the poses that lie where it has data
+    is_off: bool | None  # true if it is an outlier; null if there are too few robots to decide
+    odd: tuple[Odd, ...]  # its figures that stand out, the most improbable first
+    # camera_moved_mm, camera_turned_deg: from the camera pose in its robot.toml
     camera_moved_mm: float | None
     camera_turned_deg: float | None
 
 
 class TypeComparison(msgspec.Struct, frozen=True):
-    """Robots with the same joints.
+    """Robots with the same joints."""
 
-    Attributes:
-        joints: their names.
-        poses: number of common poses.
-        low, high: the range of each joint that the poses are from [rad or m].
-        units: the robots.
-    """
-
-    joints: tuple[str, ...]
-    poses: int
+    joints: tuple[str, ...]  # their names
+    poses: int  # number of common poses
+    # low, high: the range of each joint that the poses are from [rad or m]
     low: tuple[float, ...]
     high: tuple[float, ...]
-    units: tuple[Unit, ...]
+    units: tuple[Unit, ...]  # the robots
 
 
 def common_poses(coverages: Sequence[Mapping[str, JointRange]], joints: tuple[str, ...]) -> FloatArray:

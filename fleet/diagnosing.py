@@ -36,23 +36,14 @@ TOPIC = "bodyschema"
 
 @dataclass(frozen=True)
 class Diagnosed:
-    """Result for one recording.
+    """Result for one recording."""
 
-    Attributes:
-        job: the recording.
-        robot: name of its robot.
-        joints: of its robot; empty if its description could not be read.
-        file: the diagnosis; None if there is none.
-        timed: True if the recording has times.
-        error: the reason why there is none.
-    """
-
-    job: Job
-    robot: str
-    joints: tuple[str, ...]
-    file: DiagnosisFile | None = None
-    timed: bool = False
-    error: str | None = None
+    job: Job  # the recording
+    robot: str  # name of its robot
+    joints: tuple[str, ...]  # of its robot; empty if its description could not be read
+    file: DiagnosisFile | None = None  # the diagnosis; None if there is none
+    timed: bool = False  # True if the recording has times
+    error: str | None = None  # the reason why there is none
 
 
 @dataclass(frozen=True)
@@ -74,11 +65,9 @@ def diagnose_all(
     """Diagnose all recordings; a failed one is reported as such, and does not end the others.
 
     Args:
-        asked: settings of the diagnoses.
         out: a folder for each recording is written here.
         cluster: a client of the scheduler; running work is cancelled if this ends early.
         told: called with a recording's name and its current step.
-        done: called with each result as it comes.
 
     Returns:
         The results, in the order of the jobs.
@@ -121,7 +110,6 @@ def workers(scheduler: str | None, jobs: int, count: int | None = None) -> Itera
 
     Args:
         scheduler: its address; None starts processes here.
-        jobs: number of recordings.
         count: of processes; None: one for each core, and no more than jobs.
 
     Raises:

@@ -17,17 +17,11 @@ ENDINGS = (CSV, PARQUET, *STORE_ENDINGS)
 
 @dataclass(frozen=True)
 class Job:
-    """Recording to diagnose.
+    """Recording to diagnose."""
 
-    Attributes:
-        name: unique name of the row and of the report's folder.
-        recording: its file.
-        robot: its robot.toml.
-    """
-
-    name: str
-    recording: Path
-    robot: Path
+    name: str  # unique name of the row and of the report's folder
+    recording: Path  # its file
+    robot: Path  # its robot.toml
 
 
 def jobs(recordings: Sequence[Path], folder: Path | None, robot: Path | None) -> list[Job]:

@@ -34,33 +34,22 @@ Status = TypeVar("Status", SamplerStatus, LearnerStatus)
 
 @dataclass(frozen=True)
 class Place:
-    """Network route on which robots are looked for.
-
-    Attributes:
-        route: the route.
-        robots: names of the expected robots; others are found too if queries for all are permitted.
-    """
+    """Network route on which robots are looked for."""
 
     route: Route
-    robots: tuple[str, ...] = ()
+    robots: tuple[str, ...] = ()  # names of the expected robots; others are found too if queries for all are permitted
 
 
 @dataclass(eq=False)
 class Member:
-    """Current state of one robot of the fleet.
+    """Current state of one robot of the fleet."""
 
-    Attributes:
-        name: of the robot.
-        alive: its processes that are alive.
-        sampler, learner: their status; None if one did not answer.
-        route: the learner's route, else the sampler's; None if neither was found.
-    """
-
-    name: str
-    alive: set[str] = field(default_factory=set)
+    name: str  # of the robot
+    alive: set[str] = field(default_factory=set)  # its processes that are alive
+    # sampler, learner: their status; None if one did not answer
     sampler: SamplerStatus | None = None
     learner: LearnerStatus | None = None
-    route: Route | None = None
+    route: Route | None = None  # the learner's route, else the sampler's; None if neither was found
 
     @property
     def joints(self) -> tuple[str, ...] | None:
@@ -135,11 +124,7 @@ class Fleet:
         self._open.close()
 
     def look(self) -> list[Member]:
-        """Return the robots now, by name.
-
-        Raises:
-            BusError: none of the routes can be reached.
-        """
+        """Return the robots now, by name; raise BusError if none of the routes can be reached."""
         members = {name: Member(name) for place in self._places for name in place.robots}
         self.unreached = []
         for place in self._places:

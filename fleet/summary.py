@@ -19,60 +19,36 @@ PLACED = ("camera_pose", "camera_moved", "tool_offset", "tool_slip")
 
 
 class Row(msgspec.Struct, frozen=True, kw_only=True):
-    """Row of one recording.
+    """Row of one recording."""
 
-    Attributes:
-        name: of the row, and of the report's folder.
-        recording: its file.
-        robot: name of its robot.
-        verdict: of the diagnosis.
-        causes: with their numbers, in words, the most important first.
-        gain_percent: reduction of the RMS on held-out rows.
-        aligned_mm, extended_mm: RMS there, without and with the causes.
-        sentence: the diagnosis in one sentence.
-        error: why there is no diagnosis; then the others are null.
-    """
-
-    name: str
-    recording: str
-    robot: str
-    verdict: str | None
-    causes: tuple[str, ...]
-    gain_percent: float | None
+    name: str  # of the row, and of the report's folder
+    recording: str  # its file
+    robot: str  # name of its robot
+    verdict: str | None  # of the diagnosis
+    causes: tuple[str, ...]  # with their numbers, in words, the most important first
+    gain_percent: float | None  # reduction of the RMS on held-out rows
+    # aligned_mm, extended_mm: RMS there, without and with the causes
     aligned_mm: float | None
     extended_mm: float | None
-    sentence: str | None
-    error: str | None
+    sentence: str | None  # the diagnosis in one sentence
+    error: str | None  # why there is no diagnosis; then the others are null
 
 
 class Shared(msgspec.Struct, frozen=True):
-    """Cause that more than half of the units of a type have.
+    """Cause that more than half of the units of a type have."""
 
-    Attributes:
-        cause: effect and joint.
-        units: the units that have it.
-        of: number of diagnosed units.
-    """
-
-    cause: str
-    units: tuple[str, ...]
-    of: int
+    cause: str  # effect and joint
+    units: tuple[str, ...]  # the units that have it
+    of: int  # number of diagnosed units
 
 
 class Type(msgspec.Struct, frozen=True):
-    """Units with the same joints.
+    """Units with the same joints."""
 
-    Attributes:
-        joints: their names.
-        well: units without a finding.
-        off: by unit, the causes that few other units have.
-        shared: causes of most units: check their common description.
-    """
-
-    joints: tuple[str, ...]
-    well: tuple[str, ...]
-    off: dict[str, tuple[str, ...]]
-    shared: tuple[Shared, ...]
+    joints: tuple[str, ...]  # their names
+    well: tuple[str, ...]  # units without a finding
+    off: dict[str, tuple[str, ...]]  # by unit, the causes that few other units have
+    shared: tuple[Shared, ...]  # causes of most units: check their common description
 
 
 class Summary(msgspec.Struct, frozen=True):

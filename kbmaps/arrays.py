@@ -17,11 +17,7 @@ IntArray: TypeAlias = NDArray[np.intp]
 
 
 def numbers(name: str, values: ArrayLike) -> FloatArray:
-    """Return `values` as a float64 array of any shape.
-
-    Raises:
-        NotNumbersError: the values are not numbers, or the rows differ in length.
-    """
+    """Return `values` as a float64 array of any shape."""
     try:
         return np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -36,11 +32,7 @@ def frozen(values: ArrayLike) -> FloatArray:
 
 
 def vector(name: str, values: ArrayLike, width: int) -> FloatArray:
-    """Return `values` as a finite float64 vector (width,).
-
-    Raises:
-        ShapeError, NonFiniteError, NotNumbersError: it is no such array.
-    """
+    """Return `values` as a finite float64 vector (width,)."""
     array = numbers(name, values)
     if array.shape != (width,):
         raise ShapeError(name, f"({width},)", array.shape)
@@ -51,11 +43,7 @@ def vector(name: str, values: ArrayLike, width: int) -> FloatArray:
 
 
 def rows(name: str, values: ArrayLike, width: int) -> FloatArray:
-    """Return `values` as finite float64 rows (n, width).
-
-    Raises:
-        ShapeError, NonFiniteError, NotNumbersError: it is no such array.
-    """
+    """Return `values` as finite float64 rows (n, width)."""
     array = numbers(name, values)
     if array.ndim != 2 or array.shape[1] != width:
         raise ShapeError(name, f"(n, {width})", array.shape)
@@ -65,11 +53,7 @@ def rows(name: str, values: ArrayLike, width: int) -> FloatArray:
 
 
 def rows_or_vector(name: str, values: ArrayLike, width: int) -> FloatArray:
-    """Return `values` as a finite vector (width,) or finite rows (n, width), whichever they were.
-
-    Raises:
-        ShapeError, NonFiniteError, NotNumbersError
-    """
+    """Return `values` as a finite vector (width,) or finite rows (n, width), whichever they were."""
     array = numbers(name, values)
     if array.ndim == 1:
         return vector(name, array, width)
@@ -89,11 +73,7 @@ def batches(count: int) -> Iterator[slice]:
 
 
 def limits(name: str, values: ArrayLike, width: int) -> FloatArray:
-    """Return `values` as a float64 vector (width,); infinite entries are allowed.
-
-    Raises:
-        ShapeError, NonFiniteError (NaN), NotNumbersError
-    """
+    """Return `values` as a float64 vector (width,); infinite entries are allowed."""
     array = numbers(name, values)
     if array.shape != (width,):
         raise ShapeError(name, f"({width},)", array.shape)

@@ -117,9 +117,5 @@ class Model(PositionModel, Protocol):
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
-        """Return the model in `data`.
-
-        Raises:
-            ModelFormatError: wrong type of model, or damaged.
-        """
+        """Return the model in `data`."""
         ...

@@ -49,11 +49,7 @@ def framed(magic: bytes, header: bytes, payload: bytes) -> bytes:
 
 
 def unframed(data: bytes, magic: bytes) -> tuple[bytes, memoryview]:
-    """Return header and payload of `framed`.
-
-    Raises:
-        ModelFormatError: it does not describe one.
-    """
+    """Return header and payload of `framed`."""
     if not isinstance(data, bytes | bytearray | memoryview):  # pyright: ignore[reportUnnecessaryIsInstance]
         raise ModelFormatError(
             f"a stored model is bytes, as to_bytes gives them and Path.read_bytes reads them; got {type(data).__name__}"
@@ -76,11 +72,7 @@ def unframed(data: bytes, magic: bytes) -> tuple[bytes, memoryview]:
 
 
 def unpack(data: bytes, kind: str) -> tuple[dict[str, Any], dict[str, FloatArray]]:
-    """Return fields and arrays of a model of this kind. The caller checks the contents of the fields.
-
-    Raises:
-        ModelFormatError: the bytes are damaged, truncated, of another kind, or of another format.
-    """
+    """Return fields and arrays of a model of this kind. The caller checks the contents of the fields."""
     header, payload = unframed(data, MAGIC)
     try:
         content: Any = json.loads(header, parse_float=_finite, parse_constant=_finite)
@@ -95,11 +87,7 @@ def unpack(data: bytes, kind: str) -> tuple[dict[str, Any], dict[str, FloatArray
 
 
 def named(value: Any, what: str, keys: Sequence[str]) -> dict[str, Any]:
-    """Return `value` if it is an object with exactly these keys.
-
-    Raises:
-        ModelFormatError: it does not describe one.
-    """
+    """Return `value` if it is an object with exactly these keys."""
     if not isinstance(value, dict) or set(cast(dict[str, Any], value)) != set(keys):
         raise ModelFormatError(f"{what} must be an object with the keys {', '.join(keys)}")
     return cast(dict[str, Any], value)
@@ -129,42 +117,26 @@ def complete(arrays: Mapping[str, FloatArray], always: Sequence[str], *parts: Se
 
 
 def numbers(fields: Mapping[str, Any]) -> dict[str, float]:
-    """Return fields that are all numbers.
-
-    Raises:
-        ModelFormatError: it does not describe one.
-    """
+    """Return fields that are all numbers."""
     return {name: number(value, f"the field {name}") for name, value in fields.items()}
 
 
 def number(value: Any, what: str) -> float:
-    """Return `value` if it is a number.
-
-    Raises:
-        ModelFormatError: it does not describe one.
-    """
+    """Return `value` if it is a number."""
     if type(value) not in (int, float):
         raise ModelFormatError(f"{what} is not a number")
     return float(value)
 
 
 def count(value: Any, what: str) -> int:
-    """Return `value` if it is a whole number from 0 to 2^53, the range of every JSON reader.
-
-    Raises:
-        ModelFormatError: it is not.
-    """
+    """Return `value` if it is a whole number from 0 to 2^53, the range of every JSON reader."""
     if type(value) is not int or not 0 <= value <= _LARGEST_COUNT:
         raise ModelFormatError(f"{what} is not a whole number from 0 to {_LARGEST_COUNT}")
     return value
 
 
 def flag(value: Any, what: str) -> bool:
-    """Return `value` if it is true or false.
-
-    Raises:
-        ModelFormatError: it does not describe one.
-    """
+    """Return `value` if it is true or false."""
     if type(value) is not bool:
         raise ModelFormatError(f"{what} is neither true nor false")
     return value
@@ -176,11 +148,7 @@ def unless_infinite(value: float) -> float | None:
 
 
 def or_infinite(value: Any, what: str) -> float:
-    """Return the number from `unless_infinite`.
-
-    Raises:
-        ModelFormatError: it does not describe one.
-    """
+    """Return the number from `unless_infinite`."""
     return math.inf if value is None else number(value, what)
 
 

@@ -17,20 +17,15 @@ from kbmaps.packed import restoring
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Pairs q (n, d) [rad, m] and x (n, 3) [m].
-
-    Attributes:
-        unit: 1-sigma (n,) of each coordinate [m] up to a common factor; the geometric mean of all directions.
-        known: whether that factor is 1; otherwise it has to be estimated.
-        shape: (n, 3, 3) of determinant 1: what makes an error as large in all directions; None where it is.
-        common: (n, 3, k) [m], the errors that k unknowns shared by all pairs bring at 1 sigma of each; None: none.
-    """
+    """Pairs q (n, d) [rad, m] and x (n, 3) [m]."""
 
     q: FloatArray
     x: FloatArray
-    unit: FloatArray
-    known: bool
+    unit: FloatArray  # 1-sigma (n,) of each coordinate [m] up to a common factor; the geometric mean of all directions
+    known: bool  # whether that factor is 1; otherwise it has to be estimated
+    # (n, 3, 3) of determinant 1: what makes an error as large in all directions; None where it is
     shape: FloatArray | None = None
+    # (n, 3, k) [m], the errors that k unknowns shared by all pairs bring at 1 sigma of each; None: none
     common: FloatArray | None = None
 
     def __len__(self) -> int:
@@ -68,11 +63,7 @@ def with_units(
 
 
 def stored_pairs(arrays: Mapping[str, FloatArray], joints: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return q (n, d), x (n, 3) and sigma (n,), NaN where unknown, from the arrays of a stored model.
-
-    Raises:
-        ModelFormatError: they are missing, or not pairs.
-    """
+    """Return q (n, d), x (n, 3) and sigma (n,), NaN where unknown, from the arrays of a stored model."""
     with restoring("pairs"):
         q, x, sigma = rows("q", arrays["q"], joints), rows("x", arrays["x"], 3), arrays["sigma"]
         if not sigma.shape == (len(q),) == (len(x),):

@@ -28,9 +28,6 @@ def nearest_rotation(matrices: ArrayLike) -> FloatArray:
     The orthogonal factor of the polar decomposition, with the smallest singular direction reversed where the matrix is
     a reflection. Higham 1986, "Computing the polar decomposition"; Kabsch 1976 for the sign.
 
-    Raises:
-        ShapeError, NonFiniteError
-
     Example:
         >>> from kbmaps import nearest_rotation
         >>> nearest_rotation([[1.1, 0.0, 0.0], [0.0, 0.9, 0.0], [0.0, 0.0, 1.0]])

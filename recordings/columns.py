@@ -65,15 +65,10 @@ class Fault(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Named columns of numbers.
+    """Named columns of numbers."""
 
-    Attributes:
-        names: names of the columns.
-        values: shape (n, number of columns).
-    """
-
-    names: tuple[str, ...]
-    values: FloatArray
+    names: tuple[str, ...]  # names of the columns
+    values: FloatArray  # shape (n, number of columns)
 
     def columns(self, names: tuple[str, ...]) -> FloatArray:
         """Return the columns `names`, shape (n, len(names))."""

@@ -57,17 +57,11 @@ def from_pairs(pairs: Sequence[Pair], joints: tuple[str, ...], file: Path | None
 
 @dataclass(frozen=True)
 class StoredPairs:
-    """Pairs of a store.
+    """Pairs of a store."""
 
-    Attributes:
-        store: its identity.
-        recording: all pairs in it that can be read; rows are counted from 1.
-        numbers: sequence number of each row, ascending.
-    """
-
-    store: str
-    recording: Recording
-    numbers: Sequence[int]
+    store: str  # its identity
+    recording: Recording  # all pairs in it that can be read; rows are counted from 1
+    numbers: Sequence[int]  # sequence number of each row, ascending
 
 
 def from_store(file: Path) -> Recording:

@@ -34,29 +34,20 @@ BODY_UNITS: tuple[Unit, ...] = ("degrees", "range_m100_100")
 
 @dataclass(frozen=True)
 class LeRobotUnits:
-    """Conversion of a dataset's readings to angles.
+    """Conversion of a dataset's readings to angles."""
 
-    Attributes:
-        motors: LeRobot's calibration of the arm with which the dataset was recorded.
-        servos: the joints, in the order of q.
-        unit: of the readings; None: inferred from large readings.
-    """
-
-    motors: Calibrations
-    servos: Sequence[JointServo]
-    unit: Unit | None = None
+    motors: Calibrations  # LeRobot's calibration of the arm with which the dataset was recorded
+    servos: Sequence[JointServo]  # the joints, in the order of q
+    unit: Unit | None = None  # of the readings; None: inferred from large readings
 
 
 @dataclass(frozen=True)
 class VideoPart:
-    """The part of a video file that shows one episode.
-
-    Attributes:
-        begin_s, end_s: from the first frame of the file.
-    """
+    """The part of a video file that shows one episode."""
 
     file: Path
     episode: int
+    # begin_s, end_s: from the first frame of the file
     begin_s: float = 0.0
     end_s: float = math.inf
 

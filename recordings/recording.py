@@ -44,33 +44,22 @@ RESET_GAP_S = 10.0  # between runs whose clocks have nothing to do with each oth
 class Recording:
     """Many pairs, in the order in which they were measured.
 
-    Attributes:
-        joints: names in the order of q.
-        q: joint angles [rad] (m for a prismatic joint), shape (n, d).
-        x: marker positions in the measurement frame [m], shape (n, 3).
-        t: times [s], shape (n,), strictly increasing inside a segment, or None.
-        cov: covariances of x [m²], shape (n, 3, 3), or None.
-        segment: numbers of the runs, shape (n,), or None.
-        centres_px: (ul, vl, ur, vr) [px], shape (n, 4), or None.
-        orientation: unit quaternions (x, y, z, w), shape (n, 4), or None.
-        extra: the columns current_<joint> [A] and temperature_<joint> [°C] that are there, each of shape (n,).
-        file: where it was read from, or None.
-
     Raises:
         RecordingError: a value cannot be; the message names row (of a CSV file: line) and column.
         ValueError: the arrays' shapes do not fit each other.
     """
 
-    joints: tuple[str, ...]
-    q: FloatArray
-    x: FloatArray
-    t: FloatArray | None = None
-    cov: FloatArray | None = None
-    segment: NDArray[np.int64] | None = None
-    centres_px: FloatArray | None = None
-    orientation: FloatArray | None = None
+    joints: tuple[str, ...]  # names in the order of q
+    q: FloatArray  # joint angles [rad] (m for a prismatic joint), shape (n, d)
+    x: FloatArray  # marker positions in the measurement frame [m], shape (n, 3)
+    t: FloatArray | None = None  # times [s], shape (n,), strictly increasing inside a segment, or None
+    cov: FloatArray | None = None  # covariances of x [m²], shape (n, 3, 3), or None
+    segment: NDArray[np.int64] | None = None  # numbers of the runs, shape (n,), or None
+    centres_px: FloatArray | None = None  # (ul, vl, ur, vr) [px], shape (n, 4), or None
+    orientation: FloatArray | None = None  # unit quaternions (x, y, z, w), shape (n, 4), or None
+    # the columns current_<joint> [A] and temperature_<joint> [°C] that are there, each of shape (n,)
     extra: Mapping[str, FloatArray] = field(default_factory=dict)
-    file: Path | None = None
+    file: Path | None = None  # where it was read from, or None
 
     def __post_init__(self) -> None:
         for name in ("q", "x", "t", "cov", "centres_px", "orientation"):
@@ -178,11 +167,7 @@ class Recording:
             raise RecordingError(f"cannot be written: {error.strerror or error}", file=file) from error
 
     def write_csv_to(self, out: TextIO) -> None:
-        """Write CSV to an open file.
-
-        Raises:
-            OSError: that fails.
-        """
+        """Write CSV to an open file; raise OSError if that fails."""
         table = self.to_table()
         integers = frozenset(i for i, name in enumerate(table.names) if name in INTEGER_COLUMNS)
         out.write(",".join(table.names) + "\n")

@@ -49,17 +49,11 @@ class LinkMesh:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What stands around the markers of a recording.
+    """What stands around the markers of a recording."""
 
-    Attributes:
-        robot: the description, with camera and marker where they are.
-        predicted: the marker positions that it predicts in the measurement frame (n, 3) [m].
-        meshes: of the links that have any (STL, OBJ).
-    """
-
-    robot: RobotDescription
-    predicted: FloatArray
-    meshes: Mapping[str, Sequence[LinkMesh]] = field(default_factory=dict)
+    robot: RobotDescription  # the description, with camera and marker where they are
+    predicted: FloatArray  # the marker positions that it predicts in the measurement frame (n, 3) [m]
+    meshes: Mapping[str, Sequence[LinkMesh]] = field(default_factory=dict)  # of the links that have any (STL, OBJ)
 
 
 def write_rerun(recording: Recording, file: Path, scene: Scene | None = None) -> None:

@@ -49,21 +49,13 @@ _FEW = 200
 
 @dataclass(frozen=True)
 class BagTopics:
-    """Topics and names to read from a bag; None where the bag leaves no choice.
+    """Topics and names to read from a bag; None where the bag leaves no choice."""
 
-    Attributes:
-        joints: topic of the joint states.
-        marker: topic of the marker's positions.
-        frame: the marker's frame, where it comes by TF.
-        names: the joints' names in the bag, where they differ.
-        delay_s: delay of the time stamps of the marker's positions [s].
-    """
-
-    joints: str | None = None
-    marker: str | None = None
-    frame: str | None = None
-    names: Mapping[str, str] = field(default_factory=dict)
-    delay_s: float = 0.0
+    joints: str | None = None  # topic of the joint states
+    marker: str | None = None  # topic of the marker's positions
+    frame: str | None = None  # the marker's frame, where it comes by TF
+    names: Mapping[str, str] = field(default_factory=dict)  # the joints' names in the bag, where they differ
+    delay_s: float = 0.0  # delay of the time stamps of the marker's positions [s]
 
 
 def is_bag(source: Path) -> bool:
@@ -75,7 +67,6 @@ def read_bag(source: Path, joints: tuple[str, ...], topics: BagTopics, marker: M
     """Read joint states and positions of the marker, with the joints interpolated to the marker's times.
 
     Args:
-        joints: the robot's joints, in the order of q.
         marker: positions from elsewhere; the bag's are not read then.
 
     Raises:

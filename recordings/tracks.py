@@ -32,36 +32,23 @@ class _Settings:
 
 @dataclass(frozen=True, eq=False)
 class JointTrack:
-    """Readings of all joints.
+    """Readings of all joints."""
 
-    Attributes:
-        t: times (n,) [s].
-        q: (n, d) [rad, m].
-        run: which readings belong together (n,): nothing is interpolated between two runs, whose clocks differ.
-    """
-
-    t: FloatArray
-    q: FloatArray
+    t: FloatArray  # times (n,) [s]
+    q: FloatArray  # (n, d) [rad, m]
+    # which readings belong together (n,): nothing is interpolated between two runs, whose clocks differ
     run: NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
 class MarkerTrack:
-    """Positions of the marker in the measurement frame.
+    """Positions of the marker in the measurement frame."""
 
-    Attributes:
-        t: times (m,) on the clock of the joints [s].
-        x: (m, 3) [m].
-        cov: covariances (m, 3, 3) [m²], or None.
-        orientation: unit quaternions (m, 4), x, y, z, w, or None.
-        run: as in `JointTrack` (m,).
-    """
-
-    t: FloatArray
-    x: FloatArray
-    run: NDArray[np.int64]
-    cov: FloatArray | None = None
-    orientation: FloatArray | None = None
+    t: FloatArray  # times (m,) on the clock of the joints [s]
+    x: FloatArray  # (m, 3) [m]
+    run: NDArray[np.int64]  # as in `JointTrack` (m,)
+    cov: FloatArray | None = None  # covariances (m, 3, 3) [m²], or None
+    orientation: FloatArray | None = None  # unit quaternions (m, 4), x, y, z, w, or None
 
     def earlier(self, delay_s: float) -> MarkerTrack:
         """Return the track whose times are `delay_s` earlier: the positions were stamped that late."""

@@ -27,18 +27,12 @@ from .urdf import UrdfJoint, inverse, joint_motion, standing
 
 @dataclass(frozen=True, eq=False)
 class CalibratedGeometry:
-    """Learnt values of the poses in the robot's files.
+    """Learnt values of the poses in the robot's files."""
 
-    Attributes:
-        T_parent_joint: poses (4, 4) of the learnt joints' frames in their parent links, by joint; the axes in these
-            frames are unchanged.
-        T_parent_camera: pose (4, 4) of the measurement frame in the camera's parent link.
-        marker_xyz: the marker (3,) in its link [m].
-    """
-
+    # poses (4, 4) of the learnt joints' frames in their parent links, by joint; the axes in these frames are unchanged
     T_parent_joint: dict[str, FloatArray]
-    T_parent_camera: FloatArray
-    marker_xyz: FloatArray
+    T_parent_camera: FloatArray  # pose (4, 4) of the measurement frame in the camera's parent link
+    marker_xyz: FloatArray  # the marker (3,) in its link [m]
 
     @classmethod
     def of(
@@ -47,8 +41,6 @@ class CalibratedGeometry:
         """Return the geometry of `chain`, split as the module describes.
 
         Args:
-            robot: the nominal model that the chain was learnt from.
-            chain: the learnt one, with the axes and joint types of the nominal one.
             T_measured_nominal: camera displacement (4, 4), as in `kbmaps.ChainReport`.
             zeros: joint offsets (d,) [rad, m], as in `kbmaps.ChainReport`.
         """

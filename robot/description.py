@@ -93,24 +93,17 @@ class CameraSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class RobotDescription:
-    """A robot as its files describe it: the nominal model.
+    """A robot as its files describe it: the nominal model."""
 
-    Attributes:
-        file: robot.toml.
-        tree: the URDF.
-        chain: measurement frame to marker over `joints`.
-        lower, upper: joint limits [rad or m], shape (d,).
-        calibration: the stereo pair or the one camera, or None when [camera] describes neither.
-    """
-
-    file: Path
+    file: Path  # robot.toml
     robot: RobotSection
     camera: CameraSection
     tree: UrdfTree
-    chain: RigidChain
+    chain: RigidChain  # measurement frame to marker over `joints`
+    # lower, upper: joint limits [rad or m], shape (d,)
     lower: FloatArray
     upper: FloatArray
-    calibration: StereoCalibration | None
+    calibration: StereoCalibration | None  # the stereo pair or the one camera, or None when [camera] describes neither
 
     @classmethod
     def load(cls, file: Path) -> RobotDescription:

@@ -41,15 +41,10 @@ LARGEST_OFFSET: Mapping[Make, int] = {"feetech": 2047, "dynamixel": 1_044_479}
 
 @dataclass(frozen=True, slots=True)
 class LeRobotArm:
-    """An arm that LeRobot supports.
+    """An arm that LeRobot supports."""
 
-    Attributes:
-        make: of its servos.
-        models: of the motors, by their names in LeRobot; their IDs count from 1 in this order.
-    """
-
-    make: Make
-    models: Mapping[str, str]
+    make: Make  # of its servos
+    models: Mapping[str, str]  # of the motors, by their names in LeRobot; their IDs count from 1 in this order
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -122,9 +117,6 @@ Calibrations = Mapping[str, MotorCalibration]
 def read_calibration(file: Path, motors: Sequence[str] = ()) -> dict[str, MotorCalibration]:
     """Read LeRobot's calibration of an arm, by motor.
 
-    Args:
-        motors: those that have to be there.
-
     Raises:
         ConfigError: it cannot be read, is of an older LeRobot, or a number in it cannot be.
     """
@@ -181,16 +173,11 @@ class JointServo:
 
 @dataclass(frozen=True, slots=True)
 class Correction:
-    """A joint offset put into a motor's calibration.
-
-    Attributes:
-        offset_rad: to be added to the joint's readings.
-        ticks: the whole ticks nearest to it, which the servo reports more.
-    """
+    """A joint offset put into a motor's calibration."""
 
     motor: str
-    offset_rad: float
-    ticks: int
+    offset_rad: float  # to be added to the joint's readings
+    ticks: int  # the whole ticks nearest to it, which the servo reports more
     before: MotorCalibration
     after: MotorCalibration
 

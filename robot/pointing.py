@@ -28,7 +28,6 @@ class Pointing:
     """Steps of the gazing joints towards the marker, for any model of its position.
 
     Args:
-        calibration: of the stereo cameras.
         joints: indices of the gazing joints in q.
         lower, upper: limits of these joints [rad] (g,).
     """

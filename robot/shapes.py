@@ -17,21 +17,13 @@ _SIZES = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "lengt
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A visual shape of a link.
+    """A visual shape of a link."""
 
-    Attributes:
-        kind: box, sphere, cylinder, capsule or mesh. Cylinders and capsules lie along z.
-        sizes: edges of a box; radius; radius and length [m]; of a mesh the factors of x, y and z.
-        T_link_shape: its pose (4, 4).
-        rgba: its colour; None where the URDF gives none.
-        mesh: name of the mesh's file, as the URDF has it; empty for other kinds.
-    """
-
-    kind: str
-    sizes: tuple[float, ...]
-    T_link_shape: FloatArray
-    rgba: tuple[float, ...] | None
-    mesh: str = ""
+    kind: str  # box, sphere, cylinder, capsule or mesh. Cylinders and capsules lie along z.
+    sizes: tuple[float, ...]  # edges of a box; radius; radius and length [m]; of a mesh the factors of x, y and z
+    T_link_shape: FloatArray  # its pose (4, 4)
+    rgba: tuple[float, ...] | None  # its colour; None where the URDF gives none
+    mesh: str = ""  # name of the mesh's file, as the URDF has it; empty for other kinds
 
 
 def link_shapes(root: Any) -> dict[str, list[Shape]]:

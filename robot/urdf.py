@@ -31,59 +31,38 @@ MOST_QUOTED = 60  # characters of a wrong attribute in a message: one line of a 
 
 @dataclass(frozen=True, slots=True)
 class UrdfJoint:
-    """One joint of a URDF.
+    """One joint of a URDF."""
 
-    Attributes:
-        name: of the joint.
-        kind: revolute, continuous, prismatic or fixed.
-        parent, child: its links.
-        T_parent_joint: pose of the joint's frame in its parent link at zero, shape (4, 4).
-        axis: unit axis in the joint's frame, shape (3,).
-        lower, upper: limits [rad or m]; ±π where a revolute joint has none.
-        mimics: it moves with another joint, as the second finger of a gripper does.
-    """
-
-    name: str
-    kind: str
+    name: str  # of the joint
+    kind: str  # revolute, continuous, prismatic or fixed
+    # parent, child: its links
     parent: str
     child: str
-    T_parent_joint: FloatArray
-    axis: FloatArray
+    T_parent_joint: FloatArray  # pose of the joint's frame in its parent link at zero, shape (4, 4)
+    axis: FloatArray  # unit axis in the joint's frame, shape (3,)
+    # lower, upper: limits [rad or m]; ±π where a revolute joint has none
     lower: float
     upper: float
-    mimics: bool = False
+    mimics: bool = False  # it moves with another joint, as the second finger of a gripper does
 
 
 @dataclass(frozen=True, slots=True)
 class PointMass:
-    """Mass of a link.
+    """Mass of a link."""
 
-    Attributes:
-        mass_kg: the link's mass [kg].
-        centre: its centre of mass in the link's frame [m], shape (3,).
-    """
-
-    mass_kg: float
-    centre: FloatArray
+    mass_kg: float  # the link's mass [kg]
+    centre: FloatArray  # its centre of mass in the link's frame [m], shape (3,)
 
 
 @dataclass(frozen=True, slots=True)
 class UrdfTree:
-    """The joints of one URDF file by name; every link but the root is the child of exactly one joint.
+    """The joints of one URDF file by name; every link but the root is the child of exactly one joint."""
 
-    Attributes:
-        file: path of the URDF.
-        name: of the robot.
-        links: names.
-        joints: by name.
-        masses: of the links that state one, by link.
-    """
-
-    file: Path
-    name: str
-    links: tuple[str, ...]
-    joints: dict[str, UrdfJoint]
-    masses: dict[str, PointMass] = field(default_factory=dict)
+    file: Path  # path of the URDF
+    name: str  # of the robot
+    links: tuple[str, ...]  # names
+    joints: dict[str, UrdfJoint]  # by name
+    masses: dict[str, PointMass] = field(default_factory=dict)  # of the links that state one, by link
 
     @classmethod
     def load(cls, file: Path) -> UrdfTree:
@@ -101,6 +80,12 @@ class UrdfTree:
         tree = cls(file, root.get("name", ""), tuple(links), joints, masses)
         tree._check()
         return tree
+
+    @property
+    def root(self) -> str:
+        """The link that is the child of no joint."""
+        children = {joint.child for joint in self.joints.values()}
+        return next(link for link in self.links if link not in children)
 
     def joint(self, name: str) -> UrdfJoint:
         """Return the joint called `name`.
@@ -181,8 +166,6 @@ def chain_between(
     Args:
         joints: names in the order of q; each has to lie between the two links.
         held_at: positions [rad or m] of the other joints on the path; 0 where not named.
-        start: the link that carries the camera.
-        end: the link that carries the marker.
         T_start_camera: pose of the measurement frame in `start`, shape (4, 4).
         marker_xyz: the marker in `end` [m], shape (3,).
 

@@ -20,25 +20,15 @@ from bodyschema.sim_backend.geometry import cross_matrix
 
 
 class PhysicsUrdf(msgspec.Struct, frozen=True):
-    """A URDF and its meshes, which lie beside it.
+    """A URDF and its meshes, which lie beside it."""
 
-    Attributes:
-        text: the URDF.
-        meshes: files by name.
-        said: what is not as the robot's own URDF has it, in sentences.
-    """
-
-    text: str
-    meshes: dict[str, bytes] = {}
-    said: tuple[str, ...] = ()
+    text: str  # the URDF
+    meshes: dict[str, bytes] = {}  # files by name
+    said: tuple[str, ...] = ()  # what is not as the robot's own URDF has it, in sentences
 
 
 def load_pybullet() -> Any:
-    """Import and return the module pybullet.
-
-    Raises:
-        ConfigError: it is not installed.
-    """
+    """Import and return the module pybullet; raise ConfigError if it is not installed."""
     try:
         with _quiet():
             return importlib.import_module("pybullet")
@@ -50,7 +40,6 @@ class Body:
     """One robot in its own pybullet world. All angles are true angles of the named joints.
 
     Args:
-        urdf: the robot, with its meshes.
         joints: names of the joints that `set_angles` and `angles` are about.
         gravity: downward acceleration [m/s²].
         dt: length of one step [s].

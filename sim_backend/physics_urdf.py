@@ -22,7 +22,6 @@ from bodyschema.robot.rpy import rpy_of
 from bodyschema.robot.shapes import floats, rgba_of
 from bodyschema.robot.suggest import first_few
 from bodyschema.robot.urdf import MOVING, UrdfJoint, UrdfTree
-from bodyschema.sim_backend.truth import root_link
 
 from .bullet import PhysicsUrdf
 from .geometry import turn_of_z
@@ -105,7 +104,7 @@ class _Writer:
             self._add_link(robot, link)
         for joint in tree.joints.values():
             self._add_joint(robot, joint)
-        _add_world(robot, root_link(tree))
+        _add_world(robot, tree.root)
         files, coarser = self._meshes.files()
         self._drop_vanished(robot, files)
         said = tuple(sentence for sentence in (*self._said(), coarser) if sentence)

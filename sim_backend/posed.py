@@ -117,11 +117,7 @@ class PosedWorld:
                 self._ask_ahead()
 
     def next_reading(self, timeout_s: float) -> JointReading:  # noqa: ARG002 - nothing to wait for
-        """Return the encoders' reading in the next posture.
-
-        Raises:
-            SourceEnded: there are no more.
-        """
+        """Return the encoders' reading in the next posture; raise SourceEnded if there are no more."""
         if self._read == len(self._postures):
             raise SourceEnded("the encoders were read in all postures")
         q = self._encoders.read(self._postures[self._read] - self._truth.offsets)

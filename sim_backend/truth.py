@@ -25,25 +25,16 @@ _METRES_PER_RADIAN = 0.1
 
 @dataclass(frozen=True)
 class TrueRobot:
-    """The robot that is simulated.
+    """The robot that is simulated."""
 
-    Attributes:
-        robot: its description, the nominal model.
-        beyond: the robot with those effects, and the residual, that no rigid chain can represent.
-        tree: its true kinematics; joints that are not learnt are locked (kind fixed, their position in their origin).
-        offsets: reported minus true angle [rad or m], shape (d,), in the order of `robot.joints`.
-        T_parent_camera: true pose of the left eye in the camera's parent link, shape (4, 4).
-        tool_error: true minus described position of the marker in the marker link [m], shape (3,).
-        tool_turn: rotation of the marker in the marker link, shape (3, 3); the description has no rotation.
-    """
-
-    robot: RobotDescription
-    beyond: Simulation
+    robot: RobotDescription  # its description, the nominal model
+    beyond: Simulation  # the robot with those effects, and the residual, that no rigid chain can represent
+    # its true kinematics; joints that are not learnt are locked (kind fixed, their position in their origin)
     tree: UrdfTree
-    offsets: FloatArray
-    T_parent_camera: FloatArray
-    tool_error: FloatArray
-    tool_turn: FloatArray
+    offsets: FloatArray  # reported minus true angle [rad or m], shape (d,), in the order of `robot.joints`
+    T_parent_camera: FloatArray  # true pose of the left eye in the camera's parent link, shape (4, 4)
+    tool_error: FloatArray  # true minus described position of the marker in the marker link [m], shape (3,)
+    tool_turn: FloatArray  # rotation of the marker in the marker link, shape (3, 3); the description has no rotation
 
     @classmethod
     def draw(cls, robot: RobotDescription, config: SimConfig, extension: Simulation | None = None) -> TrueRobot:
@@ -146,18 +137,12 @@ class JointRoles:
     The path from the cameras to the marker goes up to a common link and then down. Joints on the way up carry the
     cameras: they gaze. Joints on the way down carry the marker: they are guided. If there is no way down (cameras on
     the hand, marker fixed in the world), the joints on the way up are guided.
-
-    Attributes:
-        gaze: indices of the gazing joints in q.
-        guided: indices of the guided joints in q, in their order from the robot's root.
-        wrist: the link that carries the marker (or the hand's cameras); the hand holds it.
-        elbow: the link of the guided joint half-way to the wrist, which the other hand holds.
     """
 
-    gaze: tuple[int, ...]
-    guided: tuple[int, ...]
-    wrist: str
-    elbow: str
+    gaze: tuple[int, ...]  # indices of the gazing joints in q
+    guided: tuple[int, ...]  # indices of the guided joints in q, in their order from the robot's root
+    wrist: str  # the link that carries the marker (or the hand's cameras); the hand holds it
+    elbow: str  # the link of the guided joint half-way to the wrist, which the other hand holds
 
     @classmethod
     def of(cls, robot: RobotDescription) -> JointRoles:
@@ -178,15 +163,9 @@ class JointRoles:
         return cls(gaze=gaze, guided=guided, wrist=wrist, elbow=elbow)
 
 
-def root_link(tree: UrdfTree) -> str:
-    """Return the link that is the child of no joint."""
-    children = {joint.child for joint in tree.joints.values()}
-    return next(link for link in tree.links if link not in children)
-
-
 def chain_from_root(truth: TrueRobot, roles: JointRoles, link: str) -> tuple[RigidChain, tuple[int, ...]]:
     """Return the true chain from the root to a guided link, over reported angles, and its joints' indices in q."""
-    root = root_link(truth.tree)
+    root = truth.tree.root
     on_way = {joint.name for joint, _ in truth.tree.path(root, link)}
     indices = tuple(k for k in roles.guided if truth.robot.joints[k] in on_way)
     names = tuple(truth.robot.joints[k] for k in indices)
@@ -197,6 +176,6 @@ def chain_from_root(truth: TrueRobot, roles: JointRoles, link: str) -> tuple[Rig
 def _origin(tree: UrdfTree, link: str) -> FloatArray:
     """Return the position (3,) of a link's frame in the root link with all joints at zero [m]."""
     T = np.eye(4)
-    for joint, _ in tree.path(root_link(tree), link):
+    for joint, _ in tree.path(tree.root, link):
         T = T @ joint.T_parent_joint
     return T[:3, 3]

@@ -241,18 +241,13 @@ def true_chain(
 
     Args:
         marker_xyz: the described marker of the tool in the hand [m]; None for that of robot.toml.
-        extension: the robot with effects; those that no rigid chain can represent are left out.
     """
     described = robot.robot.marker_xyz if marker_xyz is None else marker_xyz
     return TrueRobot.draw(robot, config, extension).chain(np.array(described, dtype=np.float64))
 
 
 def stereo_calibration(robot: RobotDescription) -> StereoCalibration:
-    """Return the calibration of the stereo pair, or single camera, in [camera].
-
-    Raises:
-        ConfigError: there is none.
-    """
+    """Return the calibration of the stereo pair, or single camera, in [camera]; raise ConfigError if there is none."""
     if robot.calibration is None:
         raise ConfigError(
             "the simulation renders images, but [camera] does not describe how the cameras see",

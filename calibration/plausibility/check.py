@@ -64,7 +64,6 @@ def plausibility(
     """Check pairs q (n, d) [rad, m] and x (n, 3) [m] before a fit to them is trusted.
 
     Args:
-        robot: the robot's description.
         q: joint values (n, d) [rad, m].
         x: positions (n, 3) [m].
         chain: the nominal chain if it is not the robot's.
@@ -88,25 +87,15 @@ def plausibility(
 
 @dataclass(frozen=True, slots=True)
 class _Check:
-    """Check of one recording.
+    """Check of one recording."""
 
-    Attributes:
-        robot: the robot's description.
-        search: the finished search over readings of the columns.
-        as_it_is: the columns as they are.
-        best: the simplest among the best readings.
-        others: others nearly as simple.
-        spread: of the positions [m].
-        noise: largest distance that the known noise explains [m].
-    """
-
-    robot: RobotDescription
-    search: ReadingSearch
-    as_it_is: Reading
-    best: Reading
-    others: list[Reading]
-    spread: float
-    noise: float
+    robot: RobotDescription  # the robot's description
+    search: ReadingSearch  # the finished search over readings of the columns
+    as_it_is: Reading  # the columns as they are
+    best: Reading  # the simplest among the best readings
+    others: list[Reading]  # others nearly as simple
+    spread: float  # of the positions [m]
+    noise: float  # largest distance that the known noise explains [m]
 
     def rows_and_size(self, q: FloatArray, x: FloatArray) -> Plausibility:
         """Return what is wrong with the rows or the size of all pairs q (n, d) [rad, m] and x (n, 3) [m]."""
@@ -203,12 +192,7 @@ class _Check:
         return Plausibility(warnings=(f"perhaps {text}{either}",))
 
     def _as_it_is(self, fit: ReadingFit, held: tuple[Reading, ReadingFit] | None) -> Plausibility:
-        """Report on columns that are right, save for the zero of the last joint and the measurement frame.
-
-        Args:
-            fit: of the columns as they are.
-            held: a reading and its fit if the known marker shows it.
-        """
+        """Report on columns that are right, save for the zero of the last joint and the measurement frame."""
         search, names = self.search, self.robot.joints
         turned = None
         if self.robot.camera.pose_known:

@@ -74,14 +74,7 @@ def reordered_quaternions(
 
 
 def _errors_rad(chain: RigidChain, q: FloatArray, rotation: FloatArray, turns: FloatArray) -> dict[str, float]:
-    """Return the median angle [rad] between the arm's hand and quaternions (n, 4), for each way to read them.
-
-    Args:
-        chain: the nominal chain.
-        q: joint values (n, d) [rad, m], offsets included.
-        rotation: of the nominal measurement frame in the real one (3, 3).
-        turns: the columns qx, qy, qz, qw.
-    """
+    """Return the median angle [rad] between the arm's hand and quaternions (n, 4), for each way to read them."""
     plain, first, conjugate = turns, np.roll(turns, -1, axis=1), np.array([-1.0, -1.0, -1.0, 1.0])
     readings = zip((_AS_IT_IS, *_REMEDIES), (plain, first, plain * conjugate, first * conjugate), strict=True)
     hand = rotation @ chain.orientation(q)

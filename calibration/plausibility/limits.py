@@ -88,11 +88,6 @@ def limits_text(robot: RobotDescription, joint: int) -> str:
 def require_units(robot: RobotDescription, recording: Recording, file: Path) -> None:
     """Refuse angles and positions that no arm has in radians and metres.
 
-    Args:
-        robot: the robot's description.
-        recording: the recording.
-        file: its file.
-
     Raises:
         RecordingError: angles far beyond the limits, positions farther apart than the arm reaches, or times in which
             an arm hardly moves.

@@ -43,10 +43,6 @@ def several_markers(search: ReadingSearch, before: float) -> Plausibility | None
 
     The arm is placed by a few rows at a time (Fischler and Bolles 1981): where these are of one marker, the others lie
     at few places on the hand.
-
-    Args:
-        search: the search over readings, which found none better than the columns as they are.
-        before: distance of the pairs as they are [m].
     """
     rng, rows = np.random.default_rng(_SETTINGS.seed), len(search.q)
     if rows < 2 * _SETTINGS.chosen:

@@ -20,15 +20,10 @@ _APART_RAD = math.radians(10.0)
 
 @dataclass(frozen=True, slots=True)
 class Poses:
-    """Poses that are far from each other, and the rows near each.
+    """Poses that are far from each other, and the rows near each."""
 
-    Attributes:
-        rows: the row of each pose (k,).
-        of_rows: index of the nearest pose for each row (n,).
-    """
-
-    rows: NDArray[np.intp]
-    of_rows: NDArray[np.intp]
+    rows: NDArray[np.intp]  # the row of each pose (k,)
+    of_rows: NDArray[np.intp]  # index of the nearest pose for each row (n,)
 
     @classmethod
     def of(cls, chain: RigidChain, q: FloatArray) -> Poses:
@@ -52,7 +47,6 @@ class Poses:
 
         Args:
             gain: logarithm of the ratio of their distances.
-            joints: of the arm.
             share: of the rows, by which the distances are measured.
         """
         return gain * max(3.0 * share * len(self.rows) - joints - 9.0, 0.0)

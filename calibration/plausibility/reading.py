@@ -25,26 +25,17 @@ class Reading:
     """One way to read the columns; all defaults except the order leave them as they are.
 
     A joint is its column times its sign, plus its quarter turns, plus what its column lacks of the joint before.
-
-    Attributes:
-        order: index of the column of each joint.
-        signs: 1 or -1 for each joint.
-        quarters: quarter turns to add to each joint, 2 to -1.
-        mirrored: the positions are given in a left-handed frame.
-        unit: of the positions.
-        degrees: the angles are in degrees.
-        millimetres: the readings of prismatic joints are in millimetres.
-        carried: 1 or -1 for a joint whose column lacks the angle of the joint before, or has it twice; else 0. So do
-            arms whose elbow counts from the horizontal, as behind a parallelogram. Empty where no joint does.
     """
 
-    order: tuple[int, ...]
-    signs: tuple[int, ...]
-    quarters: tuple[int, ...]
-    mirrored: bool = False
-    unit: str = METRES
-    degrees: bool = False
-    millimetres: bool = False
+    order: tuple[int, ...]  # index of the column of each joint
+    signs: tuple[int, ...]  # 1 or -1 for each joint
+    quarters: tuple[int, ...]  # quarter turns to add to each joint, 2 to -1
+    mirrored: bool = False  # the positions are given in a left-handed frame
+    unit: str = METRES  # of the positions
+    degrees: bool = False  # the angles are in degrees
+    millimetres: bool = False  # the readings of prismatic joints are in millimetres
+    # 1 or -1 for a joint whose column lacks the angle of the joint before, or has it twice; else 0. So do arms whose
+    # elbow counts from the horizontal, as behind a parallelogram. Empty where no joint does.
     carried: tuple[int, ...] = ()
 
     @classmethod
@@ -137,7 +128,6 @@ class Reading:
         """Return the changes in words, as in `the columns q1 and q2 are exchanged`.
 
         Args:
-            joints: their names.
             zeros: joint offsets (d,) besides the quarter turns [rad, m].
         """
         return _listed([looks for looks, _ in self._said(joints, zeros)])

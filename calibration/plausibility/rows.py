@@ -38,10 +38,6 @@ def few_outliers(search: ReadingSearch, before: float) -> str:
     """Return a warning if few rows place the arm without some of them; else "".
 
     Of many rows, outliers do not keep the others from placing the arm.
-
-    Args:
-        search: the search over readings, which found none; its rows are all.
-        before: distance of the pairs as they are [m].
     """
     rows, joints = len(search.q), search.chain.joints
     most = rows - math.ceil(MEASURED * rows)

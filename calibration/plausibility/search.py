@@ -65,35 +65,25 @@ _SETTINGS = _Settings()
 
 @dataclass(frozen=True, slots=True)
 class ReadingFit:
-    """Quality of a reading's fit.
+    """Quality of a reading's fit."""
 
-    Attributes:
-        error: RMS distance of the nearest pairs, in the recording's own unit.
-        nats: minus the log-likelihood, what zeros and marker cost included.
-        zeros: added to the joints (d,) beside the quarter turns [rad, m].
-        tool_m: how far from its place the marker is [m].
-        rotation: of the nominal measurement frame in the real one (3, 3).
-    """
-
-    error: float
-    nats: float
-    zeros: FloatArray
-    tool_m: float
-    rotation: FloatArray
+    error: float  # RMS distance of the nearest pairs, in the recording's own unit
+    nats: float  # minus the log-likelihood, what zeros and marker cost included
+    zeros: FloatArray  # added to the joints (d,) beside the quarter turns [rad, m]
+    tool_m: float  # how far from its place the marker is [m]
+    rotation: FloatArray  # of the nominal measurement frame in the real one (3, 3)
 
 
 class ReadingSearch:
     """Search over readings of the same pairs, with their fits.
 
     Args:
-        chain: the nominal chain.
         q, x: rows to be read, (n, d) [rad, m] and (n, 3) [m].
         exact_m: distances below this are not distinguished [m].
         pose_known: the camera pose is known.
 
     Attributes:
         fits: the best fit of each reading so far.
-        poses: of the rows.
     """
 
     def __init__(self, chain: RigidChain, q: FloatArray, x: FloatArray, exact_m: float, pose_known: bool) -> None:
@@ -326,8 +316,6 @@ class ReadingSearch:
         """Fit readings, and keep the best fit of each.
 
         Args:
-            new: the readings.
-            held: keep the joint offsets at nominal.
             tools: marker offsets (s, 3) [m] to start from.
         """
         std = self._std * (_SETTINGS.held if held else 1.0)

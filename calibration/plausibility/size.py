@@ -43,17 +43,11 @@ _SETTINGS = _Settings()
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """Estimated size of measured positions, as a multiple of the true ones.
+    """Estimated size of measured positions, as a multiple of the true ones."""
 
-    Attributes:
-        factor: the multiple.
-        log_sigma: 1-sigma of its logarithm, with the tolerances of links, joint offsets and marker integrated over.
-        error: RMS distance of the nearest pairs from the nominal chain of that size, in the recording's unit.
-    """
-
-    factor: float
-    log_sigma: float
-    error: float
+    factor: float  # the multiple
+    log_sigma: float  # 1-sigma of its logarithm, with the tolerances of links, joint offsets and marker integrated over
+    error: float  # RMS distance of the nearest pairs from the nominal chain of that size, in the recording's unit
 
     @property
     def sigmas(self) -> float:
@@ -65,7 +59,6 @@ def of_another_size(size: Size, spread: float, before: float, best: float) -> Pl
     """Return what to say of positions that are too large or too small for the arm; None if they are not.
 
     Args:
-        size: the estimated size.
         spread: of the positions [m].
         before: distance of the pairs as they are [m].
         best: the same, in the best reading of the columns.
@@ -200,7 +193,6 @@ def _posteriors(
         effects: of numbers of variance 1 (p, k).
         within: residuals and the effect of the size, as far as the parameters can explain them (2, p).
         beyond: products of the rest (2, 2).
-        count: of coordinates.
     """
     directions, sizes, _ = np.linalg.svd(effects, full_matrices=False)
     within = within @ directions

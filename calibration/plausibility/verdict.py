@@ -38,23 +38,15 @@ THRESHOLDS = _Thresholds()
 
 @dataclass(frozen=True, slots=True)
 class Plausibility:
-    """Result of the plausibility check.
+    """Result of the plausibility check."""
 
-    Attributes:
-        refusal: why the recording cannot be of this robot as it is, or None.
-        remedy: what to do about that.
-        misread: another reading of the columns was found that fits.
-        better: so many times better than the columns as they are, or than those of any real arm where none fits.
-        warnings: sentences about possible problems.
-        undirected: joints whose sign these pairs do not determine.
-    """
-
-    refusal: str | None = None
-    remedy: str = ""
-    misread: bool = False
+    refusal: str | None = None  # why the recording cannot be of this robot as it is, or None
+    remedy: str = ""  # what to do about that
+    misread: bool = False  # another reading of the columns was found that fits
+    # so many times better than the columns as they are, or than those of any real arm where none fits
     better: float = 1.0
-    warnings: tuple[str, ...] = ()
-    undirected: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  # sentences about possible problems
+    undirected: tuple[str, ...] = ()  # joints whose sign these pairs do not determine
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -64,10 +56,6 @@ class Plausibility:
 
     def require(self, file: Path | str, *, force: bool) -> tuple[str, ...]:
         """Return the warnings for a recording that is fitted.
-
-        Args:
-            file: the recording's file.
-            force: fit what would be refused.
 
         Raises:
             RecordingError: it cannot be of this robot as it is.

@@ -12,11 +12,7 @@ _WRITERS = {".pdf": pdf, ".svg": svg}
 
 
 def write_page(page: Page, out: Path) -> None:
-    """Write a page as PDF or SVG.
-
-    Raises:
-        ConfigError: the file's ending is neither, or it cannot be written.
-    """
+    """Write a page as PDF or SVG; raise ConfigError if the file's ending is neither, or it cannot be written."""
     writer = _WRITERS.get(out.suffix.lower())
     if writer is None:
         raise ConfigError(f"{out}: neither .pdf nor .svg", remedy="Name a file that ends so")

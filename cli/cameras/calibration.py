@@ -290,11 +290,7 @@ def checked(file: Path, images: Images, board: Board) -> tuple[CheckFile, str]:
 
 
 def pair_in(file: Path) -> StereoRig:
-    """Return the stereo calibration in `file`.
-
-    Raises:
-        CalibrationError: it is of one camera only.
-    """
+    """Return the stereo calibration in `file`; raise CalibrationError if it is of one camera only."""
     rig = read_rig(file)
     if isinstance(rig, OneEyeRig):
         raise CalibrationError(
@@ -305,7 +301,6 @@ def pair_in(file: Path) -> StereoRig:
 
 
 def check_figures(found: Check) -> CheckFile:
-    """Return the figures of a check."""
     return CheckFile(
         holds=found.holds,
         wrong=list(found.wrong),

@@ -35,22 +35,14 @@ MORE_VIEWS = 4
 
 @dataclass(frozen=True)
 class Shown:
-    """Feedback for the person who holds the board.
+    """Feedback for the person who holds the board."""
 
-    Attributes:
-        coverage: what the views cover. views: how many were taken.
-        look: the last pair of images; None before any, and while the cameras are lost.
-        trouble: what is wrong with the cameras, and what to do.
-        refusal: why the calibration was not good enough, when it was last tried.
-        doing: what takes its time; empty while views are taken.
-    """
-
-    coverage: Coverage
-    views: int
-    look: Look | None = None
-    trouble: tuple[str, ...] = ()
-    refusal: str = ""
-    doing: str = ""
+    coverage: Coverage  # what the views cover
+    views: int  # number of views taken
+    look: Look | None = None  # the last pair of images; None before any, and while the cameras are lost
+    trouble: tuple[str, ...] = ()  # what is wrong with the cameras, and what to do
+    refusal: str = ""  # why the calibration was not good enough, when it was last tried
+    doing: str = ""  # what takes its time; empty while views are taken
 
     @property
     def wish(self) -> str:

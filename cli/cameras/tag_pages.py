@@ -26,23 +26,16 @@ _MOST_TAGS = 100
 
 @dataclass(frozen=True)
 class Tags:
-    """The tags to print.
+    """The tags to print."""
 
-    Attributes:
-        shape: single tags, or one body of them.
-        ids: numbers of the tags as in 0-5,9; None: as many as the shape has, from 0 on.
-        side_mm: side of the black squares.
-        columns, rows: tags of a plate, or squares of a board.
-        fold_deg: fold angle of a plate [°].
-    """
-
-    shape: ShapeName = "tags"
-    ids: str | None = None
+    shape: ShapeName = "tags"  # single tags, or one body of them
+    ids: str | None = None  # numbers of the tags as in 0-5,9; None: as many as the shape has, from 0 on
     dictionary: Dictionary = "apriltag_36h11"
-    side_mm: float = 40.0
+    side_mm: float = 40.0  # side of the black squares
+    # columns, rows: tags of a plate, or squares of a board
     columns: int = 2
     rows: int = 1
-    fold_deg: float = 0.0
+    fold_deg: float = 0.0  # fold angle of a plate [°]
 
     @property
     def body(self) -> Shape | None:

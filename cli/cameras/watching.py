@@ -39,13 +39,7 @@ class Watching:
         count: int | None = None,
         clock: Clock | None = None,
     ) -> None:
-        """Store the settings; the caller of `step` opens `pictures`.
-
-        Args:
-            show: called with each picture as JPEG.
-            every_s: minimum interval between pictures [s].
-            count: number of pictures to show.
-        """
+        """Store the settings; the caller of `step` opens `pictures`."""
         self._pictures, self._show, self._every_s = pictures, show, every_s
         self._clock = SystemClock() if clock is None else clock
         self._left = math.inf if count is None else count

@@ -200,11 +200,7 @@ class PrintedBoard:
     ] = None
 
     def drawn(self) -> Board:
-        """Return the board in its nominal size.
-
-        Raises:
-            ConfigError: the options describe no valid one.
-        """
+        """Return the board in its nominal size; raise ConfigError if the options describe no valid one."""
         from bodyschema.cli.cameras.calibration import board_of
 
         return board_of(
@@ -216,11 +212,7 @@ class PrintedBoard:
         )
 
     def board(self) -> Board:
-        """Return the board in its printed size.
-
-        Raises:
-            ConfigError: the options describe no valid one.
-        """
+        """Return the board in its printed size; raise ConfigError if the options describe no valid one."""
         from bodyschema.cli.cameras.calibration import as_printed
 
         return as_printed(self.drawn(), self.ruler_mm)

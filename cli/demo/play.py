@@ -119,23 +119,15 @@ POSES = 300
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Result of the evaluation.
+    """Result of the evaluation."""
 
-    Attributes:
-        pairs: number of pairs that the answering model had learnt.
-        error_m: mean distance between prediction and ground truth on held-out poses [m].
-        nominal_m: the same for the nominal model [m].
-        within_sigma: share of coordinates within the predicted 1-sigma.
-        angle_rad: mean angle between predicted and true orientation there [rad]; None if none is learnt.
-        angles_within_sigma: share of the angles' components within the predicted 1-sigma.
-    """
-
-    pairs: int
-    error_m: float
-    nominal_m: float
-    within_sigma: float
+    pairs: int  # number of pairs that the answering model had learnt
+    error_m: float  # mean distance between prediction and ground truth on held-out poses [m]
+    nominal_m: float  # the same for the nominal model [m]
+    within_sigma: float  # share of coordinates within the predicted 1-sigma
+    # mean angle between predicted and true orientation there [rad]; None if none is learnt
     angle_rad: float | None = None
-    angles_within_sigma: float | None = None
+    angles_within_sigma: float | None = None  # share of the angles' components within the predicted 1-sigma
 
 
 class Judge:
@@ -263,7 +255,6 @@ PAIRS_BETWEEN_VERDICTS = 15
 class Snapshot:
     """The data that the view shows."""
 
-    change_after: int
     target: int
     asker: Asker
     phase: str
@@ -274,21 +265,13 @@ class Snapshot:
 
 @dataclass(frozen=True, slots=True)
 class Chapter:
-    """State at the end of one part of the demo.
+    """State at the end of one part of the demo."""
 
-    Attributes:
-        pairs: number of pairs learnt with this part's tool.
-        verdict: errors against the ground truth.
-        claimed_m: predicted error [m], or None.
-        claimed_rad: predicted error of the marker's orientation [rad], or None.
-        outlook: expected gain of further pairs, or None.
-    """
-
-    pairs: int
-    verdict: Verdict
-    claimed_m: float | None
-    claimed_rad: float | None
-    outlook: Outlook | None
+    pairs: int  # number of pairs learnt with this part's tool
+    verdict: Verdict  # errors against the ground truth
+    claimed_m: float | None  # predicted error [m], or None
+    claimed_rad: float | None  # predicted error of the marker's orientation [rad], or None
+    outlook: Outlook | None  # expected gain of further pairs, or None
 
 
 @dataclass(frozen=True, slots=True)
@@ -326,9 +309,9 @@ def play(scene: Scene, *, first: int, second: int, seed: int, show: Callable[[Sn
         learner = stack.enter_context(ZenohSession(connect=endpoints.learner, client=True))
         asker = stack.enter_context(started_asker(scene, seed))
         stage = _Stage(config, daemon, sampler, learner, asker, show, seed)
-        before = stage.learn(first, f"guided by hand, {first} pairs with the first tool", first, first + second)
+        before = stage.learn(first, f"guided by hand, {first} pairs with the first tool", first + second)
         changed_at = stage.change_tool()
-        after = stage.learn(second, "guided by hand, the tool is 250 mm longer now", first, first + second)
+        after = stage.learn(second, "guided by hand, the tool is 250 mm longer now", first + second)
         return Outcome(stage.rows, before, after, changed_at, asker.answers, asker.unanswered)
 
 
@@ -354,9 +337,9 @@ class _Stage:
         self._keys = Keys(self.config.robot.name)
         self._judge = Judge(self.config.robot, self.sampler, self.learner, self.seed)
 
-    def learn(self, pairs: int, phase: str, change_after: int, target: int) -> Chapter:
+    def learn(self, pairs: int, phase: str, target: int) -> Chapter:
         """Wait until the learner has learnt `pairs` pairs with the present tool."""
-        snapshot = Snapshot(change_after, target, self.asker, phase, self._sampler_status(), self._learner_status())
+        snapshot = Snapshot(target, self.asker, phase, self._sampler_status(), self._learner_status())
         begin = snapshot.learner.pairs
         next_verdict, progress_at = begin + 1, time.monotonic()
         while True:

@@ -154,7 +154,6 @@ def prepare(
 
     Args:
         bus: what the joints are read through, from a bench.
-        marker: what is in the hand.
         camera: the stereo pair, or its left eye alone.
 
     Raises:

@@ -46,11 +46,7 @@ FAULTS: Mapping[str, str] = MappingProxyType(
 
 
 class BenchRun:
-    """The emulated servos of a robot.toml behind a port, with a robot.toml that names this port.
-
-    Attributes:
-        stopping: True once a stop was requested.
-    """
+    """The emulated servos of a robot.toml behind a port, with a robot.toml that names this port."""
 
     def __init__(
         self,

@@ -44,28 +44,21 @@ WORDS = (("forward", "back"), ("left", "right"), ("up", "down"))  # REP 103: x, 
 
 
 class JointState(msgspec.Struct, frozen=True):
-    """Current state of one joint.
-
-    Attributes:
-        id: ID of its servo; None if it has none.
-        angle: [rad], as in q of the pairs.
-        velocity: [rad/s]. current: [A], None where it is not measured. temperature_c: None until known.
-        low, high: range since the start [rad].
-        lower, upper: the URDF's limits [rad].
-        within_limits: True if it has always been within them; a wrong sign or zero shows here.
-    """
+    """Current state of one joint."""
 
     joint: str
-    id: int | None
-    angle: float
-    velocity: float
-    current: float | None
-    temperature_c: float | None
+    id: int | None  # ID of its servo; None if it has none
+    angle: float  # [rad], as in q of the pairs
+    velocity: float  # [rad/s]
+    current: float | None  # [A]; None where it is not measured
+    temperature_c: float | None  # None until known
+    # low, high: range since the start [rad]
     low: float
     high: float
+    # lower, upper: the URDF's limits [rad]
     lower: float
     upper: float
-    within_limits: bool
+    within_limits: bool  # True if it has always been within them; a wrong sign or zero shows here
 
     @property
     def range(self) -> JointRange:
@@ -74,20 +67,13 @@ class JointState(msgspec.Struct, frozen=True):
 
 
 class Seen(msgspec.Struct, frozen=True):
-    """Current state of the arm.
-
-    Attributes:
-        moved: the joint moved last, and the marker motion predicted by the URDF; empty before that.
-        health: problems of the servos.
-        trouble: reason why nothing can be read at present, or None.
-        signs_in: where the signs and zeros of the joints are set.
-    """
+    """Current state of the arm."""
 
     joints: tuple[JointState, ...]
-    moved: str
-    health: tuple[str, ...]
-    trouble: str | None
-    signs_in: str
+    moved: str  # the joint moved last, and the marker motion predicted by the URDF; empty before that
+    health: tuple[str, ...]  # problems of the servos
+    trouble: str | None  # reason why nothing can be read at present, or None
+    signs_in: str  # where the signs and zeros of the joints are set
 
 
 class JointsWatch:

@@ -40,18 +40,14 @@ Scan = Callable[[Sequence[int]], Sequence[ScannedBus]]
 
 @dataclass(frozen=True, slots=True)
 class LeRobotServo:
-    """The servo of a joint.
-
-    Attributes:
-        middle_rad: the joint's angle where LeRobot reads 0° [rad].
-    """
+    """The servo of a joint."""
 
     joint: str
     id: int
     model: str
     direction: int
     zero_ticks: float
-    middle_rad: float
+    middle_rad: float  # the joint's angle where LeRobot reads 0° [rad]
 
 
 def lerobot_arm(name: str) -> LeRobotArm:
@@ -84,11 +80,7 @@ def lerobot_robot_toml(arm: LeRobotArm, urdf: Path, robot: Path, calibration: Pa
 
 
 def lerobot_port(arm: LeRobotArm, scan: Scan) -> str:
-    """Return the only port that has all motors of `arm`.
-
-    Raises:
-        ConfigError: none or more than one has.
-    """
+    """Return the only port that has all motors of `arm`; raise ConfigError if none or more than one has."""
     wanted = {(arm.id(name), arm.models[name]) for name in arm.joints}
     scanned = scan([BAUD])
     found = [bus.port for bus in scanned if wanted <= {(servo.id, servo.model) for servo in bus.servos}]
@@ -191,17 +183,11 @@ RECORDINGS = ".recordings"
 
 @dataclass(frozen=True)
 class CorrectedCalibration:
-    """A calibration file with the offsets in it.
+    """A calibration file with the offsets in it."""
 
-    Attributes:
-        file: LeRobot's.
-        motors: all motors as they would be written.
-        changes: what is put into which motor.
-    """
-
-    file: Path
-    motors: Calibrations
-    changes: tuple[Correction, ...]
+    file: Path  # LeRobot's
+    motors: Calibrations  # all motors as they would be written
+    changes: tuple[Correction, ...]  # what is put into which motor
 
     @classmethod
     def of(cls, config: Config, file: Path, offsets_rad: Mapping[str, float]) -> CorrectedCalibration:

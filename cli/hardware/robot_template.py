@@ -24,17 +24,11 @@ class Guess(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """Cameras of the robot and the marker that they look for.
+    """Cameras of the robot and the marker that they look for."""
 
-    Attributes:
-        cameras: those that are plugged in; with two or more, the first two are the eyes.
-        webcam: one camera alone, in their place.
-        tag_mm: side of the tag; ball_mm: diameter of the ball. Without both a ball of 40 mm.
-    """
-
-    cameras: Sequence[str] = ()
-    webcam: str | None = None
-    tag_mm: float | None = None
+    cameras: Sequence[str] = ()  # those that are plugged in; with two or more, the first two are the eyes
+    webcam: str | None = None  # one camera alone, in their place
+    tag_mm: float | None = None  # side of the tag; ball_mm: diameter of the ball. Without both a ball of 40 mm.
     ball_mm: float | None = None
 
 
@@ -189,7 +183,6 @@ def guess_from(urdf: Path, robot: Path, *, marker_link: str | None = None, camer
     """Guess the chain with the most moving joints in `urdf`, without fingers and joints that mimic others.
 
     Args:
-        urdf: the URDF.
         robot: path of the robot.toml to be written; the URDF is named relative to it.
         marker_link: the link with the marker; by default the last link fixed to the end of the chain.
         camera_link: the link that the cameras stand on; by default the root.
@@ -202,7 +195,7 @@ def guess_from(urdf: Path, robot: Path, *, marker_link: str | None = None, camer
     for link in (marker_link, camera_link):
         _require_link(tree, link, urdf)
     if marker_link is None:
-        root = camera_link or _root(tree)
+        root = camera_link or tree.root
         paths = {link: [joint for joint, _ in tree.path(root, link)] for link in tree.links}
         whole = {link: path for link, path in paths.items() if not any(map(_is_finger, path))}
         marker_link = max(whole, key=lambda link: (len(_moving(whole[link])), len(whole[link])))
@@ -215,7 +208,7 @@ def guess_from(urdf: Path, robot: Path, *, marker_link: str | None = None, camer
 
 def guess_of(tree: UrdfTree, urdf: str, end: str, root: str | None = None) -> Guess:
     """Return the chain of moving joints from a link of `tree`, by default its root, to the link `end`."""
-    root = root or _root(tree)
+    root = root or tree.root
     joints = _moving([joint for joint, _ in tree.path(root, end)])
     return Guess(key_name(tree.name), urdf, joints, end, root)
 
@@ -237,8 +230,3 @@ def _require_link(tree: UrdfTree, link: str | None, urdf: Path) -> None:
 def key_name(text: str) -> str:
     """Return `text` as a robot's name, which is part of the zenoh keys."""
     return "".join(c if c.isascii() and (c.isalnum() or c in "_.-") else "_" for c in text).lstrip(".-") or "robot"
-
-
-def _root(tree: UrdfTree) -> str:
-    children = {joint.child for joint in tree.joints.values()}
-    return next(link for link in tree.links if link not in children)

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from bodyschema.cli.terminal.screen import or_dash
 from bodyschema.daemon.wiring.servos import known_models, require_servos
 from bodyschema.interfaces.servos import FoundServo, ScannedBus
 
@@ -21,38 +22,27 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class JointFinding:
-    """The finding for a servo of robot.toml.
-
-    Attributes:
-        state: "ok", "missing", "wrong model", "not known" (it does not report its model), "another rate", "another
-            port" or "double".
-        fix: remedy; empty if the state is ok.
-        servo: the servo that answered; None if there was no answer.
-    """
+    """The finding for a servo of robot.toml."""
 
     joint: str
     bus: str
     id: int
     model: str
+    # "ok", "missing", "wrong model", "not known" (it does not report its model), "another rate", "another port" or
+    # "double"
     state: str
-    fix: str = ""
-    servo: FoundServo | None = None
+    fix: str = ""  # remedy; empty if the state is ok
+    servo: FoundServo | None = None  # the servo that answered; None if there was no answer
 
 
 @dataclass(frozen=True, slots=True)
 class ScanReport:
-    """All ports, compared with robot.toml.
-
-    Attributes:
-        joints: finding for each servo of robot.toml; None without a robot.toml.
-        strangers: servos on its ports that robot.toml does not name.
-        cameras: this machine's cameras, by their names in robot.toml.
-    """
+    """All ports, compared with robot.toml."""
 
     ports: Sequence[ScannedBus]
-    joints: tuple[JointFinding, ...] | None = None
-    strangers: tuple[FoundServo, ...] = ()
-    cameras: tuple[str, ...] = ()
+    joints: tuple[JointFinding, ...] | None = None  # finding for each servo of robot.toml; None without a robot.toml
+    strangers: tuple[FoundServo, ...] = ()  # servos on its ports that robot.toml does not name
+    cameras: tuple[str, ...] = ()  # this machine's cameras, by their names in robot.toml
 
     @property
     def servos(self) -> list[FoundServo]:
@@ -159,8 +149,8 @@ def _table(servos: Sequence[FoundServo], joints: dict[int, str], *, named: bool)
             servo.firmware or "-",
             servo.protocol,
             _rate(servo.baud),
-            _or_dash(servo.voltage_v, "{:.1f} V"),
-            _or_dash(servo.temperature_c, "{:.0f} °C"),
+            or_dash(servo.voltage_v, "{:.1f} V"),
+            or_dash(servo.temperature_c, "{:.0f} °C"),
             "-" if servo.has_torque is None else "on" if servo.has_torque else "off",
         ]
         table.add_row(*cells, *([joints.get(id(servo), "-")] if named else []))
@@ -169,10 +159,6 @@ def _table(servos: Sequence[FoundServo], joints: dict[int, str], *, named: bool)
 
 def _rate(baud: int) -> str:
     return f"{baud / 1e6:g} M" if baud >= 1e6 else f"{baud / 1e3:g} k"
-
-
-def _or_dash(value: float | None, form: str) -> str:
-    return "-" if value is None else form.format(value)
 
 
 def _troubles(report: ScanReport) -> Iterator[str]:

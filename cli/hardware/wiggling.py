@@ -27,16 +27,11 @@ POSITION = ("x", "y", "z")
 
 @dataclass(frozen=True, slots=True)
 class Collected:
-    """Data recorded from the sources.
-
-    Attributes:
-        missed: number of images without a fix, by reason.
-        health: faults of the cameras with their remedies.
-    """
+    """Data recorded from the sources."""
 
     wiggle: Wiggle
-    missed: Counter[str]
-    health: tuple[str, ...] = ()
+    missed: Counter[str]  # number of images without a fix, by reason
+    health: tuple[str, ...] = ()  # faults of the cameras with their remedies
 
     @property
     def said(self) -> str:
@@ -119,11 +114,7 @@ def collected(sources: Sources, duration_s: float, tell: Callable[[float], None]
 
 
 def wiggle_of(readings: Sequence[JointReading], fixes: Sequence[MarkerFix]) -> Wiggle:
-    """Return readings and fixes as arrays.
-
-    Raises:
-        LatencyError: either is missing.
-    """
+    """Return readings and fixes as arrays; raise LatencyError if either is missing."""
     if not readings or not fixes:
         who = "the encoders" if not readings else "the cameras"
         raise LatencyError(f"{who} gave nothing: `bodyschema doctor`, and for the marker `bodyschema watch cameras`")

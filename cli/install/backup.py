@@ -58,23 +58,16 @@ class Entry(msgspec.Struct, frozen=True):
 
 
 class Manifest(msgspec.Struct, frozen=True, kw_only=True):
-    """Contents of a backup.
-
-    Attributes:
-        store: identity of the pair store.
-        pairs: number of pairs, up to the sequence number `last_seq`.
-        files: by name in the archive.
-        unreadable: number of pairs between the oldest and the newest that could not be read and are missing.
-    """
+    """Contents of a backup."""
 
     robot: Name
     written_utc: str
     version: str
-    store: str
-    pairs: int
+    store: str  # identity of the pair store
+    pairs: int  # number of pairs, up to the sequence number `last_seq`
     last_seq: int
-    files: dict[str, Entry]
-    unreadable: int = 0
+    files: dict[str, Entry]  # by name in the archive
+    unreadable: int = 0  # number of pairs between the oldest and the newest that could not be read and are missing
     schema: int = SCHEMA
 
 

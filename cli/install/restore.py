@@ -31,21 +31,13 @@ STORE_PARTS = ("", "-wal", "-shm")
 
 @dataclass(frozen=True, slots=True)
 class Restored:
-    """Result of restoring.
+    """Result of restoring."""
 
-    Attributes:
-        written: the new files.
-        aside: files that were in their places before, under their new names.
-        elsewhere: files that robot.toml names outside its folder: new path by original path.
-        store: identity of the store from now on.
-        unreadable: number of pairs between the oldest and the newest that are missing, because a disk corrupted them.
-    """
-
-    written: list[Path]
-    aside: list[Path]
-    elsewhere: dict[str, Path]
-    store: str
-    unreadable: int
+    written: list[Path]  # the new files
+    aside: list[Path]  # files that were in their places before, under their new names
+    elsewhere: dict[str, Path]  # files that robot.toml names outside its folder: new path by original path
+    store: str  # identity of the store from now on
+    unreadable: int  # number of pairs between the oldest and the newest that are missing, because a disk corrupted them
 
 
 def restore(backup: Backup, robot_file: Path, state_dir: Path | None = None, *, force: bool = False) -> Restored:
@@ -55,7 +47,6 @@ def restore(backup: Backup, robot_file: Path, state_dir: Path | None = None, *, 
     checkpoint gets the same identity; a learner elsewhere will report that pairs come from another store.
 
     Args:
-        backup: an open backup.
         state_dir: folder for the state; None: the one of robot.toml, if that is in its folder.
         force: existing files may be moved aside.
 

@@ -34,19 +34,12 @@ PASSING_ON = "passing on"
 
 
 class RouterTables(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """router.toml.
+    """router.toml."""
 
-    Attributes:
-        listen: where machines connect, like `tls/0.0.0.0:7450`.
-        tls: the router's certificate, and the authority that signed all certificates.
-        access: names per role, by the robot's name, or `*` for every robot.
-        users_file: lines `user:password` of permitted users, in place of certificates.
-    """
-
-    listen: str
-    tls: TlsConfig
-    access: dict[str, Names]
-    users_file: str | None = None
+    listen: str  # where machines connect, like `tls/0.0.0.0:7450`
+    tls: TlsConfig  # the router's certificate, and the authority that signed all certificates
+    access: dict[str, Names]  # names per role, by the robot's name, or `*` for every robot
+    users_file: str | None = None  # lines `user:password` of permitted users, in place of certificates
 
 
 @dataclass(frozen=True)

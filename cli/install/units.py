@@ -146,17 +146,11 @@ PrivateUsers=yes""",
 
 @dataclass(frozen=True, slots=True)
 class Installed:
-    """The bodyschema installation that the units start.
+    """The bodyschema installation that the units start."""
 
-    Attributes:
-        command: path of the command.
-        folders: folders of the installation.
-        systemd: version of the machine's systemd.
-    """
-
-    command: Sequence[str]
-    folders: Sequence[Path]
-    systemd: int
+    command: Sequence[str]  # path of the command
+    folders: Sequence[Path]  # folders of the installation
+    systemd: int  # version of the machine's systemd
 
     @classmethod
     def here(cls, systemd: int) -> Installed:

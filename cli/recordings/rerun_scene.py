@@ -45,7 +45,6 @@ def scene_of(simulation: Simulation, recording: Recording) -> Scene:
 
 
 def _meshes(urdf: Path) -> dict[str, list[LinkMesh]]:
-    """Return the meshes of each link that are there."""
     found: dict[str, list[LinkMesh]] = {}
     parts = LinkParts.of(urdf, urdf.parent)
     meshes = {mesh["name"]: mesh for mesh in parts.meshes}

@@ -32,17 +32,13 @@ class Figures(msgspec.Struct, frozen=True):
 
 
 class AngleFigures(msgspec.Struct, frozen=True):
-    """Angles between predicted and measured orientation on the held-out rows [°], and the learner's predicted error.
+    """Angles between predicted and measured orientation on the held-out rows [°], and the learner's predicted error."""
 
-    Attributes:
-        mean_deg, median_deg, p95_deg: of the angles.
-        claimed_deg: mean angle to the truth that the learner predicts in its support, or null.
-    """
-
+    # mean_deg, median_deg, p95_deg: of the angles
     mean_deg: float
     median_deg: float
     p95_deg: float
-    claimed_deg: float | None
+    claimed_deg: float | None  # mean angle to the truth that the learner predicts in its support, or null
 
     @classmethod
     def of(cls, angles_rad: FloatArray, claimed_rad: float | None) -> AngleFigures:
@@ -54,53 +50,32 @@ class AngleFigures(msgspec.Struct, frozen=True):
 
 
 class ReplayReport(msgspec.Struct, frozen=True, kw_only=True):
-    """Results of a replay.
-
-    Attributes:
-        rows: in the recording.
-        held_out: of these, held-out rows, in `held_out_blocks` of 10 contiguous blocks.
-        accepted: pairs that the sampler made of the others; `rejected` by reason.
-        any_step: True if the sampler's step and speed rules were relaxed.
-        before: best alignment of what robot.toml declares unknown, fitted to the learnt rows.
-        after: the learner's predictions, queried over zenoh.
-        fitted: what `before` fitted, as named in robot.toml.
-        answering: the model that answered.
-        prequential_mm: recent mean error on pairs before they were learnt, by model [mm].
-        claimed_mm: mean error to the truth that the learner predicts in its support [mm], or null.
-        expected_mm: mean error on new pairs that it predicts, measurement noise included [mm], or null.
-        in_support_share: share of held-out rows in the learner's support.
-        within_sigma_share: share of held-out coordinates within 1-sigma of prediction and stated noise together.
-        replayed: replay steps of the instant learner.
-        outlook: gain that the learner expects of further pairs, or null.
-        doubt: possible problems of the recording, or null: columns read wrongly, another robot.
-        learning_s: time from the first pair to the end of learning [s].
-        angle: of the marker's orientation; null if the recording has none.
-    """
+    """Results of a replay."""
 
     recording: str
     robot: str
-    rows: int
-    held_out: int
+    rows: int  # in the recording
+    held_out: int  # of these, held-out rows, in `held_out_blocks` of 10 contiguous blocks
     held_out_blocks: int
-    accepted: int
+    accepted: int  # pairs that the sampler made of the others; `rejected` by reason
     rejected: dict[str, int]
-    any_step: bool
+    any_step: bool  # True if the sampler's step and speed rules were relaxed
     steps: str
-    fitted: list[str]
-    before: Figures
-    after: Figures
-    answering: str
-    prequential_mm: dict[str, float]
-    claimed_mm: float | None
-    expected_mm: float | None
-    in_support_share: float
-    within_sigma_share: float
+    fitted: list[str]  # what `before` fitted, as named in robot.toml
+    before: Figures  # best alignment of what robot.toml declares unknown, fitted to the learnt rows
+    after: Figures  # the learner's predictions, queried over zenoh
+    answering: str  # the model that answered
+    prequential_mm: dict[str, float]  # recent mean error on pairs before they were learnt, by model [mm]
+    claimed_mm: float | None  # mean error to the truth that the learner predicts in its support [mm], or null
+    expected_mm: float | None  # mean error on new pairs that it predicts, measurement noise included [mm], or null
+    in_support_share: float  # share of held-out rows in the learner's support
+    within_sigma_share: float  # share of held-out coordinates within 1-sigma of prediction and stated noise together
     doubted: int
-    replayed: int
-    outlook: Outlook | None
-    doubt: str | None
-    learning_s: float
-    angle: AngleFigures | None = None
+    replayed: int  # replay steps of the instant learner
+    outlook: Outlook | None  # gain that the learner expects of further pairs, or null
+    doubt: str | None  # possible problems of the recording, or null: columns read wrongly, another robot
+    learning_s: float  # time from the first pair to the end of learning [s]
+    angle: AngleFigures | None = None  # of the marker's orientation; null if the recording has none
     schema: int = 1
 
 

@@ -31,19 +31,12 @@ MOST = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Steps:
-    """Steps between neighbouring rows, by the sampler's rule.
+    """Steps between neighbouring rows, by the sampler's rule."""
 
-    Attributes:
-        count: their number.
-        too_far: number of steps larger than `max_step_deg`.
-        median_deg: their median.
-        max_step_deg: the sampler's limit.
-    """
-
-    count: int
-    too_far: int
+    count: int  # their number
+    too_far: int  # number of steps larger than `max_step_deg`
     median_deg: float
-    max_step_deg: float
+    max_step_deg: float  # the sampler's limit
 
     @classmethod
     def of(cls, recording: Recording, robot: RobotDescription, rules: DaemonConfig) -> Steps:
@@ -86,28 +79,18 @@ SHORTEST_S = 20.0
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """Settings of a replay.
+    """Settings of a replay."""
 
-    Attributes:
-        config: the robot's configuration.
-        recording: the recording.
-        split: its held-out rows.
-        speed: 1 as recorded, 0 as fast as the sampler takes it; None at the usual frame rate on average,
-            but in `SHORTEST_S` at least.
-        sigma_m: 1-sigma of the positions if the recording has none [m]; None as in robot.toml.
-        any_step: relax the sampler's step and speed rules.
-        folder: for store, checkpoint, logs and the learnt rows.
-        warnings: possible problems of the recording.
-    """
-
-    config: Config
+    config: Config  # the robot's configuration
     recording: Recording
-    split: Split
+    split: Split  # its held-out rows
+    # 1 as recorded, 0 as fast as the sampler takes it; None at the usual frame rate on average, but in `SHORTEST_S` at
+    # least
     speed: float | None
-    sigma_m: float | None
-    any_step: bool
-    folder: Path
-    warnings: tuple[str, ...] = ()
+    sigma_m: float | None  # 1-sigma of the positions if the recording has none [m]; None as in robot.toml
+    any_step: bool  # relax the sampler's step and speed rules
+    folder: Path  # for store, checkpoint, logs and the learnt rows
+    warnings: tuple[str, ...] = ()  # possible problems of the recording
 
     @property
     def drivers(self) -> dict[str, float]:
@@ -133,7 +116,6 @@ class Job:
 
     @property
     def held_out_rows(self) -> Recording:
-        """Rows that are held out."""
         return self.recording.rows(self.split.held_out)
 
 
@@ -150,7 +132,6 @@ def replay(job: Job, report: Callable[[SamplerStatus, LearnerStatus], None]) -> 
     """Replay a recording and measure the errors of the learnt model.
 
     Args:
-        job: settings of the replay.
         report: called with the status of both processes about four times a second.
 
     Raises:

@@ -42,28 +42,18 @@ class _Scan(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class Fitting:
-    """Assignment of servos to joints.
+    """Assignment of servos to joints."""
 
-    Attributes:
-        servos: by joint, in the order of the joints.
-        bare: joints without a servo.
-        left: servos without a joint.
-    """
-
-    servos: dict[str, Candidate]
-    bare: tuple[str, ...]
-    left: tuple[Candidate, ...]
+    servos: dict[str, Candidate]  # by joint, in the order of the joints
+    bare: tuple[str, ...]  # joints without a servo
+    left: tuple[Candidate, ...]  # servos without a joint
 
 
 Choose = Callable[[str, Sequence[Candidate]], Candidate | None]
 
 
 def candidates_in(json: bytes, file: object) -> list[Candidate]:
-    """Return the servos of a saved scan.
-
-    Raises:
-        ConfigError: it is not a scan.
-    """
+    """Return the servos of a saved scan; raise ConfigError if it is not a scan."""
     try:
         scan = msgspec.json.decode(json, type=_Scan)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -79,11 +69,7 @@ def first_of(_joint: str, left: Sequence[Candidate]) -> Candidate | None:
 
 
 def fit(joints: Sequence[str], candidates: Sequence[Candidate], choose: Choose) -> Fitting:
-    """Assign a servo to each joint.
-
-    Raises:
-        ConfigError: none of them can be used, or no joint got one.
-    """
+    """Assign a servo to each joint; raise ConfigError if none of them can be used, or no joint got one."""
     left = sorted((c for c in candidates if c.is_usable), key=lambda c: (c.port, c.id))
     if not left:
         raise ConfigError(

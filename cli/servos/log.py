@@ -18,32 +18,25 @@ State = Literal["begun", "written", "not written", "something else stands there"
 
 
 class LoggedWrite(msgspec.Struct, frozen=True, kw_only=True):
-    """One written value.
-
-    Attributes:
-        batch: number shared by all writes of one command.
-        table: the servo's vendor.
-        baud, id: baud rate and ID of the servo before the write.
-        name, address: name and address of the register.
-        old, new: its contents before, and the value to write.
-        state: "begun" is logged before the servo is written, so that the log knows every write.
-        undoes: the batch that this one undoes.
-    """
+    """One written value."""
 
     utc: str
-    batch: int
-    table: str
+    batch: int  # number shared by all writes of one command
+    table: str  # the servo's vendor
     port: str
+    # baud, id: baud rate and ID of the servo before the write
     baud: int
     id: int
     model: str
     joint: str
+    # name, address: name and address of the register
     name: str
     address: int
+    # old, new: its contents before, and the value to write
     old: int
     new: int
-    state: State = "begun"
-    undoes: int | None = None
+    state: State = "begun"  # "begun" is logged before the servo is written, so that the log knows every write
+    undoes: int | None = None  # the batch that this one undoes
 
 
 class ServoLog:

@@ -9,6 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from bodyschema.calibration.report import CalibrationReport, Figure, Zero
+from bodyschema.cli.terminal.screen import such_zeros
 
 # Told noise that explains the residuals leaves less than this.
 MISFIT = 1.5
@@ -35,7 +36,6 @@ def view(report: CalibrationReport) -> Group:
 
 
 def sentences(report: CalibrationReport) -> list[str]:
-    """Return the report as sentences."""
     said = [_expected(report)] if report.expected_mm is not None else []
     said += [
         f"Mean distance to the pairs: {_distances(report)}. {_noise(report)} {_outliers(report)}",
@@ -46,7 +46,7 @@ def sentences(report: CalibrationReport) -> list[str]:
     hidden = [zero.joint for zero in report.zeros if zero.half_width is None]
     if hidden and report.trusted != "urdf":
         said.append(
-            f"Kept at nominal: {', '.join(hidden)}. The measurements cannot separate {_such_zeros(hidden)} from a "
+            f"Kept at nominal: {', '.join(hidden)}. The measurements cannot separate {such_zeros(hidden)} from a "
             "rotation of the camera, the marker or a neighbouring joint. Predicted positions are unaffected. "
             "The other figures are given that."
         )
@@ -135,10 +135,6 @@ def _outliers(report: CalibrationReport) -> str:
     if report.outliers == 0:
         return "No outliers."
     return f"{report.outliers} outlier{'s' if report.outliers > 1 else ''} left out."
-
-
-def _such_zeros(hidden: list[str]) -> str:
-    return "its zero" if len(hidden) == 1 else "their zeros"
 
 
 def _section(table: Table, title: str) -> None:

@@ -54,24 +54,16 @@ class DiagnosisError(BodyschemaError):
 
 @dataclass(frozen=True)
 class Asked:
-    """Settings of a diagnosis.
+    """Settings of a diagnosis."""
 
-    Attributes:
-        only, without: names of effects; all when `only` is empty.
-        seed: of the resampling.
-    """
-
+    # only, without: names of effects; all when `only` is empty
     only: tuple[str, ...]
     without: tuple[str, ...]
-    seed: int
+    seed: int  # of the resampling
 
     @classmethod
     def of(cls, only: str | None, without: str | None, seed: int) -> Asked:
-        """Parse comma-separated names.
-
-        Raises:
-            RequestError: an effect is unknown, or none remains.
-        """
+        """Parse comma-separated names; raise RequestError if an effect is unknown, or none remains."""
         asked = cls(_names(only, "--effects"), _names(without, "--exclude"), seed)
         if set(asked.only or EFFECT_TYPES) <= set(asked.without):
             raise RequestError("--effects and --exclude leave nothing to look for. Exclude fewer")
@@ -136,16 +128,12 @@ def _history(history: History, joints: tuple[str, ...]) -> Recording:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Diagnosis with its context for the report.
-
-    Attributes:
-        warnings: what may be wrong with the recording itself.
-    """
+    """Diagnosis with its context for the report."""
 
     diagnosis: Diagnosis
     source: Source
     robot: RobotDescription
-    warnings: tuple[str, ...]
+    warnings: tuple[str, ...]  # what may be wrong with the recording itself
 
     @cached_property
     def file(self) -> DiagnosisFile:
@@ -267,11 +255,7 @@ def require_writable(folder: Path) -> None:
 
 
 def written(found: Found, folder: Path) -> None:
-    """Write the files of DIR.
-
-    Raises:
-        ConfigError, RecordingError: they cannot be written.
-    """
+    """Write the files of DIR; raise ConfigError, RecordingError if they cannot be written."""
     about = About(found.source.name, found.robot.name, version("bodyschema"))
     heading = f"Found by bodyschema {about.version} in {len(found.source.recording)} pairs of {about.recording}"
     extended = found.diagnosis.stored.written

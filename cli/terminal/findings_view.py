@@ -11,7 +11,7 @@ from rich.text import Text
 
 from bodyschema.learning.status import ChainCalibration, JointZero, LearntFigure, Outlook
 
-from .screen import mm
+from .screen import mm, such_zeros
 
 _DEG = math.degrees(1.0)
 
@@ -31,7 +31,6 @@ def outlook_lines(outlook: Outlook | None) -> list[str]:
 
 
 def outlook_sentence(outlook: Outlook) -> str:
-    """Return the outlook as a sentence."""
     best = "no other motion gains more"
     if _other_is_better(outlook):
         best = f"{outlook.best_motion} gains most: {_gain(outlook, outlook.best_motion_m)}"
@@ -62,7 +61,7 @@ def calibration_table(calibration: ChainCalibration, slides: Collection[str] = (
         zeros = ", ".join(f"{name} {_zero(zero, slides=name in slides)}" for name, zero in shown.items())
         facts.add_row("zeros to add", zeros)
     if drawn:
-        facts.add_row("kept at nominal", f"{', '.join(drawn)}: no motion shows {_such_zeros(drawn)}")
+        facts.add_row("kept at nominal", f"{', '.join(drawn)}: no motion shows {such_zeros(drawn)}")
     facts.add_row("arm made to", _workmanship(calibration))
     facts.add_row("noise", f"{mm(calibration.noise_m)} a coordinate, {_outliers(calibration.outliers)}")
     return Group(
@@ -76,10 +75,6 @@ def _workmanship(calibration: ChainCalibration) -> str:
     if calibration.axes_rad is None or calibration.points_m is None:
         return "not determined by these pairs"
     return f"about {_DEG * calibration.axes_rad:.2g}° and {1e3 * calibration.points_m:.2g} mm"
-
-
-def _such_zeros(joints: list[str]) -> str:
-    return "its zero" if len(joints) == 1 else "their zeros"
 
 
 def _other_is_better(outlook: Outlook) -> bool:

@@ -211,18 +211,13 @@ def effects_of(simulation: Simulation) -> str:
 
 @dataclass(frozen=True)
 class Row:
-    """Errors of one model on measured positions.
+    """Errors of one model on measured positions."""
 
-    Attributes:
-        model: its name.
-        rms_mm, mean_mm: RMS and mean of the distances to the measured positions.
-        gain_percent: reduction of the RMS relative to the nominal model; None for that one.
-    """
-
-    model: str
+    model: str  # its name
+    # rms_mm, mean_mm: RMS and mean of the distances to the measured positions
     rms_mm: float
     mean_mm: float
-    gain_percent: float | None
+    gain_percent: float | None  # reduction of the RMS relative to the nominal model; None for that one
 
 
 def compared(simulation: Simulation, recording: Recording, out: Path) -> tuple[list[Row], str | None]:

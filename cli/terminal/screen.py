@@ -33,6 +33,16 @@ def degrees(radians: float | None, unit: str = "°") -> str:
     return f"{value:.{1 if value >= 10 else 2 if value >= 1 else 3}f}{unit}"
 
 
+def or_dash(value: float | None, form: str) -> str:
+    """Return a number in this form; a dash for None."""
+    return "-" if value is None else form.format(value)
+
+
+def such_zeros(joints: Collection[str]) -> str:
+    """Return what sentences call the joint offsets of these joints."""
+    return "its zero" if len(joints) == 1 else "their zeros"
+
+
 def two_digits(value: float) -> str:
     """Return a positive number with two significant digits, never in powers of ten."""
     if value <= 0.0 or not math.isfinite(value):

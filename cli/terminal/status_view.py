@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from bodyschema.cli.terminal.findings_view import calibration_table, outlook_lines
-from bodyschema.cli.terminal.screen import coverage_table, degrees, mm, rejected
+from bodyschema.cli.terminal.screen import coverage_table, degrees, mm, or_dash, rejected
 from bodyschema.daemon.client_config import ClientConfig
 from bodyschema.daemon.service.remedies import as_typed
 from bodyschema.daemon.transport.bus import ZenohSession
@@ -224,9 +224,9 @@ def servos_table(servos: Mapping[str, ServoStatus]) -> Table:
         table.add_column(heading, justify="right" if right else "left", no_wrap=heading != "state")
     for joint, servo in servos.items():
         figures = (
-            _or_dash(servo.voltage_v, "{:.1f} V"),
-            _or_dash(servo.temperature_c, "{:.0f} °C"),
-            _or_dash(servo.current_a, "{:.2f} A"),
+            or_dash(servo.voltage_v, "{:.1f} V"),
+            or_dash(servo.temperature_c, "{:.0f} °C"),
+            or_dash(servo.current_a, "{:.2f} A"),
         )
         state = Text(_short(servo), style="red") if servo.troubles else Text("well", style="green")
         table.add_row(joint, str(servo.id), servo.model, str(servo.firmware), *figures, state)
@@ -236,7 +236,3 @@ def servos_table(servos: Mapping[str, ServoStatus]) -> Table:
 def _short(servo: ServoStatus) -> str:
     """Return the problem without its remedy, which is printed above the table."""
     return ", ".join(trouble.split(":")[0] for trouble in servo.troubles)
-
-
-def _or_dash(value: float | None, form: str) -> str:
-    return "-" if value is None else form.format(value)

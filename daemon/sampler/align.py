@@ -45,8 +45,6 @@ class JointBuffer:
         """Start with an empty buffer.
 
         Args:
-            prismatic: which joints are prismatic, shape (d,).
-            max_gap_s: readings around a frame may be this far apart [s].
             capacity: number of readings that are kept at most.
             live: `put` never waits.
             kept_s: readings up to this long before the frame are kept [s].

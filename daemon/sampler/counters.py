@@ -31,7 +31,6 @@ class SamplerCounters:
         """Start all counters at zero.
 
         Args:
-            wall: clock for rates.
             covered: smallest and largest joint angles of the existing pairs.
         """
         self._robot, self._wall = robot, wall

@@ -56,7 +56,6 @@ class DeviceWatch:
 
         Args:
             joints: queried if they keep a record.
-            store: open.
         """
         self._joints = joints if isinstance(joints, KeepsRecord) else None
         self._store, self._wall = store, wall

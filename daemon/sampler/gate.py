@@ -40,11 +40,7 @@ class Gate:
     """
 
     def __init__(self, rules: DaemonConfig, prismatic: NDArray[np.bool_], last: Pair | None = None) -> None:
-        """Start after `last`, the newest pair in the store.
-
-        Args:
-            prismatic: which joints are prismatic, shape (d,).
-        """
+        """Start after `last`, the newest pair in the store."""
         self._prismatic = prismatic
         self.follow(rules)
         self.segment = 0 if last is None else last.segment

@@ -34,10 +34,6 @@ class ReconnectingSource(Generic[R_co]):
     counts as back once it was read: a device may open and still not be readable.
 
     The first opening has to succeed: a failure at the start needs a person.
-
-    Attributes:
-        trouble: the problem with the source, or None.
-        losses: number of times it was lost.
     """
 
     def __init__(
@@ -51,8 +47,6 @@ class ReconnectingSource(Generic[R_co]):
         """Store the settings; nothing is opened yet.
 
         Args:
-            name: name of the source in messages.
-            wall: clock for the waiting times.
             forbidden: returns a device that this process will never be allowed to open, or None.
         """
         self._forbidden = forbidden

@@ -116,29 +116,20 @@ THE_CAMERAS = "the cameras"
 
 @dataclass(frozen=True, slots=True)
 class Sources:
-    """Encoders and marker, not opened yet, on one clock; and the simulated world if there is one.
-
-    Attributes:
-        powered: drives that may move the arm or the head once a person asks for it.
-        head: the one of them that moves the cameras.
-        cameras: reports the health of the cameras or of other marker sources, if there are any.
-        seen_by: name of the marker source in messages.
-        calibration: the cameras' calibration, if it differs from [camera].
-        picture: returns the newest camera picture as JPEG, or None before the first; None without cameras.
-        live: neither encoders nor cameras wait for the other; otherwise unread data is kept.
-    """
+    """Encoders and marker, not opened yet, on one clock; and the simulated world if there is one."""
 
     joints: JointSource
     marker: MarkerSource
     clock: Clock
     simulation: GroundTruth | None = None
-    powered: tuple[Powered, ...] = ()
-    head: Head | None = None
-    cameras: TellsHealth | None = None
-    seen_by: str = THE_CAMERAS
-    calibration: StereoCalibration | None = None
+    powered: tuple[Powered, ...] = ()  # drives that may move the arm or the head once a person asks for it
+    head: Head | None = None  # the one of them that moves the cameras
+    cameras: TellsHealth | None = None  # reports the health of the cameras or of other marker sources, if there are any
+    seen_by: str = THE_CAMERAS  # name of the marker source in messages
+    calibration: StereoCalibration | None = None  # the cameras' calibration, if it differs from [camera]
+    # returns the newest camera picture as JPEG, or None before the first; None without cameras
     picture: Picture | None = None
-    live: bool = False
+    live: bool = False  # neither encoders nor cameras wait for the other; otherwise unread data is kept
 
 
 class StampedJoints(JointSource, Protocol):

@@ -17,17 +17,11 @@ Key = tuple[str, str]
 
 @dataclass(frozen=True, slots=True)
 class Reload:
-    """Result of reading robot.toml again.
+    """Result of reading robot.toml again."""
 
-    Attributes:
-        config: the configuration in force from now on; unchanged if nothing changed that can.
-        changed: settings that take effect, as in `daemon.min_step_deg = 2.0`.
-        waiting: settings that need a restart.
-    """
-
-    config: Config
-    changed: list[str]
-    waiting: list[str]
+    config: Config  # the configuration in force from now on; unchanged if nothing changed that can
+    changed: list[str]  # settings that take effect, as in `daemon.min_step_deg = 2.0`
+    waiting: list[str]  # settings that need a restart
 
     def message(self, process: str) -> str:
         """Return a summary, with what to do."""

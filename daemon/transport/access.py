@@ -51,13 +51,9 @@ ROLES = tuple(field.name for field in msgspec.structs.fields(Names))
 
 @dataclass(frozen=True, slots=True)
 class Subjects:
-    """Identification of connecting clients.
+    """Identification of connecting clients."""
 
-    Attributes:
-        by_user: by the user name that the password belongs to; otherwise by the common name of the certificate.
-    """
-
-    by_user: bool
+    by_user: bool  # by the user name that the password belongs to; otherwise by the common name of the certificate
 
     def of(self, names: tuple[str, ...]) -> dict[str, list[str]]:
         """Return the subjects of these names in the form of zenoh's configuration."""

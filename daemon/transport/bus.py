@@ -40,16 +40,11 @@ REFUSALS = 1000  # refusals waiting to be sent; beyond them a query ends without
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """One query, decoded.
+    """One query, decoded."""
 
-    Attributes:
-        parameters: the part of the key after the `?`.
-        encoding: JSON or MSGPACK; the reply has to use the same.
-    """
-
-    parameters: dict[str, str]
+    parameters: dict[str, str]  # the part of the key after the `?`
     payload: bytes
-    encoding: str
+    encoding: str  # JSON or MSGPACK; the reply has to use the same
 
 
 @dataclass(frozen=True, slots=True)

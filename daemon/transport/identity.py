@@ -44,18 +44,14 @@ class LoginConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Identity:
-    """Credentials of this machine, and how it identifies others.
-
-    Attributes:
-        users_file: a line `user:password` for each permitted user; None: clients present certificates.
-    """
+    """Credentials of this machine, and how it identifies others."""
 
     ca: Path
     certificate: Path | None = None
     key: Path | None = None
     user: str | None = None
     password_file: Path | None = None
-    users_file: Path | None = None
+    users_file: Path | None = None  # a line `user:password` for each permitted user; None: clients present certificates
 
     @classmethod
     def of(cls, tls: TlsConfig, login: LoginConfig | None, users_file: str | None, folder: Path) -> Identity:
@@ -95,11 +91,7 @@ class Identity:
         return self.users_file is not None
 
     def settings(self) -> dict[str, Any]:
-        """Return zenoh's configuration of links and users.
-
-        Raises:
-            ConfigError: the password cannot be read.
-        """
+        """Return zenoh's configuration of links and users; raise ConfigError if the password cannot be read."""
         tls: dict[str, Any] = {
             "root_ca_certificate": str(self.ca),
             "enable_mtls": self.certificate is not None and not self.by_user,
@@ -122,13 +114,9 @@ class Identity:
 
 @dataclass(frozen=True)
 class Route:
-    """Endpoints of a process, and the credentials to use.
+    """Endpoints of a process, and the credentials to use."""
 
-    Attributes:
-        endpoints: tried in this order.
-    """
-
-    endpoints: tuple[str, ...]
+    endpoints: tuple[str, ...]  # tried in this order
     identity: Identity | None = None
 
     @property

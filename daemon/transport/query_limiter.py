@@ -21,25 +21,15 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Limits of one source under one key.
+    """Limits of one source under one key."""
 
-    Attributes:
-        rate_hz: queries per second in the long run.
-        burst: queries at once after a pause.
-        waiting: unanswered queries.
-        request_bytes: size of a request's payload.
-        waiting_bytes: sum of their payload sizes; the sum over all sources may be eight times that.
-        wait_s: a query that waited longer is refused, since its client no longer waits for the answer.
-        sources: number of sources waiting at the same time.
-    """
-
-    rate_hz: float = 5000.0
-    burst: int = 5000
-    waiting: int = 100
-    request_bytes: int = 4 * 2**20
-    waiting_bytes: int = 8 * 2**20
-    wait_s: float = 10.0
-    sources: int = 100
+    rate_hz: float = 5000.0  # queries per second in the long run
+    burst: int = 5000  # queries at once after a pause
+    waiting: int = 100  # unanswered queries
+    request_bytes: int = 4 * 2**20  # size of a request's payload
+    waiting_bytes: int = 8 * 2**20  # sum of their payload sizes; the sum over all sources may be eight times that
+    wait_s: float = 10.0  # a query that waited longer is refused, since its client no longer waits for the answer
+    sources: int = 100  # number of sources waiting at the same time
 
 
 LIMITS = Limits()
@@ -69,9 +59,6 @@ class QueryLimiter(Generic[T]):
 
     def admit(self, source: str, size: int, query: T) -> None:
         """Queue a query.
-
-        Args:
-            size: size of its payload [bytes].
 
         Raises:
             RequestError: it is too large, or its source asks too much; the message says how much is allowed.

@@ -238,7 +238,6 @@ def decode(payload: bytes, kind: type[M], encoding: str = JSON) -> M:
 
 
 def pair_to_wire(pair: Pair) -> PairMessage:
-    """Return a pair as its message."""
     return pairs_to_wire([pair])[0]
 
 

@@ -18,7 +18,8 @@ import msgspec
 
 from bodyschema.daemon.config import Config
 from bodyschema.drivers.bench.asked_faults import AskedFault
-from bodyschema.drivers.bench.dry_run import Angle, BenchArm, DryRun
+from bodyschema.drivers.bench.device import Angle
+from bodyschema.drivers.bench.dry_run import BenchArm, DryRun
 from bodyschema.drivers.bench.servo_arm import played, swinging
 from bodyschema.drivers.bench.through_driver import LATENCY_MS, READ_S, Behind, ThroughDriver
 from bodyschema.drivers.dynamixel.config import DynamixelConfig
@@ -54,11 +55,7 @@ class Motion:
 
 
 def require_on_ports(config: Config) -> OnPorts:
-    """Return the servos or encoders of robot.toml.
-
-    Raises:
-        ConfigError: it has none.
-    """
+    """Return the servos or encoders of robot.toml; raise ConfigError if it has none."""
     match config.tables.drivers.hardware:
         case DynamixelConfig() | FeetechConfig() | SerialLinesConfig() as hardware:
             return hardware
@@ -198,11 +195,7 @@ def bench_robot_file(config: Config, bench: DryRun, port: Path) -> Path:
 
 
 def require_bench(config: Config) -> OnPorts | Ros2Config:
-    """Return the driver settings for reading the simulation's joints.
-
-    Raises:
-        ConfigError: robot.toml has none.
-    """
+    """Return the driver settings for reading the simulation's joints; raise ConfigError if robot.toml has none."""
     robot = config.tables.drivers.ros2
     return require_on_ports(config) if robot is None else robot
 

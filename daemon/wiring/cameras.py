@@ -47,11 +47,7 @@ def cameras_of(config: Config) -> CamerasConfig | None:
 
 
 def require_cameras(config: Config) -> CamerasConfig:
-    """Return the cameras configured in robot.toml.
-
-    Raises:
-        ConfigError: it has none.
-    """
+    """Return the cameras configured in robot.toml; raise ConfigError if it has none."""
     cameras = cameras_of(config)
     if cameras is None:
         raise ConfigError(
@@ -185,16 +181,11 @@ def require_usable(config: Config) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Watched:
-    """Cameras for a person to look at.
+    """Cameras for a person to look at."""
 
-    Attributes:
-        camera: gives the pictures, not opened yet. eyes: tells how the cameras are.
-        is_calibrated: whether the marker is looked for.
-    """
-
-    camera: WatchedCamera | PlainEyes
+    camera: WatchedCamera | PlainEyes  # gives the pictures, not opened yet. eyes: tells how the cameras are.
     eyes: Eyes
-    is_calibrated: bool
+    is_calibrated: bool  # whether the marker is looked for
 
 
 def open_watched(config: Config) -> Watched:
@@ -294,11 +285,7 @@ def _told(figures: CameraFigures) -> str:
 
 
 def camera_lines(config: Config) -> Iterator[str]:
-    """Yield lines on the source of the images.
-
-    Raises:
-        ConfigError: the calibration cannot be read.
-    """
+    """Yield lines on the source of the images; raise ConfigError if the calibration cannot be read."""
     yield from _lines_of(require_cameras(config), config.file.parent)
     for further in config.tables.vision.further_cameras:
         for line in _lines_of(further, config.file.parent):

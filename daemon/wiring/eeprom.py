@@ -52,13 +52,9 @@ TABLES = {
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """A selected servo, before it is queried.
+    """A selected servo, before it is queried."""
 
-    Attributes:
-        table: its vendor's table in [drivers].
-    """
-
-    table: str
+    table: str  # its vendor's table in [drivers]
     port: str
     baud: int
     entry: ServoConfig

@@ -149,11 +149,7 @@ def measured(images: Images, calibration: Path, wanted: Wanted, tell: Callable[[
 
 
 def sides_of(text: str) -> dict[int, float]:
-    """Parse sides [m] of tags by ID from a text like 7=25,8=25 [mm].
-
-    Raises:
-        ConfigError: it is invalid.
-    """
+    """Parse sides [m] of tags by ID from a text like 7=25,8=25 [mm]; raise ConfigError if it is invalid."""
     found: dict[int, float] = {}
     for part in text.split(","):
         told = _SIDE.fullmatch(part.strip())
@@ -199,7 +195,6 @@ def tables(found: MeasuredCluster, wanted: Wanted) -> str:
 
 
 def figures(found: MeasuredCluster) -> ClusterFile:
-    """Return the figures of a measured cluster."""
     return ClusterFile(
         views=found.views,
         misfit=found.misfit,

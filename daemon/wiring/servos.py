@@ -35,17 +35,11 @@ Servos = DynamixelConfig | FeetechConfig
 
 @dataclass(frozen=True, slots=True)
 class KnownModel:
-    """A servo model with a driver.
+    """A servo model with a driver."""
 
-    Attributes:
-        table: its vendor's table in robot.toml.
-        bauds: the baud rates that robot.toml accepts for it [bit/s].
-        zero_ticks: the middle of its range.
-    """
-
-    table: str
-    bauds: tuple[int, ...]
-    zero_ticks: int
+    table: str  # its vendor's table in robot.toml
+    bauds: tuple[int, ...]  # the baud rates that robot.toml accepts for it [bit/s]
+    zero_ticks: int  # the middle of its range
 
 
 def servos_of(config: Config) -> Servos | None:
@@ -147,7 +141,7 @@ def joint_state_checks(config: Config) -> Iterator[Check]:
     """Check the ROS 2 robot of robot.toml, if it has one. Only listens."""
     robot = config.tables.drivers.ros2
     if robot is not None:
-        from bodyschema.drivers.ros2.checks import joint_state_checks as checks_of_joint_states
+        from bodyschema.drivers.ros2.joints import joint_state_checks as checks_of_joint_states
 
         prismatic = config.robot.chain.prismatic.tolist()
         yield from checks_of_joint_states(robot, config.robot.joints, SystemClock(), prismatic=prismatic)

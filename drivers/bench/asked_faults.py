@@ -18,7 +18,7 @@ ON_THE_WIRE: Mapping[str, Fault] = {
     "checksum": wrong_checksum,
     "corrupt": corrupt(),
     "half": half,
-    "garbage": garbage(),
+    "garbage": garbage,
 }
 OF_ALL = ("power-cycle", "unplug")
 NOW_AND_THEN = ("glitch", *OF_ALL)
@@ -28,35 +28,24 @@ OPTION = "--fault"
 
 @dataclass(frozen=True, slots=True)
 class FaultKinds:
-    """Faults available for a vendor's servos or encoders.
+    """Faults available for a vendor's servos or encoders."""
 
-    Attributes:
-        on_the_wire: faults of transmitted packets, by name.
-        of_one_joint: faults of one servo or encoder; `glitch` recurs, the others are present from the start.
-    """
-
-    on_the_wire: Mapping[str, Fault]
+    on_the_wire: Mapping[str, Fault]  # faults of transmitted packets, by name
+    # faults of one servo or encoder; `glitch` recurs, the others are present from the start
     of_one_joint: tuple[str, ...]
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of all faults."""
         return (*self.on_the_wire, *self.of_one_joint, *OF_ALL)
 
 
 @dataclass(frozen=True, slots=True)
 class AskedFault:
-    """One requested fault.
+    """One requested fault."""
 
-    Attributes:
-        kind: its name.
-        joint: joint whose servo or encoder is affected; None: all.
-        share: the probability that an answer is affected, for faults on the wire.
-    """
-
-    kind: str
-    joint: str | None
-    share: float
+    kind: str  # its name
+    joint: str | None  # joint whose servo or encoder is affected; None: all
+    share: float  # the probability that an answer is affected, for faults on the wire
 
     @classmethod
     def parsed(cls, text: str, joints: Collection[str], kinds: FaultKinds) -> AskedFault:

@@ -6,49 +6,77 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from functools import reduce
 from operator import and_
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
-from .device import Faults, OnlyAnswers, Reply, Sampling, byte_s, no_faults
+from bodyschema.drivers.servos.model import Model
+
+from .device import Angle, Faults, OnlyAnswers, Reply, Sampling, byte_s, no_faults
 
 FORGET_AFTER_S = 0.02  # an incomplete instruction is discarded after this pause
 BAUD_TOLERANCE = 0.03
 
 
-class AnyServo(Protocol):
-    """Interface of an emulated servo, which can be tampered with."""
+class EmulatedServo(ABC):
+    """An emulated servo: a control table, and a shaft whose angle is given.
 
-    glitch_ticks: int
+    Attributes:
+        glitch_ticks: error of the encoder [ticks].
+    """
+
+    delay_unit_us: ClassVar[int]
+    """Unit of the register of the return delay."""
+
+    def __init__(self, model: Model, angle: Angle) -> None:
+        """Start with an empty control table.
+
+        Args:
+            angle: shaft angle [rad] as a function of time [s]; 0 in the middle of its range, any number of turns.
+        """
+        self.model, self.glitch_ticks, self._angle = model, 0, angle
+        self._memory = bytearray(model.layout.size)
+        self._registered: tuple[int, bytes] | None = None  # a write that waits for ACTION
+
+    @abstractmethod
+    def __getitem__(self, name: str) -> int:
+        """Return the value of a register."""
+
+    @abstractmethod
+    def __setitem__(self, name: str, value: int) -> None:
+        """Write a register permanently, as the servo itself does, bypassing all locks."""
+
+    @abstractmethod
+    def write(self, address: int, data: bytes, t: float) -> object:
+        """Write bytes of the control table where that is allowed."""
+
+    @abstractmethod
+    def reboot(self, t: float) -> None:
+        """Restart as after a power cycle."""
+
+    @abstractmethod
+    def fail(self, bits: int) -> None:
+        """Report a hardware error until the servo is rebooted."""
+
+    @property
+    @abstractmethod
+    def baud(self) -> int:
+        """Baud rate of the servo [bit/s]."""
 
     @property
     def id(self) -> int:
         """ID on the bus."""
-        ...
-
-    @property
-    def baud(self) -> int:
-        """Baud rate of the servo [bit/s]."""
-        ...
+        return self["id"]
 
     @property
     def return_delay_s(self) -> float:
         """Delay between instruction and answer [s]."""
-        ...
+        return self["return_delay"] * self.delay_unit_us * 1e-6
 
     def angle(self, t: float) -> float:
         """Return the shaft angle at `t` [rad]."""
-        ...
-
-    def reboot(self, t: float) -> None:
-        """Restart as after a power cycle."""
-
-    def __setitem__(self, name: str, value: int) -> None:
-        """Write a register as the servo itself does, bypassing all locks."""
-
-    def fail(self, bits: int) -> None:
-        """Report a hardware error until the servo is rebooted."""
+        return self._angle(t)
 
 
-ServoT = TypeVar("ServoT", bound=AnyServo)
+ServoT = TypeVar("ServoT", bound=EmulatedServo)
 
 
 class ServoChain(OnlyAnswers, ABC, Generic[ServoT]):
@@ -60,9 +88,7 @@ class ServoChain(OnlyAnswers, ABC, Generic[ServoT]):
 
     Attributes:
         servos: in the order of the cable.
-        faults: applied to the answers.
         samplings: by ID, time and angle of the last position sent.
-        instructions: number of instructions understood.
     """
 
     overhead: int
@@ -78,11 +104,7 @@ class ServoChain(OnlyAnswers, ABC, Generic[ServoT]):
         self._byte_s = 0.0
 
     def servo(self, id: int) -> ServoT:
-        """Return the first servo with this ID.
-
-        Raises:
-            KeyError: there is none.
-        """
+        """Return the first servo with this ID; raise KeyError if there is none."""
         for servo in self.servos:
             if servo.id == id:
                 return servo
@@ -159,6 +181,13 @@ class ServoChain(OnlyAnswers, ABC, Generic[ServoT]):
             begin, count = (reply[0].start, len(reply[0].data)) if reply else (t, size + self.overhead)
             t = begin + count * self._byte_s
         return replies
+
+    def _write_each(self, servos: list[ServoT], address: int, size: int, entries: bytes, t: float) -> None:
+        """Write the data of each entry of a SYNC_WRITE, an ID and `size` bytes, to the servos of that ID."""
+        for k in range(0, len(entries) - size, size + 1):
+            for servo in servos:
+                if servo.id == entries[k]:
+                    servo.write(address, entries[k + 1 : k + 1 + size], t)
 
 
 def mixed(packets: list[bytes]) -> bytes:

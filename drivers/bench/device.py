@@ -13,19 +13,15 @@ from bodyschema.drivers.echo import BITS_PER_BYTE
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """An answer in transit.
+    """An answer in transit."""
 
-    Attributes:
-        id: ID of the sender (of the first one, for a common answer).
-        start: when its first byte is on the wire [s].
-        data: its bytes; empty when it is not sent.
-    """
-
-    id: int
-    start: float
-    data: bytes
+    id: int  # ID of the sender (of the first one, for a common answer)
+    start: float  # when its first byte is on the wire [s]
+    data: bytes  # its bytes; empty when it is not sent
 
 
+Angle = Callable[[float], float]
+"""Angle [rad] as a function of time [s]."""
 Fault = Callable[[Reply, Random], Reply]
 
 

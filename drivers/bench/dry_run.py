@@ -17,7 +17,6 @@ EVERY_S = 10.0  # period of recurring faults
 UNPLUGGED_S = 3.0
 GLITCH_S, GLITCH_TICKS = 0.1, 700
 
-Angle = Callable[[float], float]
 Event = tuple[float, str, Callable[[], None]]
 
 
@@ -57,7 +56,6 @@ class DryRun:
     """An emulated arm as configured, each bus behind its own port. A context manager.
 
     Attributes:
-        arm: the devices behind the ports.
         config: the configuration with its ports replaced by the emulator's.
         shells: pseudo-terminals, by name of the bus.
     """

@@ -42,14 +42,10 @@ def half(reply: Reply, rng: Random) -> Reply:
     return replace(reply, data=reply.data[: rng.randrange(1, len(reply.data))])
 
 
-def garbage(most_bytes: int = 12) -> Fault:
-    """Return a fault that puts random bytes before or after the answer."""
-
-    def fault(reply: Reply, rng: Random) -> Reply:
-        noise = rng.randbytes(rng.randint(1, most_bytes))
-        return replace(reply, data=noise + reply.data if rng.random() < 0.5 else reply.data + noise)
-
-    return fault
+def garbage(reply: Reply, rng: Random) -> Reply:
+    """Put up to twelve random bytes before or after the answer."""
+    noise = rng.randbytes(rng.randint(1, 12))
+    return replace(reply, data=noise + reply.data if rng.random() < 0.5 else reply.data + noise)
 
 
 class Planned:
@@ -80,11 +76,7 @@ class Planned:
 
 
 class Storm:
-    """Random faults.
-
-    Attributes:
-        struck: how often each fault occurred.
-    """
+    """Random faults."""
 
     def __init__(self, shares: Mapping[str, tuple[float, Fault]], rng: Random) -> None:
         """Start with all counts at zero.
@@ -116,7 +108,7 @@ def storm(intensity: float, rng: Random, *others: Fault, longest_late_s: float =
         "wrong checksum": wrong_checksum,
         "corrupt": corrupt(),
         "half": half,
-        "garbage": garbage(),
+        "garbage": garbage,
         **{f"other {k}": fault for k, fault in enumerate(others, 1)},
     }
     return Storm({name: (intensity / len(faults), fault) for name, fault in faults.items()}, rng)

@@ -12,13 +12,13 @@ from typing import Any, ClassVar, Generic, TypeVar
 import msgspec
 import numpy as np
 
-from bodyschema.drivers.bench.dry_run import GLITCH_TICKS, Angle
+from bodyschema.drivers.bench.dry_run import GLITCH_TICKS
 from bodyschema.drivers.servos.config import ServoConfig, ServosConfig
 from bodyschema.interfaces.records import FloatArray, frozen_array
 
 from .asked_faults import AskedFault, FaultKinds, WireFaults
 from .chain import ServoChain, ServoT
-from .device import Faults
+from .device import Angle, Faults
 from .dry_run import BenchArm
 
 
@@ -40,8 +40,6 @@ def played(path: FloatArray, rate_hz: float, begin_s: float) -> list[Angle]:
 
     Args:
         path: angles [rad], shape (n, d) with n > 1.
-        rate_hz: rows per second.
-        begin_s: start time [s].
     """
     path = frozen_array(path)
     rows = np.arange(len(path), dtype=np.float64)
@@ -97,10 +95,7 @@ class ServoArm(BenchArm, Generic[ServoT, ConfigT]):
         """Create the servos with their power on.
 
         Args:
-            config: checked configuration.
             angles: by joint, its angle as a function of time [rad].
-            return_delay_s: return delay of all servos.
-            seed: of the faults on the wire.
         """
         self._config, self._return_delay_s, self._rng, self._now = config, return_delay_s, Random(seed), now
         self._servos: dict[str, ServoT] = {}
@@ -137,7 +132,6 @@ class ServoArm(BenchArm, Generic[ServoT, ConfigT]):
         return sum(chain.instructions for chain in self.chains.values())
 
     def servo(self, joint: str) -> ServoT:
-        """Return the servo of a joint."""
         return self._servos[joint]
 
     def at_ports(self, ports: Mapping[str, str]) -> ConfigT:

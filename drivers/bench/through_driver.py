@@ -11,7 +11,7 @@ from bodyschema.interfaces.protocols import JointSource
 from bodyschema.interfaces.records import JointReading, frozen_array
 from bodyschema.interfaces.servos import BusStatus, ServoStatus
 
-from .dry_run import Angle
+from .device import Angle
 
 ATTEMPTS = 5
 READ_S = 0.5
@@ -21,14 +21,10 @@ LATENCY_MS = 40.0
 
 @dataclass(frozen=True)
 class Behind:
-    """An open driver and its emulator.
+    """An open driver and its emulator."""
 
-    Attributes:
-        driver: the open driver.
-        look: reads the emulated joints at their present angles; None when the reading failed.
-    """
-
-    driver: JointSource
+    driver: JointSource  # the open driver
+    # reads the emulated joints at their present angles; None when the reading failed
     look: Callable[[], JointReading | None]
 
 
@@ -48,7 +44,6 @@ class ThroughDriver:
 
         Args:
             source: gives the angles; its clock advances only while it is read.
-            open_bench: creates the emulator and opens the driver.
         """
         self._source, self._open_bench = source, open_bench
         self._opened = ExitStack()

@@ -23,63 +23,37 @@ class Drop(Exception):
 
 @dataclass(frozen=True, slots=True)
 class GuardLimits:
-    """Limits that must not be exceeded.
+    """Limits that must not be exceeded."""
 
-    Attributes:
-        joints: names, in the order of all arrays (n,).
-        heartbeat_s: longest time between two checks.
-        doubtful_cycles: torque goes off after this many consecutive checks without a reading.
-        max_speed: of each joint [rad/s].
-        current_limit: of each joint [A]; infinite where it is not monitored.
-        overcurrent_s: longest time that a current may exceed its limit.
-        max_temperature_c: a servo at this or above is too hot.
-    """
-
-    joints: tuple[str, ...]
-    heartbeat_s: float
-    doubtful_cycles: int
-    max_speed: FloatArray
-    current_limit: FloatArray
-    overcurrent_s: float
-    max_temperature_c: float
+    joints: tuple[str, ...]  # names, in the order of all arrays (n,)
+    heartbeat_s: float  # longest time between two checks
+    doubtful_cycles: int  # torque goes off after this many consecutive checks without a reading
+    max_speed: FloatArray  # of each joint [rad/s]
+    current_limit: FloatArray  # of each joint [A]; infinite where it is not monitored
+    overcurrent_s: float  # longest time that a current may exceed its limit
+    max_temperature_c: float  # a servo at this or above is too hot
 
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """One reading of the joints with torque, arrays (n,).
+    """One reading of the joints with torque, arrays (n,)."""
 
-    Attributes:
-        t: of the reading [s].
-        q: angles [rad].
-        velocity: as reported by the servos [rad/s].
-        current: measured [A], 0 where it is not.
-        alert: True for a servo that reports a fault.
-    """
-
-    t: float
-    q: FloatArray
-    velocity: FloatArray
-    current: FloatArray
-    alert: Sequence[bool]
+    t: float  # of the reading [s]
+    q: FloatArray  # angles [rad]
+    velocity: FloatArray  # as reported by the servos [rad/s]
+    current: FloatArray  # measured [A], 0 where it is not
+    alert: Sequence[bool]  # True for a servo that reports a fault
 
 
 @dataclass(frozen=True, slots=True)
 class ServoState:
-    """Part of one servo's control table while it has torque.
+    """Part of one servo's control table while it has torque."""
 
-    Attributes:
-        has_torque: its torque is on.
-        trouble: its hardware error, in words; empty when there is none.
-        watchdog: Bus Watchdog: negative after it has fired, 0 while it is not armed.
-        took_goal: its goal is the one that was sent last.
-        temperature_c: measured [°C].
-    """
-
-    has_torque: bool
-    trouble: str
-    watchdog: int
-    took_goal: bool
-    temperature_c: float
+    has_torque: bool  # its torque is on
+    trouble: str  # its hardware error, in words; empty when there is none
+    watchdog: int  # Bus Watchdog: negative after it has fired, 0 while it is not armed
+    took_goal: bool  # its goal is the one that was sent last
+    temperature_c: float  # measured [°C]
 
 
 class Guard:
@@ -112,11 +86,7 @@ class Guard:
             self._check(now, motion)
 
     def check_servo(self, joint: str, state: ServoState) -> None:
-        """Check the reported state of one servo, at intervals.
-
-        Raises:
-            Drop: it violates a limit.
-        """
+        """Check the reported state of one servo, at intervals; raise Drop if it violates a limit."""
         with self._lasting():
             self._check_servo(joint, state)
 
@@ -211,10 +181,8 @@ class Currents:
         """Store arrays of shape (n,).
 
         Args:
-            joints: names.
             torque_constant: of each joint [N·m/A].
             current_limit: of each joint [A].
-            ramp_s: duration of the ramp.
             share: of the torque that is applied, up to 1.
         """
         self._joints = tuple(joints)

@@ -39,13 +39,7 @@ class ZeroForce(PoweredJoints):
         torques: HoldingTorques,
         clock: Clock,
     ) -> None:
-        """Start with torque off.
-
-        Args:
-            config: the servos; checked.
-            joints: all, in the order of q.
-            torques: returns the holding torques.
-        """
+        """Start with torque off."""
         floating = [joint for joint in joints if joint in zero_force.joints]
         servos = {servo.joint: servo for servo in config.servos}
         limit = frozen_array([zero_force.joints[joint].current_limit_a for joint in floating])

@@ -44,11 +44,7 @@ _decode = msgspec.json.Decoder(Datagram).decode
 
 
 def decode_datagram(payload: bytes, _: bytes = b"") -> Iterator[Report]:
-    """Yield the position in a datagram.
-
-    Raises:
-        Unusable: it is no such JSON, or has numbers that are not finite.
-    """
+    """Yield the position in a datagram; raise Unusable if it is no such JSON, or not finite."""
     if len(payload) > LARGEST_BYTES:
         raise Unusable(Fault.MALFORMED, f"{len(payload)} bytes are more than a position has")
     try:

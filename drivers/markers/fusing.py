@@ -51,16 +51,12 @@ CHI2_999, CHI2_MEDIAN = 16.27, 2.37  # of 3 degrees of freedom
 
 @dataclass(frozen=True, slots=True)
 class Common:
-    """Positions of two sources at one time.
+    """Positions of two sources at one time."""
 
-    Attributes:
-        lead, other: positions [m], (3,).
-        cov: covariance of their difference [m²], (3, 3).
-    """
-
+    # lead, other: positions [m], (3,)
     lead: FloatArray
     other: FloatArray
-    cov: FloatArray
+    cov: FloatArray  # covariance of their difference [m²], (3, 3)
 
     @property
     def chi2(self) -> float:
@@ -74,7 +70,6 @@ class Member:
 
     Attributes:
         name: in messages.
-        source: gives the positions.
         pose: of the source's frame in the measurement frame, (4, 4).
         newest_t: time of its newest position or miss [s].
         common: its positions beside the leading source's.

@@ -86,11 +86,7 @@ class KeyReceiver:
         self._link: ZenohLink | None = None
 
     def open(self) -> None:
-        """Subscribe.
-
-        Raises:
-            SourceLost: the router is not there.
-        """
+        """Subscribe; raise SourceLost if the router is not there."""
         try:
             session = open_session(self._table.router)
         except SourceLost as error:

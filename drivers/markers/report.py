@@ -68,44 +68,26 @@ class Unusable(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Packet:
-    """A message as it arrived.
-
-    Attributes:
-        payload: its bytes.
-        sender: tells senders apart.
-        arrived: time of arrival [s].
-        attached: attachment of rmw_zenoh; empty without one.
-    """
+    """A message as it arrived."""
 
     payload: bytes
-    sender: Hashable
-    arrived: float
-    attached: bytes = b""
+    sender: Hashable  # tells senders apart
+    arrived: float  # time of arrival [s]
+    attached: bytes = b""  # attachment of rmw_zenoh; empty without one
 
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """A decoded position, in the sender's unit.
+    """A decoded position, in the sender's unit."""
 
-    Attributes:
-        x: position, 3 numbers; None where the body is not tracked.
-        stamp_ns: time on the sender's clock [ns]; None without one.
-        age_s: by how much the measurement is older than its stamp, by the sender's own clock [s].
-        seq: number of the message among all of its sender, for counting lost ones.
-        turn: quaternion (x, y, z, w), or None.
-        cov: 9 numbers by rows, or 36 with the rotation's; or None.
-        spread: 1-sigma that the sender estimates for this position, in its unit.
-        body, frame: names, where there are any.
-        where: the names by which robot.toml may call the body.
-    """
-
-    x: tuple[float, ...] | None
-    stamp_ns: int | None = None
-    age_s: float = 0.0
-    seq: int | None = None
-    turn: tuple[float, ...] | None = None
-    cov: tuple[float, ...] | None = None
-    spread: float = 0.0
+    x: tuple[float, ...] | None  # position, 3 numbers; None where the body is not tracked
+    stamp_ns: int | None = None  # time on the sender's clock [ns]; None without one
+    age_s: float = 0.0  # by how much the measurement is older than its stamp, by the sender's own clock [s]
+    seq: int | None = None  # number of the message among all of its sender, for counting lost ones
+    turn: tuple[float, ...] | None = None  # quaternion (x, y, z, w), or None
+    cov: tuple[float, ...] | None = None  # 9 numbers by rows, or 36 with the rotation's; or None
+    spread: float = 0.0  # 1-sigma that the sender estimates for this position, in its unit
+    # body, frame: names, where there are any
     body: str | None = None
     frame: str | None = None
-    where: tuple[str, ...] = ()
+    where: tuple[str, ...] = ()  # the names by which robot.toml may call the body

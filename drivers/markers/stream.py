@@ -47,11 +47,7 @@ USED = "used"
 
 
 class Ledger:
-    """Counters of used and unused messages, in total and of the last `lately_s`; for any thread.
-
-    Attributes:
-        total: number of messages by fault, and the used ones.
-    """
+    """Counters of used and unused messages, in total and of the last `lately_s`; for any thread."""
 
     def __init__(self) -> None:
         self.total: Counter[str] = Counter()
@@ -137,10 +133,6 @@ class MarkerStream:
 
     The sender's clock is mapped to ours by the fastest messages. Unusable messages are dropped and counted; `health`
     names them with the remedy.
-
-    Attributes:
-        name: in messages.
-        ledger: what came of the messages.
     """
 
     def __init__(self, table: SourceTable, receiver: Receiver, decode: Decode, clock: Clock) -> None:
@@ -390,7 +382,6 @@ def stream_checks(stream: MarkerStream, clock: Clock, read_s: float = READ_S) ->
 
     Args:
         stream: not open; it is closed again afterwards.
-        read_s: duration of the look [s].
     """
     subject = f"marker source {stream.name}"
     try:

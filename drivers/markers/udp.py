@@ -73,11 +73,7 @@ class UdpReceiver:
         self._strangers = 0
 
     def open(self) -> None:
-        """Listen.
-
-        Raises:
-            SourceLost: another program does so already, or the address is not this machine's.
-        """
+        """Listen; raise SourceLost if another program does so already, or the address is not this machine's."""
         try:
             self._socket = listening(self._table.host, self._table.port)
         except OSError as error:

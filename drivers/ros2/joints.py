@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from typing import Self
 
+from bodyschema.drivers.checks import MANY_TROUBLES, READ_S, Check, warned
 from bodyschema.drivers.ros2 import rmw
 from bodyschema.drivers.ros2.cdr import Malformed
 from bodyschema.drivers.ros2.config import Ros2Config
@@ -19,28 +21,20 @@ from bodyschema.drivers.ros2.senders import Gates, Refusal, Sender
 from bodyschema.interfaces.errors import SourceError, SourceLost
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import JointReading, frozen_array
-from bodyschema.interfaces.waits import RIVAL_AFTER_S, SILENT_AFTER_S
+from bodyschema.interfaces.waits import POLL_S, RIVAL_AFTER_S, SILENT_AFTER_S
 
 LONGEST = 4096
 
 
 @dataclass(frozen=True, slots=True)
 class Merged:
-    """All joints at one time.
+    """All joints at one time."""
 
-    Attributes:
-        t: the time of a message [s], never between two messages.
-        stamp_ns: that message's stamp.
-        q: positions.
-        gap_s: the longest time between the two messages that a joint's position was interpolated from.
-        sigma_s: the largest 1-sigma of their times.
-    """
-
-    t: float
-    stamp_ns: int
-    q: tuple[float, ...]
-    gap_s: float
-    sigma_s: float
+    t: float  # the time of a message [s], never between two messages
+    stamp_ns: int  # that message's stamp
+    q: tuple[float, ...]  # positions
+    gap_s: float  # the longest time between the two messages that a joint's position was interpolated from
+    sigma_s: float  # the largest 1-sigma of their times
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,7 +187,6 @@ class Ros2Joints:
 
     Attributes:
         joints: names of the joints in the order of q.
-        received: number of messages since creation.
         refused: messages and readings that were not used, by reason.
         lost: messages that never arrived, by the senders' own count.
         stamp_ns: the robot's own stamp of the newest reading [ns], or None before any.
@@ -212,9 +205,7 @@ class Ros2Joints:
 
         Args:
             config: checked; see `Ros2Config.check`.
-            joints: in the order of q.
             prismatic: True for each prismatic joint; none by default.
-            open_link: opens the link to the router.
         """
         self._config, self.joints, self._clock, self._open_link = config, tuple(joints), clock, open_link
         self._wanted = config.ros_names(joints)
@@ -371,3 +362,64 @@ class Ros2Joints:
         missing = [self._wanted[place] for place in self._merging.missing()]
         self._complaint = silence(self._config, missing, self._names, self._lately, link.tokens)
         log.warning("%s", self._complaint)
+
+
+FEW_PER_S = 20.0
+LAST_PART = re.compile(r"[;.] (?!.*[;.] )", re.DOTALL)
+
+
+def joint_state_checks(
+    config: Ros2Config,
+    joints: Sequence[str],
+    clock: Clock,
+    *,
+    prismatic: Sequence[bool] | None = None,
+    open_link: OpenLink = open_zenoh,
+) -> Iterator[Check]:
+    """Yield checks of the router, of the joints and of their rate. Open a session for that.
+
+    Args:
+        joints, prismatic, open_link: as for `Ros2Joints`.
+    """
+    try:
+        with Ros2Joints(config, joints, clock, prismatic=prismatic, open_link=open_link) as robot:
+            yield Check("router", "ok", f"{config.router} answers")
+            if not _begins(robot, clock):
+                yield Check("joint states", "wrong", *_parted(robot.health))
+                return
+            yield Check("joint states", "ok", f"all {len(joints)} joints of robot.toml are in {config.topic}")
+            lost, heard = _counted(robot)
+            end, readings = clock.now() + READ_S, 0
+            while clock.now() < end:
+                readings += robot.read(end - clock.now()) is not None
+            lost_since, heard_since = _counted(robot)
+            rate_hz, lost, messages = readings / READ_S, lost_since - lost, heard_since - heard
+            fix = "let the robot's nodes publish more often"
+            yield warned("rate", f"{rate_hz:.0f} readings/s come", fix, when=rate_hz < FEW_PER_S)
+            fix = "bodyschema watch joints    # its log says why, once for each reason"
+            said = f"{lost} of {messages} messages were lost or not used"
+            yield warned("errors", said, fix, when=lost > MANY_TROUBLES * messages)
+    except SourceError as error:
+        yield Check("router", "wrong", *_parted((str(error),)))
+
+
+def _begins(robot: Ros2Joints, clock: Clock) -> bool:
+    """Return True if a reading arrives before the robot counts as silent."""
+    end = clock.now() + SILENT_AFTER_S + POLL_S
+    while clock.now() < end:
+        if robot.read(POLL_S) is not None:
+            return True
+    return False
+
+
+def _parted(complaints: Sequence[str]) -> tuple[str, str]:
+    """Split a complaint into what was found and its last part, what to do."""
+    if not complaints:
+        return "too few joint states come", "let the robot's nodes publish more often"
+    *said, fix = LAST_PART.split(complaints[0])
+    return "".join(said), fix
+
+
+def _counted(robot: Ros2Joints) -> tuple[int, int]:
+    """Return the number of unusable messages, and of all messages sent, so far."""
+    return robot.lost + robot.refused.total(), robot.lost + robot.received

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import queue
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -25,17 +26,11 @@ GRAPH_LIMIT_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """A received message.
-
-    Attributes:
-        payload: its bytes.
-        attached: attachment of rmw_zenoh; empty without one.
-        arrived: time of arrival [s].
-    """
+    """A received message."""
 
     payload: bytes
-    attached: bytes
-    arrived: float
+    attached: bytes  # attachment of rmw_zenoh; empty without one
+    arrived: float  # time of arrival [s]
 
 
 class Link(Protocol):
@@ -102,7 +97,6 @@ class ZenohLink:
         """Subscribe to `key`; the session is closed with the link."""
         self._session, self._clock = session, clock
         self._waiting: queue.Queue[Sample] = queue.Queue(WAITING)
-        self.overflowed = 0
         # In zenoh's own thread, so that the time of arrival does not depend on the reader.
         handler = zenoh.handlers.Callback(self._take, indirect=False)
         self._subscriber = session.declare_subscriber(key, handler)
@@ -129,10 +123,8 @@ class ZenohLink:
 
     def _take(self, sample: zenoh.Sample) -> None:
         attached = b"" if sample.attachment is None else sample.attachment.to_bytes()
-        try:
+        with suppress(queue.Full):
             self._waiting.put_nowait(Sample(sample.payload.to_bytes(), attached, self._clock.now()))
-        except queue.Full:
-            self.overflowed += 1
 
 
 def open_zenoh(config: Ros2Config, clock: Clock) -> Link:

@@ -11,15 +11,10 @@ NANO = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class MessageType:
-    """A message's type as rmw_zenoh names it.
+    """A message's type as rmw_zenoh names it."""
 
-    Attributes:
-        name: the DDS name.
-        digest: hash of its definition, the same from ROS 2 Iron on (REP-2011).
-    """
-
-    name: str
-    digest: str
+    name: str  # the DDS name
+    digest: str  # hash of its definition, the same from ROS 2 Iron on (REP-2011)
 
 
 JOINT_STATE = MessageType(
@@ -39,33 +34,22 @@ TF_MESSAGE = MessageType(
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """std_msgs/Header.
+    """std_msgs/Header."""
 
-    Attributes:
-        stamp_ns: time since the epoch of the sender's clock [ns].
-        frame: name of the frame.
-    """
-
-    stamp_ns: int
-    frame: str = ""
+    stamp_ns: int  # time since the epoch of the sender's clock [ns]
+    frame: str = ""  # name of the frame
 
 
 @dataclass(frozen=True, slots=True)
 class JointState:
-    """sensor_msgs/JointState.
-
-    Attributes:
-        names: of the joints.
-        positions: one per name [rad], [m] for a prismatic joint; or none. The same holds for velocities and efforts.
-        velocities: [rad/s] or [m/s].
-        efforts: [N m] or [N].
-    """
+    """sensor_msgs/JointState."""
 
     header: Header
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # of the joints
+    # one per name [rad], [m] for a prismatic joint; or none. The same holds for velocities and efforts.
     positions: tuple[float, ...] = ()
-    velocities: tuple[float, ...] = ()
-    efforts: tuple[float, ...] = ()
+    velocities: tuple[float, ...] = ()  # [rad/s] or [m/s]
+    efforts: tuple[float, ...] = ()  # [N m] or [N]
 
 
 def decode_joint_state(data: bytes) -> JointState:
@@ -84,7 +68,6 @@ def decode_joint_state(data: bytes) -> JointState:
 
 
 def encode_joint_state(message: JointState, *, big_endian: bool = False) -> bytes:
-    """Encode the message."""
     writer = CdrWriter(big_endian=big_endian)
     write_header(writer, message.header)
     writer.strings(message.names)
@@ -123,7 +106,6 @@ def encode_transform(header: Header, child: str, x: tuple[float, ...], quaternio
 
     Args:
         header: of the transform; its frame is the parent.
-        child: the frame.
         x: its position in the parent [m], 3 numbers.
         quaternion: its orientation (x, y, z, w).
     """
@@ -137,11 +119,7 @@ def encode_transform(header: Header, child: str, x: tuple[float, ...], quaternio
 
 
 def read_header(reader: CdrReader) -> Header:
-    """Read std_msgs/Header.
-
-    Raises:
-        Malformed: an invalid stamp.
-    """
+    """Read std_msgs/Header; raise Malformed if its stamp is invalid."""
     seconds, nanoseconds = reader.int32(), reader.uint32()
     if nanoseconds >= NANO:
         raise Malformed(f"{nanoseconds} nanoseconds in a stamp")

@@ -61,10 +61,6 @@ class StampClock:
         """Return the host's time [s] at `stamp_ns`, later than that of any earlier stamp.
 
         Return None when stamp and arrival do not fit together.
-
-        Args:
-            stamp_ns: later than all before.
-            arrived: arrival of the message [s].
         """
         if self._is_early(stamp_ns, arrived):
             return None

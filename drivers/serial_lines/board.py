@@ -14,21 +14,12 @@ DOUBTS = 5  # consecutive implausible lines: the board was restarted, or the pro
 
 @dataclass
 class Counts:
-    """Number of lines by outcome.
+    """Number of lines by outcome."""
 
-    Attributes:
-        lines: intact readings in order.
-        garbled: damaged lines.
-        missing: by the gaps in the sequence.
-        out_of_order: arrived after a later one, or twice.
-        of_another_time: rejected by the board's clock.
-    """
-
-    lines: int = 0
-    garbled: int = 0
-    missing: int = 0
-    out_of_order: int = 0
-    of_another_time: int = 0
+    lines: int = 0  # intact readings in order
+    garbled: int = 0  # damaged lines
+    missing: int = 0  # by the gaps in the sequence
+    out_of_order: int = 0  # arrived after a later one, or twice
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,8 +65,6 @@ class Board:
     """A board's lines since it was opened.
 
     Attributes:
-        header: the board's header, once received.
-        counts: number of lines by outcome.
         restarted: the board was restarted, by its header or its clock.
     """
 
@@ -136,7 +125,6 @@ class Board:
             self.counts.missing += ahead - 1
         t = self._clock.time(begun, reading.t_us)
         if t is None:
-            self.counts.of_another_time += 1
             self._doubt()
             return
         self._seq, self._doubts = reading.seq, 0

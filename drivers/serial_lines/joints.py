@@ -5,12 +5,12 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Self
 
 from bodyschema.drivers.checks import MANY_TROUBLES, READ_S, Check, aligned, warned
-from bodyschema.drivers.echo import BITS_PER_BYTE, Port
+from bodyschema.drivers.echo import BITS_PER_BYTE, Port, close_quietly
 from bodyschema.drivers.serial_line import RETRY_S, SerialLine
 from bodyschema.drivers.serial_lines.config import SerialLinesConfig
 from bodyschema.drivers.turn_count import LOST_AFTER_S, TurnCount
@@ -45,23 +45,16 @@ OpenPort = Callable[[SerialLinesConfig, Clock], Port]
 
 
 def open_serial(config: SerialLinesConfig, clock: Clock) -> Port:
-    """Open the port."""
     return SerialLine.open(config.port, config.baud, clock.now)
 
 
 @dataclass(frozen=True, slots=True)
 class Encoder:
-    """An encoder as announced by the board.
+    """An encoder as announced by the board."""
 
-    Attributes:
-        config: its entry in robot.toml.
-        place: its place in the board's lines.
-        ticks_per_turn: ticks after which the reading repeats.
-    """
-
-    config: EncoderConfig
-    place: int
-    ticks_per_turn: int
+    config: EncoderConfig  # its entry in robot.toml
+    place: int  # its place in the board's lines
+    ticks_per_turn: int  # ticks after which the reading repeats
 
     @property
     def joint(self) -> str:
@@ -115,7 +108,6 @@ class SerialLineJoints:
 
         Args:
             config: checked; see `SerialLinesConfig.check`.
-            joints: in the order of q.
             limits: of each joint [rad]; a range below one turn determines the turn.
             last_pose: last joint angles [rad], shape (d,), from which turns are counted.
         """
@@ -169,7 +161,7 @@ class SerialLineJoints:
     def __enter__(self) -> Self:
         port = self._open_port(self._config, self._clock)
         with ExitStack() as stack:
-            stack.callback(_close, port)
+            stack.callback(close_quietly, port)
             self._begin(port)
             stack.pop_all()
         self._port = port
@@ -179,7 +171,7 @@ class SerialLineJoints:
 
     def __exit__(self, *_: object) -> None:
         if self._port is not None:
-            _close(self._port)
+            close_quietly(self._port)
             self._port = None
 
     def read(self, timeout_s: float) -> JointReading | None:
@@ -339,22 +331,15 @@ def _complaint(joint: str) -> str:
     return f"joint {joint!r}: its encoder has no value: look at its cable, and at the magnet's distance"
 
 
-def _close(port: Port) -> None:
-    with suppress(SourceError):
-        port.close()
-
-
-def encoder_checks(
-    config: SerialLinesConfig, joints: Sequence[str], clock: Clock, *, read_s: float = READ_S
-) -> Iterator[Check]:
+def encoder_checks(config: SerialLinesConfig, joints: Sequence[str], clock: Clock) -> Iterator[Check]:
     """Yield checks of the configured encoders and of their reading rate. Open the port for that."""
     try:
         with SerialLineJoints(config, joints, clock) as encoders:
             yield Check("encoders", "ok", f"all {len(joints)} of robot.toml are in the board's header")
-            end, readings = clock.now() + read_s, 0
+            end, readings = clock.now() + READ_S, 0
             while clock.now() < end:
                 readings += encoders.read(end - clock.now()) is not None
-            rate_hz, counts = readings / read_s, encoders.counts
+            rate_hz, counts = readings / READ_S, encoders.counts
             fix = "a higher rate of the UART, fewer other things that the board does"
             yield warned("rate", f"{rate_hz:.0f} readings/s come", fix, when=rate_hz < _Settings.few_per_s)
             lost = counts.garbled + counts.missing

@@ -31,30 +31,19 @@ class GarbledLine(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """Header of a board.
+    """Header of a board."""
 
-    Attributes:
-        boot: a new random number at each start.
-        encoders: by name, ticks after which the reading repeats.
-    """
-
-    boot: int
-    encoders: dict[str, int]
+    boot: int  # a new random number at each start
+    encoders: dict[str, int]  # by name, ticks after which the reading repeats
 
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """A measurement of a board.
+    """A measurement of a board."""
 
-    Attributes:
-        seq: one more than before, modulo 2^16.
-        t_us: the board's time in the middle of the measurement [µs], modulo 2^32.
-        ticks: raw, in the order of the header; None where the sensor fails.
-    """
-
-    seq: int
-    t_us: int
-    ticks: tuple[int | None, ...]
+    seq: int  # one more than before, modulo 2^16
+    t_us: int  # the board's time in the middle of the measurement [µs], modulo 2^32
+    ticks: tuple[int | None, ...]  # raw, in the order of the header; None where the sensor fails
 
 
 def crc_ccitt(data: bytes) -> int:
@@ -69,11 +58,7 @@ def with_checksum(content: str) -> bytes:
 
 
 def parse(line: bytes) -> Header | Reading:
-    """Parse a line without its line feed.
-
-    Raises:
-        GarbledLine: it is not intact.
-    """
+    """Parse a line without its line feed; raise GarbledLine if it is not intact."""
     found = _LINE.fullmatch(line)
     if found is None or crc_ccitt(found[1]) != int(found[2], 16):
         raise GarbledLine

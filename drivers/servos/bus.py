@@ -55,23 +55,14 @@ class Trouble(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Request:
-    """A request and the servos that answer it.
+    """A request and the servos that answer it."""
 
-    Attributes:
-        packet: returns the bytes to send for a number of data bytes per servo.
-        ids: servos that answer, in this order.
-        size: data bytes wanted from each.
-        protocol: version of the vendor's protocol.
-        spare: how many extra bytes may be requested, to tell its answers from late ones to an earlier request.
-        is_fast: all answer in one packet.
-    """
-
-    packet: Callable[[int], bytes]
-    ids: tuple[int, ...]
-    size: int
-    protocol: int
-    spare: int = 0
-    is_fast: bool = False
+    packet: Callable[[int], bytes]  # returns the bytes to send for a number of data bytes per servo
+    ids: tuple[int, ...]  # servos that answer, in this order
+    size: int  # data bytes wanted from each
+    protocol: int  # version of the vendor's protocol
+    spare: int = 0  # how many extra bytes may be requested, to tell its answers from late ones to an earlier request
+    is_fast: bool = False  # all answer in one packet
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,7 +184,6 @@ class Bus(ABC):
         return self.packets_of(request.protocol).is_weak
 
     def write(self, model: Model, id: int, register: Register, data: bytes) -> Exchange:
-        """Write a register."""
         return self.tell(model.protocol, self.packets_of(model.protocol).write(id, register.address, data), id)
 
     def ping(self, model: Model, id: int) -> Exchange:
@@ -355,7 +345,6 @@ class Inbox:
     """Bytes received in answer to a request.
 
     Attributes:
-        received: all of them.
         at: number of bytes parsed.
         late: number of those in answers to earlier requests.
         arrived: time of the last arrival [s].

@@ -36,28 +36,18 @@ class _Settings:
 
 @dataclass(frozen=True, slots=True)
 class Sample:
-    """A servo's decoded answer.
+    """A servo's decoded answer."""
 
-    Attributes:
-        question: the bus, and the time of the request; the same for all answers to one request.
-        expected: time of the sample if nothing was delayed [s].
-        earliest, latest: bounds of the time of the sample [s].
-        ticks: position as reported.
-        velocity: [rad/s], in the servo's own direction.
-        current: [A], or None where it is not measured.
-        moving: the servo reports motion.
-        alert: the servo reports a fault; its position is valid nevertheless.
-    """
-
-    question: tuple[str, float]
-    expected: float
+    question: tuple[str, float]  # the bus, and the time of the request; the same for all answers to one request
+    expected: float  # time of the sample if nothing was delayed [s]
+    # earliest, latest: bounds of the time of the sample [s]
     earliest: float
     latest: float
-    ticks: int
-    velocity: float
-    current: float | None
-    moving: bool
-    alert: bool
+    ticks: int  # position as reported
+    velocity: float  # [rad/s], in the servo's own direction
+    current: float | None  # [A], or None where it is not measured
+    moving: bool  # the servo reports motion
+    alert: bool  # the servo reports a fault; its position is valid nevertheless
 
     @property
     def middle(self) -> float:
@@ -69,7 +59,6 @@ class Channel(ABC):
     """The answers of one servo since the bus was opened.
 
     Attributes:
-        servo: the servo.
         newest: the last accepted sample.
         doubts: number of consecutive rejected answers.
         surprising: the newest sample deviates from the trend of the two before it.

@@ -27,29 +27,23 @@ SCAN = "`bodyschema scan --robot robot.toml` looks for them at all rates and IDs
 
 @dataclass(frozen=True, slots=True)
 class IdentifiedServo:
-    """A servo as it was found.
+    """A servo as it was found."""
 
-    Attributes:
-        joint: whose angle it tells.
-        bus: the name of its bus.
-        direction, zero_ticks: from its position to the joint's angle.
-        firmware, drive_mode, operating_mode, homing_offset, return_delay_s: as its control table says; a change of
-            them between two recordings is a change of calibration.
-        had_torque: its torque was on.
-    """
-
-    joint: str
-    bus: str
+    joint: str  # whose angle it tells
+    bus: str  # the name of its bus
     id: int
     model: Model
+    # direction, zero_ticks: from its position to the joint's angle
     direction: int
     zero_ticks: int | float
+    # firmware, drive_mode, operating_mode, homing_offset, return_delay_s: as its control table says; a change of them
+    # between two recordings is a change of calibration
     firmware: int
     drive_mode: int
     operating_mode: int
     homing_offset: int
     return_delay_s: float
-    had_torque: bool = False
+    had_torque: bool = False  # its torque was on
 
     @property
     def version(self) -> str:
@@ -178,11 +172,7 @@ def switch_torque_off(bus: Bus, servo: IdentifiedServo) -> IdentifiedServo:
 
 
 def torque_is_on(bus: Bus, servo: IdentifiedServo) -> bool:
-    """Return True if the servo's torque is on.
-
-    Raises:
-        SourceLost: it does not answer.
-    """
+    """Return True if the servo's torque is on; raise SourceLost if it does not answer."""
     data, trouble = read_register(bus, servo.model, servo.id, servo.model.layout["torque"])
     if data is None:
         raise SourceLost(f"joint {servo.joint!r} (ID {servo.id}): {trouble}", retry_s=RETRY_S)

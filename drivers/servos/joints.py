@@ -12,7 +12,7 @@ from contextlib import ExitStack, suppress
 from itertools import zip_longest
 from typing import Any, Self
 
-from bodyschema.drivers.echo import Port, without_echo
+from bodyschema.drivers.echo import Port, close_quietly, without_echo
 from bodyschema.drivers.serial_line import SerialLine, adapter_latency_s
 from bodyschema.drivers.servos.channel import Drive
 from bodyschema.drivers.servos.health import Inspection
@@ -71,8 +71,6 @@ class ServoJoints:
         drives: may move the joints on request.
         servos: as found at the last opening, in the order of the joints.
         epoch: how often it was opened. Only this comparison connects positions of different epochs.
-        dropped: number of dropped readings.
-        make: the vendor.
     """
 
     make: ServoVendor
@@ -92,8 +90,6 @@ class ServoJoints:
 
         Args:
             config: checked; see `ServosConfig.check`.
-            joints: in the order of q.
-            open_port: opens the port of a bus.
             limits: of each joint [rad]; a range below one turn determines the turn.
             last_pose: last joint angles [rad], shape (d,), from which turns are counted.
             drives: may move joints on request; without any, torque stays off.
@@ -236,7 +232,7 @@ class ServoJoints:
         for name, config in self._config.buses.items():
             self._health.away.add(name)
             port, latency_s = self._open_port(config, self._clock)
-            stack.callback(_close, port)
+            stack.callback(close_quietly, port)
             heard = without_echo(port, self._clock, latency_s)
             self._buses[name] = self.make.bus(name, heard, self._clock, latency_s)
             self._buses[name].counts = self._counts[name]
@@ -399,8 +395,3 @@ class ServoJoints:
             return True
         bus, *_ = self._buses.values()
         return bus.listen(t)
-
-
-def _close(port: Port) -> None:
-    with suppress(SourceError):
-        port.close()

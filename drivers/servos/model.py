@@ -11,19 +11,13 @@ from .packets import Status
 
 @dataclass(frozen=True, slots=True)
 class Register:
-    """A byte range of a control table.
-
-    Attributes:
-        signed: two's complement.
-        sign_bit: index of the sign bit, if the other bits are the magnitude.
-        order: byte order.
-    """
+    """A byte range of a control table."""
 
     address: int
     size: int
-    signed: bool = False
-    sign_bit: int | None = None
-    order: Literal["little", "big"] = "little"
+    signed: bool = False  # two's complement
+    sign_bit: int | None = None  # index of the sign bit, if the other bits are the magnitude
+    order: Literal["little", "big"] = "little"  # byte order
 
     def value(self, data: bytes) -> int:
         """Return the number in the register's bytes."""
@@ -51,23 +45,15 @@ class Register:
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Register addresses of a series.
+    """Register addresses of a series."""
 
-    Attributes:
-        protocol: version of the vendor's protocol.
-        registers: by name; the same names in all series.
-        block: range of one reading: the position and the values that validate it.
-        state: range that begins with torque and includes hardware_error, if that is a register and not the error byte.
-        ram: address of the first register that is volatile and never locked.
-        size: of the control table [bytes].
-    """
-
-    protocol: int
-    registers: Mapping[str, Register] = field(repr=False)
-    block: Register
+    protocol: int  # version of the vendor's protocol
+    registers: Mapping[str, Register] = field(repr=False)  # by name; the same names in all series
+    block: Register  # range of one reading: the position and the values that validate it
+    # range that begins with torque and includes hardware_error, if that is a register and not the error byte
     state: Register
-    ram: int
-    size: int
+    ram: int  # address of the first register that is volatile and never locked
+    size: int  # of the control table [bytes]
 
     def __getitem__(self, name: str) -> Register:
         return self.registers[name]
@@ -92,29 +78,17 @@ class Layout:
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """One model of servo.
+    """One model of servo."""
 
-    Attributes:
-        number: its model number.
-        name: as its maker writes it.
-        series: the series it belongs to.
-        layout: its register addresses.
-        rad_per_tick: a turn, or the measured range, divided by its number of ticks [rad].
-        ticks_per_turn: None for a sensor that does not wrap.
-        zero_ticks: the position that its manual calls 0°, in the middle of the range.
-        velocity_unit: of the register [rad/s].
-        current_unit: of the register [A]; None without such a sensor (the register then shows the load).
-    """
-
-    number: int
-    name: str
-    series: str
-    layout: Layout
-    rad_per_tick: float
-    ticks_per_turn: int | None
-    zero_ticks: int
-    velocity_unit: float
-    current_unit: float | None
+    number: int  # its model number
+    name: str  # as its maker writes it
+    series: str  # the series it belongs to
+    layout: Layout  # its register addresses
+    rad_per_tick: float  # a turn, or the measured range, divided by its number of ticks [rad]
+    ticks_per_turn: int | None  # None for a sensor that does not wrap
+    zero_ticks: int  # the position that its manual calls 0°, in the middle of the range
+    velocity_unit: float  # of the register [rad/s]
+    current_unit: float | None  # of the register [A]; None without such a sensor (the register then shows the load)
 
     @property
     def protocol(self) -> int:

@@ -12,19 +12,12 @@ class Garbled(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """A servo's answer.
+    """A servo's answer."""
 
-    Attributes:
-        id: the sender's ID as received.
-        error: the error byte as received.
-        data: without stuffing.
-        size: on the wire [bytes].
-    """
-
-    id: int
-    error: int
-    data: bytes
-    size: int
+    id: int  # the sender's ID as received
+    error: int  # the error byte as received
+    data: bytes  # without stuffing
+    size: int  # on the wire [bytes]
 
 
 class Packets(Protocol):

@@ -25,24 +25,15 @@ VOLT_PER_UNIT = 0.1  # for all series of all vendors; temperatures are in °C
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A servo vendor, or its servos with one version of its protocol.
+    """A servo vendor, or its servos with one version of its protocol."""
 
-    Attributes:
-        name: in words.
-        bauds: rates that robot.toml can name [bit/s].
-        version: of the vendor's protocol.
-        models: by number.
-        errors: meaning and remedy of each bit of the hardware error.
-        bus: class of its buses.
-        unsupported: names by number of models without a driver, because their control table differs.
-    """
-
-    name: str
-    bauds: tuple[int, ...]
-    version: int
-    models: Mapping[int, Model] = field(repr=False)
-    errors: Mapping[int, str] = field(repr=False)
-    bus: type[Bus]
+    name: str  # in words
+    bauds: tuple[int, ...]  # rates that robot.toml can name [bit/s]
+    version: int  # of the vendor's protocol
+    models: Mapping[int, Model] = field(repr=False)  # by number
+    errors: Mapping[int, str] = field(repr=False)  # meaning and remedy of each bit of the hardware error
+    bus: type[Bus]  # class of its buses
+    # names by number of models without a driver, because their control table differs
     unsupported: Mapping[int, str] = field(default_factory=dict[int, str], repr=False)
 
     @property

@@ -19,32 +19,22 @@ OTHER_ZERO = "the joint's zero moves: pairs measured before do not fit those aft
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """A number in a servo's EEPROM.
+    """A number in a servo's EEPROM."""
 
-    Attributes:
-        name: for commands.
-        register: where it is stored.
-        lowest, highest: its bounds.
-        words: named values. If there are any, no other value is allowed.
-        per_unit, unit: value and unit of one count, for display; no unit: a plain number.
-        follows: consequence of a change for a calibrated arm.
-    """
-
-    name: str
-    register: Register
+    name: str  # for commands
+    register: Register  # where it is stored
+    # lowest, highest: its bounds
     lowest: int
     highest: int
+    # named values. If there are any, no other value is allowed.
     words: Mapping[str, int] = field(default_factory=dict, repr=False)
+    # per_unit, unit: value and unit of one count, for display; no unit: a plain number
     per_unit: float = 1.0
     unit: str = ""
-    follows: str = ""
+    follows: str = ""  # consequence of a change for a calibrated arm
 
     def value(self, text: str) -> int:
-        """Parse the user's value.
-
-        Raises:
-            ConfigError: it is no value of this setting, or out of range.
-        """
+        """Parse the user's value; raise ConfigError if it is no value of this setting, or out of range."""
         if text in self.words:
             return self.words[text]
         try:
@@ -78,11 +68,7 @@ class Setting:
 
 
 def setting_called(name: str, settings: Mapping[str, Setting], model: str) -> Setting:
-    """Return the setting of that name.
-
-    Raises:
-        ConfigError: the model's EEPROM has none that may be written.
-    """
+    """Return the setting of that name; raise ConfigError if the model's EEPROM has none that may be written."""
     if name not in settings:
         what = f"{model} has no setting {name!r} that may be written"
         raise ConfigError(what, remedy=did_you_mean(name, settings))

@@ -18,16 +18,11 @@ from .settings import Setting
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """One method of reading a group of servos.
+    """One method of reading a group of servos."""
 
-    Attributes:
-        name: for messages.
-        requests: its requests.
-        complaint: what is wrong when the group fails to answer, though all its servos support it; None: some may not.
-    """
-
-    name: str
+    name: str  # for messages
     requests: tuple[Request, ...]
+    # what is wrong when the group fails to answer, though all its servos support it; None: some may not
     complaint: str | None = None
 
 
@@ -82,29 +77,19 @@ def one_by_one(bus: Bus, servos: Sequence[IdentifiedServo]) -> Way:
 
 @dataclass(frozen=True, slots=True)
 class ServoVendor:
-    """A servo vendor.
+    """A servo vendor."""
 
-    Attributes:
-        table: its table in robot.toml.
-        models: by number.
-        errors: meaning and remedy of each bit of the hardware error.
-        bus: class of its buses.
-        channel: creates the decoder of one servo's answers.
-        ways: returns the read methods of each group of servos on a bus, the fastest first.
-        settings: returns the EEPROM settings of a model that a command may change.
-        homing_sign: 1 where the homing offset is added to the sensor's value, −1 where it is subtracted.
-        tick_s: tick of the clock with which servos stamp their measurements [s]; 0 without one.
-    """
-
-    table: str
-    models: Mapping[int, Model] = field(repr=False)
-    errors: Mapping[int, str]
-    bus: type[Bus]
-    channel: Callable[[IdentifiedServo], Channel]
+    table: str  # its table in robot.toml
+    models: Mapping[int, Model] = field(repr=False)  # by number
+    errors: Mapping[int, str]  # meaning and remedy of each bit of the hardware error
+    bus: type[Bus]  # class of its buses
+    channel: Callable[[IdentifiedServo], Channel]  # creates the decoder of one servo's answers
+    # returns the read methods of each group of servos on a bus, the fastest first
     ways: Callable[[Bus, Sequence[IdentifiedServo], Any], Sequence[Sequence[Way]]]
-    settings: Callable[[Model], Sequence[Setting]]
+    settings: Callable[[Model], Sequence[Setting]]  # returns the EEPROM settings of a model that a command may change
+    # 1 where the homing offset is added to the sensor's value, −1 where it is subtracted
     homing_sign: Literal[1, -1] = 1
-    tick_s: float = 0.0
+    tick_s: float = 0.0  # tick of the clock with which servos stamp their measurements [s]; 0 without one
 
 
 def plans_of(

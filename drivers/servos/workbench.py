@@ -47,17 +47,12 @@ class Change:
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """Outcome of a change.
-
-    Attributes:
-        found: value read back; None if no servo answered.
-        said: explanation; empty if the value was written and read back.
-    """
+    """Outcome of a change."""
 
     change: Change
     outcome: Outcome
-    found: int | None = None
-    said: str = ""
+    found: int | None = None  # value read back; None if no servo answered
+    said: str = ""  # explanation; empty if the value was written and read back
 
 
 class EepromEditor:
@@ -77,11 +72,7 @@ class EepromEditor:
             self._buses.clear()
 
     def bus(self, port: str, baud: int) -> Bus:
-        """Return the bus at `port`, opened at this baud rate.
-
-        Raises:
-            SourceError: it cannot be opened.
-        """
+        """Return the bus at `port`, opened at this baud rate; raise SourceError if it cannot be opened."""
         if port in self._buses:
             rate, bus = self._buses[port]
             if rate == baud:
@@ -94,11 +85,7 @@ class EepromEditor:
         return self._buses[port][1]
 
     def fitted(self, bus: Bus, config: ServoConfig, model: Model) -> IdentifiedServo:
-        """Return the servo as found on the bus.
-
-        Raises:
-            SourceError: it is another, or does not answer.
-        """
+        """Return the servo as found on the bus; raise SourceError if it is another, or does not answer."""
         finding = identify(bus, config, model, self.make.models)
         if finding.servo is None:
             raise SourceError(
@@ -126,19 +113,11 @@ class EepromEditor:
         return {model.protocol: model for model in self.make.models.values()}
 
     def value(self, bus: Bus, servo: IdentifiedServo, setting: Setting) -> int:
-        """Return the setting's value in the servo's EEPROM.
-
-        Raises:
-            SourceError: the servo does not answer.
-        """
+        """Return the setting's value in the servo's EEPROM; raise SourceError if the servo does not answer."""
         return _read(bus, servo, setting.register)
 
     def position(self, bus: Bus, servo: IdentifiedServo) -> int:
-        """Return the servo's position [ticks].
-
-        Raises:
-            SourceError: it does not answer.
-        """
+        """Return the servo's position [ticks]; raise SourceError if it does not answer."""
         return _read(bus, servo, servo.model.layout["position"])
 
     def homing_offset(self, bus: Bus, servo: IdentifiedServo) -> int:
@@ -149,11 +128,7 @@ class EepromEditor:
         return wanted if turn is None else (wanted + turn // 2) % turn - turn // 2
 
     def torque_off(self, bus: Bus, servos: Iterable[IdentifiedServo]) -> None:
-        """Switch the torque of all servos off, and verify it.
-
-        Raises:
-            SourceError: one stays on.
-        """
+        """Switch the torque of all servos off, and verify it; raise SourceError if one stays on."""
         for servo in servos:
             switch_torque_off(bus, servo)
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyschema.effects.effect_type import STEP
-from bodyschema.effects.encoder import STRAINS_KEPT, EncoderEffect, Place, Rows
+from bodyschema.effects.encoder import STRAINS_KEPT, EncoderEffect, LiveDriven, Place, Rows
 from bodyschema.effects.joint_errors import JointErrors
 from bodyschema.effects.motion import Motion
 from bodyschema.effects.parameter import Parameter
@@ -47,8 +47,9 @@ class Backlash(EncoderEffect):
     def correction(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
         return _played(motion, place.joint, abs(float(values[0]))) * np.sign(values[0])
 
-    def live(self, place: Place, values: FloatArray, row_readings: int) -> _LivePlay:
-        return _LivePlay(place, float(values[0]))
+    def live(self, place: Place, values: FloatArray, row_readings: int) -> LiveDriven:
+        width = float(values[0])
+        return LiveDriven(place, Play(abs(width)), float(np.sign(width)))
 
     def trial_shapes(self, motion: Motion) -> FloatArray:
         return WIDTHS
@@ -80,10 +81,10 @@ class Play:
         self._output = reading - self._half * float(np.sign(leading))
 
     def follow(self, reading: float) -> float:
-        """Return the output for the next reading."""
+        """Return output minus input at the next reading."""
         output = reading if self._output is None else self._output
         self._output = min(max(output, reading - self._half), reading + self._half)
-        return self._output
+        return self._output - reading
 
 
 def played(q: FloatArray, width: float) -> FloatArray:
@@ -108,24 +109,3 @@ def played(q: FloatArray, width: float) -> FloatArray:
 def _played(motion: Motion, joint: int, width: float) -> FloatArray:
     """Return `played` of one joint; cached, since a search repeats the same widths."""
     return frozen_array(played(motion.q[:, joint], width))
-
-
-class _LivePlay:
-    """A backlash at a joint; the first move determines its initial side, until then it is centred."""
-
-    def __init__(self, place: Place, width: float) -> None:
-        self._joint = place.joint
-        self._sign = float(np.sign(width))
-        self._play = Play(abs(width))
-        self._first: float | None = None
-        self._moved = False
-
-    def at(self, motion: Motion, move: float) -> float:
-        """Return output minus input [rad, m] at the next reading."""
-        reading = float(motion.q[0, self._joint])
-        if self._first is None:
-            self._first = reading
-        if not self._moved and reading != self._first:
-            self._moved = True
-            self._play.begin(self._first, reading - self._first)
-        return self._sign * (self._play.follow(reading) - reading)

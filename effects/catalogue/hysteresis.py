@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyschema.effects.encoder import STRAINS_KEPT, EncoderEffect, Place, Rows, carried_on
+from bodyschema.effects.encoder import STRAINS_KEPT, EncoderEffect, LiveDriven, Place, Rows, carried_on
 from bodyschema.effects.motion import Motion
 from bodyschema.effects.parameter import Parameter
 from bodyschema.interfaces.records import FloatArray, frozen_array
@@ -53,8 +53,9 @@ class Hysteresis(EncoderEffect):
         strained = _strained(motion, place.joint, float(values[1]))
         return np.stack([-strained, np.zeros_like(strained)], axis=1)
 
-    def live(self, place: Place, values: FloatArray, row_readings: int) -> _LiveHysteresis:
-        return _LiveHysteresis(place, values)
+    def live(self, place: Place, values: FloatArray, row_readings: int) -> LiveDriven:
+        lag, length = values.tolist()
+        return LiveDriven(place, Bristle(length), -lag)
 
     def trial_shapes(self, motion: Motion) -> FloatArray:
         return _LENGTHS
@@ -103,24 +104,3 @@ def _strained(motion: Motion, joint: int, length: float) -> FloatArray:
     strained = np.sign(moves) * (1.0 - kept)
     strained[0], kept[0] = float(np.sign(leading[0])) if len(leading) else 0.0, 0.0
     return frozen_array(carried_on(strained, kept))
-
-
-class _LiveHysteresis:
-    """Friction behind an elastic drive; the first move determines its initial strain."""
-
-    def __init__(self, place: Place, values: FloatArray) -> None:
-        self._joint = place.joint
-        self._lag, length = values.tolist()
-        self._bristle = Bristle(length)
-        self._first: float | None = None
-        self._moved = False
-
-    def at(self, motion: Motion, move: float) -> float:
-        """Return minus the lag of the joint [rad, m] at the next reading."""
-        reading = float(motion.q[0, self._joint])
-        if self._first is None:
-            self._first = reading
-        if not self._moved and reading != self._first:
-            self._moved = True
-            self._bristle.begin(self._first, reading - self._first)
-        return -self._lag * self._bristle.follow(reading)

@@ -49,20 +49,14 @@ def numbers(effect: Effect) -> str:
 
 @dataclass(frozen=True)
 class ArmErrors:
-    """Effects of a simulation after its moments have passed, sorted by joint.
-
-    Attributes:
-        joints: errors of every joint of the robot.
-        payloads: masses on the marker's link that the URDF does not state, their centres in its frame [m].
-        left_out: effects that a rigid-body simulator cannot hold.
-        notes: sentences on effects that are held in another form than found.
-    """
+    """Effects of a simulation after its moments have passed, sorted by joint."""
 
     simulation: Simulation
-    joints: dict[str, JointErrors]
+    joints: dict[str, JointErrors]  # errors of every joint of the robot
+    # masses on the marker's link that the URDF does not state, their centres in its frame [m]
     payloads: tuple[PointMass, ...]
-    left_out: tuple[LeftOut, ...]
-    notes: tuple[str, ...]
+    left_out: tuple[LeftOut, ...]  # effects that a rigid-body simulator cannot hold
+    notes: tuple[str, ...]  # sentences on effects that are held in another form than found
 
     @classmethod
     def of(cls, simulation: Simulation) -> Self:

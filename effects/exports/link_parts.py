@@ -33,21 +33,14 @@ _GREY = "0.7 0.7 0.72 1"
 
 @dataclass(frozen=True)
 class LinkParts:
-    """Parts of a URDF that only a simulator needs.
+    """Parts of a URDF that only a simulator needs."""
 
-    Attributes:
-        meshes: attributes of the assets.
-        geoms: attributes of the geoms, by link.
-        inertias: (3, 3) [kg·m²] about the centres of mass, along the links' axes, by link.
-        mimics: for each mimic joint: the joint it follows, the factor, and the offset [rad, m].
-        unreadable: mesh files that are missing, or that MuJoCo cannot read.
-    """
-
-    meshes: list[dict[str, str]]
-    geoms: dict[str, list[dict[str, str]]]
-    inertias: dict[str, FloatArray]
+    meshes: list[dict[str, str]]  # attributes of the assets
+    geoms: dict[str, list[dict[str, str]]]  # attributes of the geoms, by link
+    inertias: dict[str, FloatArray]  # (3, 3) [kg·m²] about the centres of mass, along the links' axes, by link
+    # for each mimic joint: the joint it follows, the factor, and the offset [rad, m]
     mimics: dict[str, tuple[str, float, float]]
-    unreadable: list[str]
+    unreadable: list[str]  # mesh files that are missing, or that MuJoCo cannot read
 
     @classmethod
     def of(cls, urdf: Path, folder: Path) -> LinkParts:

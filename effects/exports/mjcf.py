@@ -58,9 +58,6 @@ _HIDDEN, _WORLD = "5", "world"
 def write_mjcf(simulation: Simulation, file: Path, heading: str) -> list[str]:
     """Write the simulation as MJCF to `file`.
 
-    Args:
-        heading: one line for the top that names the origin.
-
     Returns:
         Sentences on what the file does not hold, or holds in another form.
 
@@ -76,17 +73,11 @@ def write_mjcf(simulation: Simulation, file: Path, heading: str) -> list[str]:
 
 @dataclass
 class _Document:
-    """Builder of one MJCF file.
+    """Builder of one MJCF file."""
 
-    Attributes:
-        simulation: the simulation to export.
-        folder: folder of the file.
-        joints: names of the joints in it.
-    """
-
-    simulation: Simulation
-    folder: Path
-    joints: set[str] = field(default_factory=set)
+    simulation: Simulation  # the simulation to export
+    folder: Path  # folder of the file
+    joints: set[str] = field(default_factory=set)  # names of the joints in it
 
     def __post_init__(self) -> None:
         from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]

@@ -16,9 +16,6 @@ _WHY_NOT = "a URDF has zeros, links and fixed frames alone"
 def write_urdf(simulation: Simulation, file: Path, heading: str) -> list[str]:
     """Write the URDF of the simulation's robot, with the corrections that a URDF can hold, to `file`.
 
-    Args:
-        heading: one line for the top that names the origin.
-
     Returns:
         Sentences on what the file does not hold.
 

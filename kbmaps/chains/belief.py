@@ -101,11 +101,7 @@ class ChainBelief:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
-        """Return the belief in `data`.
-
-        Raises:
-            ModelFormatError: wrong type of model, or damaged.
-        """
+        """Return the belief in `data`."""
         fields, arrays = unpack(data, _KIND)
         with restoring("a belief in a chain"):
             complete(arrays, (*CHAIN, "mean", "root"))

@@ -173,7 +173,6 @@ class RigidChain:
         """Return the chain in another measurement frame, in which the old one has the pose T_new_old (4, 4).
 
         Raises:
-            ShapeError
             ChainError: not a rigid transform.
         """
         transform = numbers("T_new_old", T_new_old)

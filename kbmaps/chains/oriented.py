@@ -100,11 +100,7 @@ class OrientedChain:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
-        """Restore the bytes of `to_bytes`.
-
-        Raises:
-            ModelFormatError: wrong type of model, or damaged.
-        """
+        """Restore the bytes of `to_bytes`."""
         fields, arrays = unpack(data, _KIND)
         with restoring("an oriented chain"):
             complete(arrays, (*CHAIN, "mean", "turn", "root"))
@@ -127,7 +123,6 @@ def fitted_orientation(belief: ChainBelief, q: ArrayLike, rotation: ArrayLike) -
 
     Raises:
         DegenerateDataError: no orientations.
-        ShapeError, NonFiniteError, RotationError
 
     Example:
         >>> import numpy as np

@@ -33,20 +33,14 @@ class _Settings:
 
 @dataclass(frozen=True, eq=False)
 class Placements:
-    """Nominal chain placed to s readings of the same n pairs.
+    """Nominal chain placed to s readings of the same n pairs."""
 
-    Attributes:
-        rotations, shifts: the pose of the nominal measurement frame in the real one (s, 3, 3) and (s, 3) [m].
-        zeros: joint offsets, added to the joints' readings (s, d) [rad, m].
-        tools: offsets of the marker in the marker frame (s, 3) [m].
-        distances: of the pairs from the chain (s, n) [m].
-    """
-
+    # rotations, shifts: the pose of the nominal measurement frame in the real one (s, 3, 3) and (s, 3) [m]
     rotations: FloatArray
     shifts: FloatArray
-    zeros: FloatArray
-    tools: FloatArray
-    distances: FloatArray
+    zeros: FloatArray  # joint offsets, added to the joints' readings (s, d) [rad, m]
+    tools: FloatArray  # offsets of the marker in the marker frame (s, 3) [m]
+    distances: FloatArray  # of the pairs from the chain (s, n) [m]
 
     def errors(self, share: float) -> FloatArray:
         """Return the RMS distance (s,) [m] of this share of the pairs, the nearest ones."""

@@ -36,17 +36,12 @@ class Interval:
 
 @dataclass(frozen=True)
 class Scatter:
-    """Scatter of pairs about a chain.
+    """Scatter of pairs about a chain."""
 
-    Attributes:
-        noise: 1-sigma of a measured coordinate [m], estimated or given (their RMS).
-        misfit: residual over what the noise explains; about 1 for a rigid chain, 1 where the noise was not given.
-        freedom: degrees of freedom: residual coordinates minus those that the parameters have used up. If they are few,
-            `noise` is uncertain.
-    """
-
-    noise: float
-    misfit: float
+    noise: float  # 1-sigma of a measured coordinate [m], estimated or given (their RMS)
+    misfit: float  # residual over what the noise explains; about 1 for a rigid chain, 1 where the noise was not given
+    # degrees of freedom: residual coordinates minus those that the parameters have used up. If they are few, `noise` is
+    # uncertain.
     freedom: float
 
 

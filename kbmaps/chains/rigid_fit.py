@@ -36,15 +36,10 @@ class _Settings:
 
 @dataclass(frozen=True)
 class NoiseKnowledge:
-    """Prior of an unknown noise, with the weight of a number of coordinates.
+    """Prior of an unknown noise, with the weight of a number of coordinates."""
 
-    Attributes:
-        coordinates: that number, 0 without a prior.
-        square: their mean square [m²].
-    """
-
-    coordinates: float = 0.0
-    square: float = 0.0
+    coordinates: float = 0.0  # that number, 0 without a prior
+    square: float = 0.0  # their mean square [m²]
 
     def found(self, square: float, freedom: float) -> float:
         """Return the variance from a sum of squared residuals [m²]; `freedom + coordinates` must exceed 0."""
@@ -56,25 +51,15 @@ NOTHING_KNOWN = NoiseKnowledge()
 
 @dataclass(frozen=True, eq=False)
 class RigidFit:
-    """Change of the chain with its uncertainty.
+    """Change of the chain with its uncertainty."""
 
-    Attributes:
-        belief: the posterior of the parameters.
-        noise: estimated noise over unit; at least 1 where the units are the noise (more: the chain does not fit).
-        freedom: residual coordinates minus those that the parameters have used up.
-        inliers: True for each pair (n,) that is not an outlier.
-        rank: number of independent directions of the parameters that the data determine.
-        log_evidence: log marginal likelihood of the inliers (Laplace's approximation).
-        common: most probable values (k,) of the unknowns shared by all pairs, in their sigmas.
-    """
-
-    belief: ChainBelief
-    noise: float
-    freedom: float
-    inliers: BoolArray
-    rank: int
-    log_evidence: float
-    common: FloatArray
+    belief: ChainBelief  # the posterior of the parameters
+    noise: float  # estimated noise over unit; at least 1 where the units are the noise (more: the chain does not fit)
+    freedom: float  # residual coordinates minus those that the parameters have used up
+    inliers: BoolArray  # True for each pair (n,) that is not an outlier
+    rank: int  # number of independent directions of the parameters that the data determine
+    log_evidence: float  # log marginal likelihood of the inliers (Laplace's approximation)
+    common: FloatArray  # most probable values (k,) of the unknowns shared by all pairs, in their sigmas
 
 
 @dataclass(frozen=True, eq=False)

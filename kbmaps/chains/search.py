@@ -36,15 +36,10 @@ class _Settings:
 
 @dataclass(frozen=True, eq=False)
 class ScrewArms:
-    """Chains given by the location of their joint axes with all joints at zero (Brockett 1984).
+    """Chains given by the location of their joint axes with all joints at zero (Brockett 1984)."""
 
-    Attributes:
-        axes: unit axes (s, d, 3).
-        points: a point of each axis (s, d, 3), then the marker position (s, d+1, 3) [m].
-    """
-
-    axes: FloatArray
-    points: FloatArray
+    axes: FloatArray  # unit axes (s, d, 3)
+    points: FloatArray  # a point of each axis (s, d, 3), then the marker position (s, d+1, 3) [m]
 
     def __getitem__(self, chosen: BoolArray | IntArray) -> ScrewArms:
         return ScrewArms(self.axes[chosen], self.points[chosen])
@@ -77,19 +72,12 @@ class ScrewArms:
 
 @dataclass(frozen=True, eq=False)
 class _Reached:
-    """Marker positions of each chain; pairs come last so that all of them are one vector operation.
+    """Marker positions of each chain; pairs come last so that all of them are one vector operation."""
 
-    Attributes:
-        turned: R_kᵀ (d+1, s, 3, 3, n), R_k the rotation before joint k, and of the marker.
-        levers: from each joint's point to the marker (d, s, 3, n) [m].
-        residuals: (s, 3, n) [m].
-        squares: their sums of squares (s,) [m²].
-    """
-
-    turned: FloatArray
-    levers: FloatArray
-    residuals: FloatArray
-    squares: FloatArray
+    turned: FloatArray  # R_kᵀ (d+1, s, 3, 3, n), R_k the rotation before joint k, and of the marker
+    levers: FloatArray  # from each joint's point to the marker (d, s, 3, n) [m]
+    residuals: FloatArray  # (s, 3, n) [m]
+    squares: FloatArray  # their sums of squares (s,) [m²]
 
     def __getitem__(self, chosen: BoolArray | IntArray) -> _Reached:
         return _Reached(self.turned[:, chosen], self.levers[:, chosen], self.residuals[chosen], self.squares[chosen])

@@ -54,24 +54,16 @@ NOTHING_SEEN = (0.0,) * len(_Settings.lengths)
 
 @dataclass(frozen=True, eq=False)
 class Runs:
-    """Runs of neighbours, represented by their means.
+    """Runs of neighbours, represented by their means."""
 
-    Attributes:
-        angles: of all pairs (n, d) [rad, or for a prismatic joint the equivalent].
-        starts: the first pair of each run (m,).
-        rows: means of the derivatives by the known parameters, then by joints' own errors, and of errors, times the
-            square root of the run's length (m, 3, p).
-        known: number of the known parameters, with a prior of variance 1.
-        within: sum of the squares of errors around their means.
-        fitted: True if the known parameters were fitted to these pairs, which then carry no information about them.
-    """
-
-    angles: FloatArray
-    starts: IntArray
+    angles: FloatArray  # of all pairs (n, d) [rad, or for a prismatic joint the equivalent]
+    starts: IntArray  # the first pair of each run (m,)
+    # means of the derivatives by the known parameters, then by joints' own errors, and of errors, times the square root
+    # of the run's length (m, 3, p)
     rows: FloatArray
-    known: int
-    within: float
-    fitted: bool
+    known: int  # number of the known parameters, with a prior of variance 1
+    within: float  # sum of the squares of errors around their means
+    fitted: bool  # True if the known parameters were fitted to these pairs, which then carry no information about them
 
     @classmethod
     def of(
@@ -121,19 +113,12 @@ class Runs:
 
 @dataclass(frozen=True, eq=False)
 class Bends:
-    """Probable hypotheses of one bend length: sizes, joints' own errors and noises.
+    """Probable hypotheses of one bend length: sizes, joints' own errors and noises."""
 
-    Attributes:
-        axes: the coordinates of runs in which each bend is diagonal (m, m).
-        weights: inverse variance of each coordinate (h, m).
-        known: projection of rows of runs onto the known parameters and joints' own errors (h, k, 3 m).
-        logs: log probability of each (h,).
-    """
-
-    axes: FloatArray
-    weights: FloatArray
-    known: FloatArray
-    logs: FloatArray
+    axes: FloatArray  # the coordinates of runs in which each bend is diagonal (m, m)
+    weights: FloatArray  # inverse variance of each coordinate (h, m)
+    known: FloatArray  # projection of rows of runs onto the known parameters and joints' own errors (h, k, 3 m)
+    logs: FloatArray  # log probability of each (h,)
 
     def sums(self, rows: FloatArray) -> FloatArray:
         """Return weighted products (h, p, p) of rows (m, 3, p) of runs, less the part of the known parameters."""

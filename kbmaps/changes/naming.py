@@ -80,21 +80,13 @@ def explanations(
 
 @dataclass(frozen=True, eq=False)
 class _Fit:
-    """Fitted change, in metres of marker motion.
+    """Fitted change, in metres of marker motion."""
 
-    Attributes:
-        cost: minus the log likelihood there, including the prior belief.
-        log_volume: of the prior uncertainty, ½ log det of its precision.
-        information: of the change with the rest unknown (k, k).
-        change: (k,) [m].
-        moved_m: see `Explanation`.
-    """
-
-    cost: float
-    log_volume: float
-    information: FloatArray
-    change: FloatArray
-    moved_m: float
+    cost: float  # minus the log likelihood there, including the prior belief
+    log_volume: float  # of the prior uncertainty, ½ log det of its precision
+    information: FloatArray  # of the change with the rest unknown (k, k)
+    change: FloatArray  # (k,) [m]
+    moved_m: float  # see `Explanation`
 
     def evidence(self, sizes: FloatArray) -> float:
         values, vectors = np.linalg.eigh(self.information)

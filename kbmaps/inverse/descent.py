@@ -63,19 +63,12 @@ class JointRange:
 
 @dataclass(frozen=True, eq=False)
 class Descent:
-    """End of a descent.
+    """End of a descent."""
 
-    Attributes:
-        q: the configuration (d,).
-        error: the remaining error there [m].
-        steps: derivatives evaluated.
-        ended: True if no step from there can lessen the error, or none is needed; False if the steps ran out.
-    """
-
-    q: FloatArray
-    error: FloatArray
-    steps: int
-    ended: bool
+    q: FloatArray  # the configuration (d,)
+    error: FloatArray  # the remaining error there [m]
+    steps: int  # derivatives evaluated
+    ended: bool  # True if no step from there can lessen the error, or none is needed; False if the steps ran out
 
 
 def descend(goal: Goal, start: FloatArray, joints: JointRange, max_steps: int) -> Descent:

@@ -37,17 +37,13 @@ class PositionGoal:
 
 @dataclass(frozen=True, eq=False)
 class PoseGoal:
-    """Target position x (3,) [m] of the marker with the orientation `rotation` (3, 3).
-
-    Attributes:
-        lever: the length [m] at which a radian of orientation counts as much as the arc that it makes.
-        tolerance, angle_tolerance: errors that count as reached [m], [rad].
-    """
+    """Target position x (3,) [m] of the marker with the orientation `rotation` (3, 3)."""
 
     model: PoseModel
     x: FloatArray
     rotation: FloatArray
-    lever: float
+    lever: float  # the length [m] at which a radian of orientation counts as much as the arc that it makes
+    # tolerance, angle_tolerance: errors that count as reached [m], [rad]
     tolerance: float
     angle_tolerance: float
 
@@ -207,7 +203,6 @@ class InverseKinematics:
                 first.
 
         Raises:
-            ShapeError, NonFiniteError, RotationError
             SettingError: a rotation was given, and the model has no orientation.
         """
         goal = self._goal(vector("x", x, 3), rotation)

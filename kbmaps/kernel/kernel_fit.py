@@ -76,23 +76,14 @@ class _Settings:
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Pairs in the form of the inference: rows multiplied by `scale`, so that their noise is equal.
+    """Pairs in the form of the inference: rows multiplied by `scale`, so that their noise is equal."""
 
-    Attributes:
-        weights: of every joint (n, d, 3).
-        scale: roots (n,) of the pairs' weights.
-        errors: scaled residuals of the prior's mean (n, 3).
-        count: effective number of pairs; less than n where some are partly forgotten.
-        log_weights: sum of the logarithms of the pairs' inverse variances.
-        noise_known: True if the noise of the scaled errors is 1; False if it is to be estimated.
-    """
-
-    weights: FloatArray
-    scale: FloatArray
-    errors: FloatArray
-    count: float
-    log_weights: float
-    noise_known: bool
+    weights: FloatArray  # of every joint (n, d, 3)
+    scale: FloatArray  # roots (n,) of the pairs' weights
+    errors: FloatArray  # scaled residuals of the prior's mean (n, 3)
+    count: float  # effective number of pairs; less than n where some are partly forgotten
+    log_weights: float  # sum of the logarithms of the pairs' inverse variances
+    noise_known: bool  # True if the noise of the scaled errors is 1; False if it is to be estimated
 
 
 class KernelFit:

@@ -318,11 +318,7 @@ def describe_bases(bases: Sequence[JointBasis]) -> list[list[Any]]:
 
 
 def parse_bases(value: Any) -> tuple[JointBasis, ...]:
-    """Return the bases from `describe_bases`.
-
-    Raises:
-        ModelFormatError: it does not describe one.
-    """
+    """Return the bases from `describe_bases`."""
     if not isinstance(value, list) or not value:
         raise ModelFormatError("the bases are not a list of at least one")
     return tuple(_parse_basis(entry) for entry in cast(list[Any], value))

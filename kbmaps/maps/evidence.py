@@ -41,18 +41,12 @@ class LinearEvidence:
 
     All terms are positive. Computed as a difference of yᵀ y and the part that β explains, the noise of a wide prior
     would be rounding.
-
-    Attributes:
-        count: N, the number of coordinates of y; not whole where pairs are partly forgotten.
-        unreached: y₀ᵀ y₀.
-        eigenvalues: γ (p,).
-        along: a (p,).
     """
 
-    count: float
-    unreached: float
-    eigenvalues: FloatArray
-    along: FloatArray
+    count: float  # N, the number of coordinates of y; not whole where pairs are partly forgotten
+    unreached: float  # y₀ᵀ y₀
+    eigenvalues: FloatArray  # γ (p,)
+    along: FloatArray  # a (p,)
 
     def mean(self, variance: float) -> FloatArray:
         """Return the posterior mean of Vᵀ β (p,) at this s²."""

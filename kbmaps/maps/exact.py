@@ -238,7 +238,6 @@ class ExactLearner:
                 (3, 3) or (4,); required if the prior has an orientation, and only then.
 
         Raises:
-            ShapeError, NonFiniteError, RotationError
             SettingError: a weight that is not positive, rotations missing or not expected. Nothing has changed.
         """
         angles = np.atleast_2d(rows_or_vector("q", q, len(self._bases)))

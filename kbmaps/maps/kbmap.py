@@ -104,7 +104,6 @@ class KBMap:
 
         Raises:
             ShapeError: the map holds positions only, or q has the wrong length.
-            NonFiniteError
         """
         self._require_orientation()
         axes = _as_columns(self._kernel.outputs(q, POSITION_OUTPUTS, POSE_OUTPUTS))
@@ -121,7 +120,6 @@ class KBMap:
 
         Raises:
             ShapeError: the map holds positions only, or q has the wrong length.
-            NonFiniteError
         """
         self._require_orientation()
         checked = rows_or_vector("q", q, self.joints)
@@ -160,7 +158,6 @@ class KBMap:
 
         Raises:
             ShapeError: the map holds positions only, or δ has the wrong length.
-            NonFiniteError
         """
         self._require_orientation()
         shift = vector("marker_shift", marker_shift, 3)
@@ -255,9 +252,6 @@ def _one_a_joint(name: str, values: ArrayLike, joints: int) -> list[float]:
 def prediction_errors(kbmap: KBMap, q: ArrayLike, x: ArrayLike) -> FloatArray:
     """Return distances (n,) [m] between predicted and given positions x (n, 3) [m] at q (n, d) [rad].
 
-    Raises:
-        ShapeError, NonFiniteError
-
     Example:
         >>> import numpy as np
         >>> from kbmaps import JointBasis, KBMap, prediction_errors
@@ -281,7 +275,6 @@ def pose_targets(positions: FloatArray, rotation: ArrayLike | None, outputs: int
         outputs: of the map.
 
     Raises:
-        ShapeError, NonFiniteError, RotationError
         SettingError: a rotation for a map of positions, or none for a map of poses.
     """
     if rotation is None:

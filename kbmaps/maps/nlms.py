@@ -135,7 +135,6 @@ class NLMS:
             rotation: the orientation, (3, 3) or a quaternion x, y, z, w (4,); for a map with orientation only.
 
         Raises:
-            ShapeError, NonFiniteError, RotationError
             SettingError: a rotation missing or not expected. Nothing has changed.
         """
         mu = self._step_size.at(self._pairs)
@@ -160,7 +159,6 @@ class NLMS:
             rotation: the orientations, (n, 3, 3) or quaternions (n, 4), as for `learn`.
 
         Raises:
-            ShapeError, NonFiniteError, RotationError
             SettingError: an index outside the pairs, rotations missing or not expected. Nothing has changed.
         """
         angles = rows("q", q, self._stack.joints)
@@ -187,11 +185,7 @@ class NLMS:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
-        """Return the learner in `data`.
-
-        Raises:
-            ModelFormatError: wrong type of model, or damaged.
-        """
+        """Return the learner in `data`."""
         fields, arrays = unpack(data, _KIND)
         with restoring("an NLMS learner"):
             named(fields, "the fields", ("bases", "mu0", "decay", "floor", "pairs"))

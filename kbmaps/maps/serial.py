@@ -42,11 +42,7 @@ def encode(bases: Sequence[JointBasis], net: FloatArray, metadata: Mapping[str, 
 
 
 def decode(data: bytes) -> tuple[tuple[JointBasis, ...], FloatArray, dict[str, str]]:
-    """Return bases, net and metadata from a byte string.
-
-    Raises:
-        ModelFormatError: the bytes are damaged, truncated, or of another format.
-    """
+    """Return bases, net and metadata from a byte string."""
     header, payload = unframed(data, MAGIC)
     bases, outputs, metadata = _parse_header(header)
     shape = (outputs, *(basis.size for basis in bases))

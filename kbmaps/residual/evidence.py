@@ -39,19 +39,12 @@ class _Settings:
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Sums over N whitened rows (a, t) of a linear model t = a·w + noise.
+    """Sums over N whitened rows (a, t) of a linear model t = a·w + noise."""
 
-    Attributes:
-        gram: Σ a aᵀ (P, P).
-        product: Σ a t (P,).
-        square: Σ t².
-        count: N.
-    """
-
-    gram: FloatArray
-    product: FloatArray
-    square: float
-    count: int
+    gram: FloatArray  # Σ a aᵀ (P, P)
+    product: FloatArray  # Σ a t (P,)
+    square: float  # Σ t²
+    count: int  # N
 
     @classmethod
     def of(cls, design: FloatArray, target: FloatArray) -> Moments:
@@ -95,17 +88,11 @@ class Posterior:
 
 @dataclass(frozen=True, eq=False)
 class Average:
-    """Weights averaged over several models by their probability.
+    """Weights averaged over several models by their probability."""
 
-    Attributes:
-        groups: of any of the models, besides the one that all have.
-        mean: (A,) over the columns of "" and then of the groups.
-        spread: W (A, A) with the covariance W Wᵀ.
-    """
-
-    groups: tuple[str, ...]
-    mean: FloatArray
-    spread: FloatArray
+    groups: tuple[str, ...]  # of any of the models, besides the one that all have
+    mean: FloatArray  # (A,) over the columns of "" and then of the groups
+    spread: FloatArray  # W (A, A) with the covariance W Wᵀ
 
 
 class GroupedModel:

@@ -44,37 +44,27 @@ Weights = Mapping[str, FloatArray]
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """Distorted chain linearised around a change and weights, at n configurations.
+    """Distorted chain linearised around a change and weights, at n configurations."""
 
-    Attributes:
-        x: positions (n, 3) [m].
-        chain: derivative (n, 3, size) by the chain's parameters.
-        groups: derivative (n, 3, features) by each group's weights.
-    """
-
-    x: FloatArray
-    chain: FloatArray
-    groups: dict[str, FloatArray]
+    x: FloatArray  # positions (n, 3) [m]
+    chain: FloatArray  # derivative (n, 3, size) by the chain's parameters
+    groups: dict[str, FloatArray]  # derivative (n, 3, features) by each group's weights
 
 
 @dataclass(frozen=True, eq=False)
 class ResidualScaling:
     """Scaling that makes features of the order of 1 at the data, and the place of the last load on the hand.
 
-    Attributes:
-        middle, half: of the ranges of the joints' readings (d,) [rad, m].
-        centre: of the positions (3,) [m].
-        scale: their spread [m].
-        load: place of the last load in the frame of the last link (3,) [m]; None: the marker itself.
-
     Raises:
         SettingError: a range or the spread is not positive.
     """
 
+    # middle, half: of the ranges of the joints' readings (d,) [rad, m]
     middle: FloatArray
     half: FloatArray
-    centre: FloatArray
-    scale: float
+    centre: FloatArray  # of the positions (3,) [m]
+    scale: float  # their spread [m]
+    # place of the last load in the frame of the last link (3,) [m]; None: the marker itself
     load: FloatArray | None = None
 
     def __post_init__(self) -> None:

@@ -81,23 +81,14 @@ def most_probable(evidence: Callable[[float], float], present: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class ResidualFit:
-    """Distorted chain with its uncertainty.
+    """Distorted chain with its uncertainty."""
 
-    Attributes:
-        model: the fitted model.
-        noise: estimated noise over unit; at least 1 where the units are the noise.
-        freedom: residual coordinates minus those that all weights have used up.
-        shared: correlation of the errors of neighbours on a path; 0 where pairs are apart.
-        inliers: True for each pair (n,) that is not an outlier.
-        groups: supported by the pairs or part of the prior; the model averages over others too.
-    """
-
-    model: ResidualModel
-    noise: float
-    freedom: float
-    shared: float
-    inliers: BoolArray
-    groups: tuple[str, ...]
+    model: ResidualModel  # the fitted model
+    noise: float  # estimated noise over unit; at least 1 where the units are the noise
+    freedom: float  # residual coordinates minus those that all weights have used up
+    shared: float  # correlation of the errors of neighbours on a path; 0 where pairs are apart
+    inliers: BoolArray  # True for each pair (n,) that is not an outlier
+    groups: tuple[str, ...]  # supported by the pairs or part of the prior; the model averages over others too
 
 
 class _Fitter:

@@ -186,11 +186,7 @@ class ResidualModel:
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
-        """Return the model in `data`.
-
-        Raises:
-            ModelFormatError: wrong type of model, or damaged.
-        """
+        """Return the model in `data`."""
         fields, arrays = unpack(data, _KIND)
         with restoring("a rigid chain with residual"):
             settings = numbers(named(fields, "the fields", ("scale", "noise")))

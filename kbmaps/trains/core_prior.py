@@ -37,11 +37,7 @@ class CorePrior:
             raise ShapeError("mean", f"(d, {CORE_NUMBERS})", mean.shape)
         if spread.shape != (len(mean), CORE_NUMBERS, CORE_NUMBERS):
             raise ShapeError("spread", f"({len(mean)}, {CORE_NUMBERS}, {CORE_NUMBERS})", spread.shape)
-        for name, array in (("mean", mean), ("spread", spread)):
-            if not np.isfinite(array).all():
-                raise NonFiniteError(name)
-        object.__setattr__(self, "mean", mean)
-        object.__setattr__(self, "spread", spread)
+        _set_finite(self, mean=mean, spread=spread)
 
     @classmethod
     def vague(cls, joints: int, length: float, std: float = 1.0) -> CorePrior:
@@ -122,11 +118,7 @@ class CoreFamily:
             raise ShapeError("mean", f"(d, {CORE_NUMBERS})", mean.shape)
         if motions.ndim != 3 or motions.shape[:2] != mean.shape:
             raise ShapeError("motions", f"({len(mean)}, {CORE_NUMBERS}, m)", motions.shape)
-        for name, array in (("mean", mean), ("motions", motions)):
-            if not np.isfinite(array).all():
-                raise NonFiniteError(name)
-        object.__setattr__(self, "mean", mean)
-        object.__setattr__(self, "motions", motions)
+        _set_finite(self, mean=mean, motions=motions)
 
     @classmethod
     def around(
@@ -174,6 +166,13 @@ class CoreFamily:
         covariances = self.motions @ self.motions.swapaxes(1, 2) + np.diag(np.square(ellipse_std * self.sizes))
         spread: FloatArray = np.linalg.cholesky(covariances).astype(np.float64, copy=False)
         return CorePrior(self.mean, spread)
+
+
+def _set_finite(prior: CorePrior | CoreFamily, **arrays: FloatArray) -> None:
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise NonFiniteError(name)
+        object.__setattr__(prior, name, array)
 
 
 def _motions(

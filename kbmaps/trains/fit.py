@@ -28,19 +28,12 @@ class _Settings:
 
 @dataclass(frozen=True, eq=False)
 class TensorProblem:
-    """Pairs and prior: the objective Σ ‖(x − f(q)) / std‖² + ‖z‖² over the whitened cores z.
+    """Pairs and prior: the objective Σ ‖(x − f(q)) / std‖² + ‖z‖² over the whitened cores z."""
 
-    Attributes:
-        weights: basis functions (n, d, 3).
-        x: positions (n, 3) [m].
-        std: of one coordinate of each pair (n,) [m].
-        prior: the Gaussian of which z is the standard form.
-    """
-
-    weights: FloatArray
-    x: FloatArray
-    std: FloatArray
-    prior: CorePrior
+    weights: FloatArray  # basis functions (n, d, 3)
+    x: FloatArray  # positions (n, 3) [m]
+    std: FloatArray  # of one coordinate of each pair (n,) [m]
+    prior: CorePrior  # the Gaussian of which z is the standard form
 
     def maps(self, z: FloatArray) -> FloatArray:
         cores = self.prior.cores(z)

@@ -48,17 +48,11 @@ PLAUSIBLE = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Pairs:
-    """Checked pairs.
+    """Checked pairs."""
 
-    Attributes:
-        weights: basis functions (n, d, 3).
-        x: positions (n, 3) [m].
-        sigma: 1-sigma of a coordinate (n,) [m]; NaN where it is not known.
-    """
-
-    weights: FloatArray
-    x: FloatArray
-    sigma: FloatArray
+    weights: FloatArray  # basis functions (n, d, 3)
+    x: FloatArray  # positions (n, 3) [m]
+    sigma: FloatArray  # 1-sigma of a coordinate (n,) [m]; NaN where it is not known
 
     @property
     def unknown(self) -> BoolArray:

@@ -124,7 +124,6 @@ def rebuild(file: Path, fresh: dict[str, str], working: Callable[[], None] = lam
 
     Args:
         fresh: `meta` of a new store, in case the store's own is lost.
-        working: called repeatedly meanwhile.
 
     Returns:
         Path under which the damaged store was kept.

@@ -12,24 +12,17 @@ AT_ONCE = 500
 
 @dataclass(frozen=True, slots=True)
 class Keep:
-    """Limits of the pairs that a store keeps.
+    """Limits of the pairs that a store keeps."""
 
-    Attributes:
-        days: maximum age; None: any.
-        size: maximum bytes of the file in use; None: unlimited.
-        newest: number of pairs kept whatever their age and size, so that a wall clock that jumps ahead cannot delete
-            all.
-    """
-
-    days: float | None
-    size: float | None
+    days: float | None  # maximum age; None: any
+    size: float | None  # maximum bytes of the file in use; None: unlimited
+    # number of pairs kept whatever their age and size, so that a wall clock that jumps ahead cannot delete all
     newest: int
 
     def last_to_delete(self, connection: sqlite3.Connection, utc: str, newest: int) -> int | None:
         """Return the newest pair that can be deleted now, with all before it; None to keep all.
 
         Args:
-            utc: current time.
             newest: number of the newest pair; a damaged row may not contain it.
         """
         if self.days is None and self.size is None:

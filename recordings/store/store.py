@@ -68,57 +68,39 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """Configuration of one run of the sampler, stored with the pairs so that they can be understood later.
+    """Configuration of one run of the sampler, stored with the pairs so that they can be understood later."""
 
-    Attributes:
-        joints: names in the order of q. They hold for the whole store; another order needs another store.
-        robot_toml, urdf: texts of the two files.
-        config: all tables including overrides, as JSON.
-    """
-
+    # names in the order of q. They hold for the whole store; another order needs another store.
     joints: tuple[str, ...]
     started_utc: str
+    # robot_toml, urdf: texts of the two files
     robot_toml: str
     urdf: str
-    config: str
+    config: str  # all tables including overrides, as JSON
     version: str
     host: str
 
 
 @dataclass(frozen=True, slots=True)
 class Devices:
-    """Devices that read the joints.
+    """Devices that read the joints."""
 
-    Attributes:
-        session: number of the sampler's run.
-        from_seq: first pair they apply to, until the next entry.
-        record: for each joint: names and settings, as reported by its driver.
-    """
-
-    session: int
-    from_seq: int
+    session: int  # number of the sampler's run
+    from_seq: int  # first pair they apply to, until the next entry
     utc: str
-    record: tuple[dict[str, Any], ...]
+    record: tuple[dict[str, Any], ...]  # for each joint: names and settings, as reported by its driver
 
 
 @dataclass(frozen=True, slots=True)
 class Audit:
-    """Result of checking each row of a store.
+    """Result of checking each row of a store."""
 
-    Attributes:
-        pairs: number of sound pairs.
-        newest: number of the newest pair, sound or not; 0 if there is none.
-        session: session of the newest sound pair; 0 if there is none.
-        damage: numbers of pairs that cannot be read.
-        lost_rows: number of existing but unreadable rows, of pairs and of related tables.
-        joint_ranges: smallest and largest joint angles, each shape (d,) [rad or m]; None if there is no pair.
-    """
-
-    pairs: int
-    newest: int
-    session: int
-    damage: Damage
-    lost_rows: int
+    pairs: int  # number of sound pairs
+    newest: int  # number of the newest pair, sound or not; 0 if there is none
+    session: int  # session of the newest sound pair; 0 if there is none
+    damage: Damage  # numbers of pairs that cannot be read
+    lost_rows: int  # number of existing but unreadable rows, of pairs and of related tables
+    # smallest and largest joint angles, each shape (d,) [rad or m]; None if there is no pair
     joint_ranges: tuple[FloatArray, FloatArray] | None
 
 
@@ -223,9 +205,6 @@ class PairReader:
 
     def audit(self, working: Callable[[], None] = lambda: None) -> Audit:
         """Check each row. Unreadable pairs are added to `damage`.
-
-        Args:
-            working: called repeatedly meanwhile.
 
         Raises:
             StoreError: the file cannot be read.
@@ -369,11 +348,7 @@ class PairStore:
             connection.execute(store_schema.INSERT["devices"], sealed(told))
 
     def go_on_with(self, session: Session) -> None:
-        """Use this session from the next pair on.
-
-        Raises:
-            StoreError: the disk is full or broken.
-        """
+        """Use this session from the next pair on; raise StoreError if the disk is full or broken."""
         connection = self._require_open()
         self._session = session
         with explained(self.file):
@@ -381,9 +356,6 @@ class PairStore:
 
     def trim(self, keep: Keep, utc: str) -> int:
         """Delete a batch of the oldest pairs that are no longer kept; return the number deleted.
-
-        Args:
-            utc: current time.
 
         Raises:
             StoreError: the disk is full or broken.

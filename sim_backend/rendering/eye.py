@@ -82,7 +82,6 @@ def cluttered_room(
     """Return a picture (1024, 2048, 3), BGR, of a wall with coloured objects: rectangles, discs and bars.
 
     Args:
-        ball_hue_deg: hue of the ball [deg].
         gap_deg: smallest difference between the hue of an object and that of the ball [deg].
     """
     rows = (np.linspace(205, 120, _Settings.height)[:, None, None] * [0.93, 0.97, 1.0]).astype(np.uint8)
@@ -215,7 +214,6 @@ class StereoEyes:
         """Paint frame `number` into each eye's image (height, width, 3), BGR, the left one's first.
 
         Args:
-            T_world_camera: pose of the left eye (4, 4).
             x_eyes: apparent position of the marker's centre in each eye's optical frame (eyes, 3) [m].
             R_camera_marker: orientation of the marker in the left eye's optical frame (3, 3).
         """

@@ -21,19 +21,15 @@ _FLIP = np.diag([1.0, -1.0, -1.0, 1.0])
 
 @dataclass(frozen=True)
 class Grid:
-    """Samples over a rectangle of the image.
+    """Samples over a rectangle of the image."""
 
-    Attributes:
-        left, top: the first whole pixel.
-        columns, rows: number of samples.
-        per_pixel: samples across one pixel (a half: one sample in two pixels).
-    """
-
+    # left, top: the first whole pixel
     left: int
     top: int
+    # columns, rows: number of samples
     columns: int
     rows: int
-    per_pixel: float
+    per_pixel: float  # samples across one pixel (a half: one sample in two pixels)
 
     def directions(self, calibration: StereoCalibration) -> FloatArray:
         """Return the rays (rows, columns, 3) through the samples, with z = 1."""

@@ -48,20 +48,14 @@ class Tool(msgspec.Struct, frozen=True, tag=True):
 
 
 class Frame(msgspec.Struct, frozen=True, tag=True):
-    """Paint this frame into slot `number` modulo SLOTS, then answer with one byte.
-
-    Attributes:
-        angles: true joint angles [rad or m].
-        T_world_camera: pose of the left eye, row by row, 16 numbers.
-        x_eyes: apparent position of the marker's centre in the left, then the right eye's frame [m], 3 numbers each.
-        R_camera_marker: orientation of the marker in the left eye's frame, row by row, 9 numbers.
-    """
+    """Paint this frame into slot `number` modulo SLOTS, then answer with one byte."""
 
     number: int
-    angles: list[float]
-    T_world_camera: list[float]
+    angles: list[float]  # true joint angles [rad or m]
+    T_world_camera: list[float]  # pose of the left eye, row by row, 16 numbers
+    # apparent position of the marker's centre in the left, then the right eye's frame [m], 3 numbers each
     x_eyes: list[float]
-    R_camera_marker: list[float]
+    R_camera_marker: list[float]  # orientation of the marker in the left eye's frame, row by row, 9 numbers
 
 
 Message = Setup | Tool | Frame
@@ -70,11 +64,7 @@ _decoder = msgspec.msgpack.Decoder(Message)
 
 
 def send(pipe: Connection, message: Message) -> None:
-    """Write a message.
-
-    Raises:
-        BrokenPipeError: the reader is gone.
-    """
+    """Write a message; raise BrokenPipeError if the reader is gone."""
     pipe.send_bytes(_encoder.encode(message))
 
 

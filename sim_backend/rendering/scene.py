@@ -15,26 +15,17 @@ from bodyschema.sim_backend.truth import TrueRobot
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Content of a frame.
+    """Content of a frame."""
 
-    Attributes:
-        angles: true joint angles [rad or m], shape (d,).
-        T_world_camera: pose of the left eye, shape (4, 4).
-        x_world: centre of the ball [m], shape (3,).
-        tip: the same point in the marker link, the end of the tool [m], shape (3,).
-        x_eyes: its apparent position in each eye's optical frame [m], shape (eyes, 3); the true one
-            unless the lenses differ from the calibration.
-        R_camera_marker: orientation of the marker in the left eye's optical frame, shape (3, 3).
-        x_seen: position that an ideal tracker with the described calibration reports [m], shape (3,).
-    """
-
-    angles: FloatArray
-    T_world_camera: FloatArray
-    x_world: FloatArray
-    tip: FloatArray
+    angles: FloatArray  # true joint angles [rad or m], shape (d,)
+    T_world_camera: FloatArray  # pose of the left eye, shape (4, 4)
+    x_world: FloatArray  # centre of the ball [m], shape (3,)
+    tip: FloatArray  # the same point in the marker link, the end of the tool [m], shape (3,)
+    # its apparent position in each eye's optical frame [m], shape (eyes, 3); the true one unless the lenses differ from
+    # the calibration
     x_eyes: FloatArray
-    R_camera_marker: FloatArray
-    x_seen: FloatArray
+    R_camera_marker: FloatArray  # orientation of the marker in the left eye's optical frame, shape (3, 3)
+    x_seen: FloatArray  # position that an ideal tracker with the described calibration reports [m], shape (3,)
 
 
 def scene_of(

@@ -29,7 +29,6 @@ class VirtualLink:
 
     Attributes:
         is_connected: True while the router is reachable; otherwise nothing arrives.
-        overflowed: always 0.
         known: liveliness tokens of publishers.
     """
 
@@ -41,7 +40,7 @@ class VirtualLink:
             clock: the virtual clock.
             delay: returns the transit time of a message [s], sampled for each; messages of one node keep their order.
         """
-        self.is_connected, self.overflowed = True, 0
+        self.is_connected = True
         self.known: list[str] = []
         self._clock, self._delay = clock, delay
         self._nodes = list(nodes)

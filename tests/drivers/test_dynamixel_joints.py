@@ -23,7 +23,7 @@ from bodyschema.drivers.dynamixel.models import BY_NAME
 from bodyschema.interfaces.errors import SourceError, SourceLost
 from bodyschema.interfaces.records import JointReading
 
-FAULTS = [mute, late(0.02), wrong_checksum, corrupt(), half, garbage(), swapped]
+FAULTS = [mute, late(0.02), wrong_checksum, corrupt(), half, garbage, swapped]
 MIXED = ("XM430-W350", "PH54-200-S500", "MX-28", "AX-12A", "MX-64(2.0)", "XL330-M288")
 FAST = 0.9  # [rad/s], the arm's largest speed; plus half a tick
 

@@ -22,7 +22,7 @@ from bodyschema.drivers.servos.channel import Punctuality
 from bodyschema.interfaces.errors import SourceError, SourceLost
 from bodyschema.interfaces.records import JointReading
 
-FAULTS = [mute, late(0.02), wrong_checksum, corrupt(), half, garbage(), swapped]
+FAULTS = [mute, late(0.02), wrong_checksum, corrupt(), half, garbage, swapped]
 MIXED = ("STS3215", "SCS0009", "STS3250", "SM8512BL")
 
 

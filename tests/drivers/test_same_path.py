@@ -19,7 +19,8 @@ from servo_arm import TICK
 from test_serial_lines import BoardArm
 from virtual_port import VirtualClock
 
-from bodyschema.drivers.bench.servo_arm import Angle, played
+from bodyschema.drivers.bench.device import Angle
+from bodyschema.drivers.bench.servo_arm import played
 from bodyschema.drivers.ros2.bench.node import Node
 from bodyschema.drivers.ros2.bench.zenoh_robot import ZenohRobot
 from bodyschema.drivers.ros2.config import Ros2Config

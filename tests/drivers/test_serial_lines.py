@@ -42,7 +42,7 @@ from bodyschema.interfaces.records import JointReading
 TICK = 2 * math.pi / 4096
 HEADER = "H,1,7,2,shoulder,4096,elbow,16384"
 SKETCH = Path(__file__).parents[2] / "examples" / "as5600" / "as5600.ino"
-FAULTS = [mute, late(0.05), wrong_checksum, corrupt(), half, garbage()]
+FAULTS = [mute, late(0.05), wrong_checksum, corrupt(), half, garbage]
 PIECES = st.lists(
     st.one_of(
         st.binary(max_size=60),

@@ -84,8 +84,6 @@ class FitOptions:
         """Return the calibration, and that with everything free where the URDF is trusted and the pairs suffice.
 
         Args:
-            robot: the nominal model.
-            recording: what to learn.
             common: returns the errors that all positions share, as for `Calibration.of`; None: none are known.
         """
         from bodyschema.calibration.rigid_chain import Calibration, fewest_pairs
@@ -131,6 +129,24 @@ class PlanOptions:
 
 NO_PLAN = PlanOptions()
 
+
+@Parameter(name="*")
+@dataclass(frozen=True)
+class RowNumbers:
+    """The rows to learn."""
+
+    first: Annotated[
+        int | None,
+        Parameter(
+            help="Number of the first row to learn; of a store, else the first with the present tool.",
+            validator=Number(gte=1),
+        ),
+    ] = None
+    last: Annotated[int | None, Parameter(help="Number of the last row to learn.", validator=Number(gte=1))] = None
+
+
+ALL_ROWS = RowNumbers()
+
 # Without a help of its own its page shows what `arm` says, beside the commands.
 calibrate = cyclopts.App(name="calibrate")
 calibrate.command(cameras, sort_key=1)
@@ -150,14 +166,7 @@ def arm(
     *,
     robot: SourceRobotFile = None,
     fit: FitOptions = AS_USUAL,
-    first: Annotated[
-        int | None,
-        Parameter(
-            help="Number of the first row to learn; of a store, else the first with the present tool.",
-            validator=Number(gte=1),
-        ),
-    ] = None,
-    last: Annotated[int | None, Parameter(help="Number of the last row to learn.", validator=Number(gte=1))] = None,
+    numbers: RowNumbers = ALL_ROWS,
     out: Annotated[
         Path | None, Parameter(help="Write the calibrated robot into this folder: a URDF and a robot.toml.")
     ] = None,
@@ -195,7 +204,6 @@ def arm(
     the servos instead, by LeRobot's own calibration file.
     """
     from bodyschema.calibration.next_poses import check_target
-    from bodyschema.calibration.report import CalibrationReport
     from bodyschema.daemon.config import Config
 
     _require_one_target(servos, out)
@@ -204,22 +212,15 @@ def arm(
         check_target(plan.next_poses, replace=force)
     config = Config.load(robot_file(robot, source))
     servos.require(config)
-    description, source = config.robot, source or config.store_file
-    recording, first = _rows(config, source, taken, servos.lerobot, (first, last))
-    seen = _checked(description, recording, source, fit.sigma_m)
-    if seen.misread:
-        seen.require(source, force=force)
-    common, unknown = _common_errors(config, source, taken)
-    found, free = fit.fitted(description, recording, common)
-    report = CalibrationReport.of(found, seen, source.name, first, camera_frame, free)
-    if report.other_tool_from is None:
-        seen.require(source, force=force)
+    rows = _Rows.of(config, source or config.store_file, numbers, taken, servos.lerobot)
+    common, unknown = _common_errors(config, rows.source, taken)
+    found, report = rows.calibrated(fit, common, camera_frame, force=force)
     if out is not None or servos.write:
         _require_writable(report, force=force)
     told = [] if out is None else _written(config, found, report, out, replace=force)
     of_cameras, lines = [*unknown, *_contained(found)], plan.written(found)
     offsets = {zero.joint: math.radians(zero.zero) for zero in report.zeros if zero.half_width is not None}
-    changed = servos.lines(config, offsets, source)
+    changed = servos.lines(config, offsets, rows.source)
     if as_json:
         print_json(report)
         sys.stderr.writelines(f"{line}\n" for line in [*of_cameras, *changed])
@@ -227,14 +228,56 @@ def arm(
         _show(report, [*of_cameras, *lines, *changed], told)
 
 
-def _checked(robot: RobotDescription, recording: Recording, source: Path, sigma_m: float | None) -> Plausibility:
-    """Check that the recording can be of this robot; refuse units that no arm has."""
-    from bodyschema.calibration.plausibility.check import plausibility, told_sigma
-    from bodyschema.calibration.plausibility.limits import require_units
+@dataclass(frozen=True)
+class _Rows:
+    """Rows to learn."""
 
-    require_units(robot, recording, source)
-    sigma_m = told_sigma(recording) or sigma_m
-    return plausibility(robot, recording.q, recording.x, sigma_m=sigma_m, orientation=recording.orientation)
+    robot: RobotDescription
+    source: Path
+    recording: Recording
+    first: int  # number of the first of them in the source
+
+    @classmethod
+    def of(cls, config: Config, source: Path, numbers: RowNumbers, taken: SourceOptions, lerobot: Path | None) -> _Rows:
+        """Read the rows; of a store, those with the present tool."""
+        from bodyschema.cli.recordings.foreign import opened
+        from bodyschema.daemon.learner.checkpoint import first_pair
+        from bodyschema.recordings import files as recordings
+
+        first = numbers.first
+        if source.suffix.lower() in recordings.STORE_ENDINGS:
+            stored = recordings.stored_pairs(source)
+            recording = recordings.of_robot(stored.recording, config.robot.joints, source)
+            first = first or first_pair(stored, source.with_name(config.checkpoint_file.name), config.robot.name)
+        else:
+            recording = opened(config, source, taken, lerobot)
+        first = first or 1
+        return cls(config.robot, source, recordings.between(recording, first, numbers.last, source), first)
+
+    def calibrated(
+        self, fit: FitOptions, common: CommonErrors | None, frame: str, *, force: bool
+    ) -> tuple[Calibration, CalibrationReport]:
+        """Return the calibration with its report; refuse rows that are not of this robot."""
+        from bodyschema.calibration.report import CalibrationReport
+
+        seen = self._checked(fit.sigma_m)
+        if seen.misread:
+            seen.require(self.source, force=force)
+        found, free = fit.fitted(self.robot, self.recording, common)
+        report = CalibrationReport.of(found, seen, self.source.name, self.first, frame, free)
+        if report.other_tool_from is None:
+            seen.require(self.source, force=force)
+        return found, report
+
+    def _checked(self, sigma_m: float | None) -> Plausibility:
+        """Check that the recording can be of this robot; refuse units that no arm has."""
+        from bodyschema.calibration.plausibility.check import plausibility, told_sigma
+        from bodyschema.calibration.plausibility.limits import require_units
+
+        rows = self.recording
+        require_units(self.robot, rows, self.source)
+        sigma_m = told_sigma(rows) or sigma_m
+        return plausibility(self.robot, rows.q, rows.x, sigma_m=sigma_m, orientation=rows.orientation)
 
 
 def _common_errors(config: Config, source: Path, taken: SourceOptions) -> tuple[CommonErrors | None, list[str]]:
@@ -269,25 +312,6 @@ def _require_one_target(servos: LeRobotOptions, out: Path | None) -> None:
         raise RequestError(
             "--write is for --lerobot FILE, and without --out: offsets belong into the servos or into a URDF, not both"
         )
-
-
-def _rows(
-    config: Config, source: Path, taken: SourceOptions, lerobot: Path | None, between: tuple[int | None, int | None]
-) -> tuple[Recording, int]:
-    """Return the rows to learn, and the number of the first; of a store, those with the present tool."""
-    from bodyschema.cli.recordings.foreign import opened
-    from bodyschema.daemon.learner.checkpoint import first_pair
-    from bodyschema.recordings import files as recordings
-
-    first, last = between
-    if source.suffix.lower() in recordings.STORE_ENDINGS:
-        stored = recordings.stored_pairs(source)
-        recording = recordings.of_robot(stored.recording, config.robot.joints, source)
-        first = first or first_pair(stored, source.with_name(config.checkpoint_file.name), config.robot.name)
-    else:
-        recording = opened(config, source, taken, lerobot)
-    first = first or 1
-    return recordings.between(recording, first, last, source), first
 
 
 def _require_writable(report: CalibrationReport, *, force: bool) -> None:

@@ -162,11 +162,7 @@ def _of_lerobot(
 
 
 def write_new(file: Path, text: str) -> None:
-    """Write a new file.
-
-    Raises:
-        ConfigError: it exists.
-    """
+    """Write a new file; raise ConfigError if it exists."""
     from bodyschema.interfaces.whole_files import write_whole
 
     if os.path.lexists(file):

@@ -11,8 +11,7 @@ from random import Random
 
 from bodyschema.drivers.bench import faults
 from bodyschema.drivers.bench.asked_faults import ON_THE_WIRE, FaultKinds
-from bodyschema.drivers.bench.device import Faults, Reply
-from bodyschema.drivers.bench.dry_run import Angle
+from bodyschema.drivers.bench.device import Angle, Faults, Reply
 from bodyschema.drivers.bench.faults import Storm
 from bodyschema.drivers.bench.servo_arm import AT_THE_START, ServoArm
 from bodyschema.drivers.dynamixel.bench.chain import Chain

@@ -139,10 +139,7 @@ class Chain(ServoChain[Servo]):
     def _sync_write(self, servos: list[Servo], instruction: Instruction, t: float) -> list[Reply]:
         wide, params = instruction.protocol, instruction.params
         address, size = _number(params[:wide]), _number(params[wide : 2 * wide])
-        for k in range(2 * wide, len(params) - size, size + 1):
-            for servo in servos:
-                if servo.id == params[k]:
-                    servo.write(address, params[k + 1 : k + 1 + size], t)
+        self._write_each(servos, address, size, params[2 * wide :], t)
         return []
 
     def _bulk_write(self, servos: list[Servo], instruction: Instruction, t: float) -> list[Reply]:
@@ -150,9 +147,7 @@ class Chain(ServoChain[Servo]):
         k = 0
         while k + 5 <= len(params):
             id, address, size = params[k], _number(params[k + 1 : k + 3]), _number(params[k + 3 : k + 5])
-            for servo in servos:
-                if servo.id == id:
-                    servo.write(address, params[k + 5 : k + 5 + size], t)
+            self._write_each(servos, address, size, bytes((id,)) + params[k + 5 : k + 5 + size], t)
             k += 5 + size
         return []
 

@@ -17,14 +17,7 @@ Values = tuple[tuple[int, int, int], ...]
 
 @dataclass(frozen=True, slots=True)
 class Factory2:
-    """Register values of Protocol 2.0; those of the X430 by default.
-
-    Attributes:
-        positions: limits [ticks]; None: a turn around the middle.
-        ports: number of external ports.
-        gains: I and P of the velocity, D, I and P of the position.
-        supply: rated supply voltage [0.1 V].
-    """
+    """Register values of Protocol 2.0; those of the X430 by default."""
 
     threshold: int = 10
     temperature: int = 80
@@ -33,12 +26,13 @@ class Factory2:
     current: int = 1193
     acceleration: int = 0
     velocity: int = 200
-    positions: tuple[int, int] | None = (0, 4095)
-    ports: int = 0
+    positions: tuple[int, int] | None = (0, 4095)  # limits [ticks]; None: a turn around the middle
+    ports: int = 0  # number of external ports
     slope: int = 0
     shutdown: int = 52
+    # I and P of the velocity, D, I and P of the position
     gains: tuple[int, int, int, int, int] = (1920, 100, 0, 0, 800)
-    supply: int = 120
+    supply: int = 120  # rated supply voltage [0.1 V]
 
     def values(self, model: Model) -> Values:
         """Return address, size and value of all registers."""

@@ -55,20 +55,14 @@ ERRORS1 = {Error.INSTRUCTION: 0x40, Error.CRC: 0x10}  # in Protocol 1.0 all othe
 
 @dataclass(frozen=True, slots=True)
 class Instruction:
-    """One packet from the host.
-
-    Attributes:
-        params: without stuffing.
-        intact: the checksum is right.
-        end: offset in the stream just behind its last byte.
-    """
+    """One packet from the host."""
 
     protocol: Protocol
     id: int
     code: int
-    params: bytes
-    intact: bool
-    end: int
+    params: bytes  # without stuffing
+    intact: bool  # the checksum is right
+    end: int  # offset in the stream just behind its last byte
 
 
 def instructions_in(stream: bytearray) -> tuple[list[Instruction], int]:

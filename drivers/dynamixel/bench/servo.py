@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
+from bodyschema.drivers.bench.chain import EmulatedServo
+from bodyschema.drivers.bench.device import Angle
 from bodyschema.drivers.dynamixel.models import TICK_S, TICKS, Model, baud_of, baud_value
 
 from .factory import factory_values, indirect_blocks
 from .frames import Error
-
-Angle = Callable[[float], float]
 
 CURRENT_MODE, POSITION_MODE = 0, 3  # Operating Mode
 MODES_WITH_CURRENT, MODES_WITHOUT = (0, 1, 3, 4, 5, 16), (1, 3, 4, 16)
@@ -55,18 +55,18 @@ JUDGED = (*LARGEST, *GOALS, "operating_mode")
 RAM_OF_FACTORY = ("status_return", "temperature")
 
 
-class Servo:
+class Servo(EmulatedServo):
     """An emulated servo.
 
-    The shaft angle is given by `angle`. The servo's action on the shaft is reported by `motor_current` and `held_at`:
-    an `angle` that follows these moves as a real arm would.
+    Its action on the shaft is reported by `motor_current` and `held_at`: an `angle` that follows these moves as a real
+    arm would.
 
     Attributes:
-        model: its model.
-        glitch_ticks: error of the encoder [ticks].
         excess_a: current drawn above the regulated one [A].
         fast: it supports FAST_SYNC_READ.
     """
+
+    delay_unit_us = TICKS_PER_REPLY_DELAY_US
 
     def __init__(
         self,
@@ -79,18 +79,9 @@ class Servo:
         booted_s: float = 0.0,
         fast: bool = True,
     ) -> None:
-        """Create a servo with factory settings, except for the arguments.
-
-        Args:
-            angle: shaft angle [rad] as a function of time [s]; 0 in the middle of its range, any number of turns.
-            return_delay_s: delay between instruction and answer.
-            booted_s: time of power-up.
-            fast: it supports FAST_SYNC_READ.
-        """
-        self.model, self.fast = model, fast
-        self.glitch_ticks, self.excess_a = 0, 0.0
-        self._angle = angle
-        self._memory = bytearray(model.layout.size)
+        """Create a servo with factory settings, except for the arguments."""
+        super().__init__(model, angle)
+        self.fast, self.excess_a = fast, 0.0
         self._values: dict[str, int] = {}  # of registers, as far as they have been read since the memory changed
         self._is_protocol2 = model.protocol == 2
         self._places = {name: (r.address, r.end, r.signed) for name, r in model.layout.registers.items()}
@@ -104,7 +95,6 @@ class Servo:
         self._reset_memory()
         self["id"], self["baud"] = id, baud_value(model.layout, baud)
         self["return_delay"] = round(return_delay_s * 1e6 / TICKS_PER_REPLY_DELAY_US)
-        self._registered: tuple[int, bytes] | None = None
         self._booted_s = booted_s
         self._base = 0
         self._heard_s = booted_s
@@ -112,7 +102,6 @@ class Servo:
         self._fold(booted_s)
 
     def __getitem__(self, name: str) -> int:
-        """Return the value of a register."""
         value = self._values.get(name)
         if value is None:
             address, end, signed = self._places[name]
@@ -120,22 +109,13 @@ class Servo:
         return value
 
     def __setitem__(self, name: str, value: int) -> None:
-        """Write a register as the servo itself does, bypassing all locks."""
         address, end, signed = self._places[name]
         self._memory[address:end] = value.to_bytes(end - address, "little", signed=signed)
         self._values[name] = value
 
     @property
-    def id(self) -> int:
-        return self["id"]
-
-    @property
     def baud(self) -> int:
         return baud_of(self.model.layout, self["baud"])
-
-    @property
-    def return_delay_s(self) -> float:
-        return self["return_delay"] * TICKS_PER_REPLY_DELAY_US * 1e-6
 
     @property
     def hardware_error(self) -> int:
@@ -150,9 +130,6 @@ class Servo:
             self["hardware_error"] |= bits
         if bits & self["shutdown"]:
             self["torque"] = 0
-
-    def angle(self, t: float) -> float:
-        return self._angle(t)
 
     def hear(self, t: float) -> None:
         """Note that an instruction for the servo arrived at `t`."""

@@ -10,8 +10,7 @@ from random import Random
 from bodyschema.drivers.bench import faults
 from bodyschema.drivers.bench.asked_faults import ON_THE_WIRE, FaultKinds
 from bodyschema.drivers.bench.chain import ServoChain, mixed
-from bodyschema.drivers.bench.device import Faults, Reply, Sampling
-from bodyschema.drivers.bench.dry_run import Angle
+from bodyschema.drivers.bench.device import Angle, Faults, Reply, Sampling
 from bodyschema.drivers.bench.servo_arm import AT_THE_START, ServoArm
 from bodyschema.drivers.feetech.bench.servo import Servo
 from bodyschema.drivers.feetech.config import FeetechConfig, ServoConfig
@@ -50,16 +49,12 @@ class Code(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Instruction:
-    """One packet from the host.
-
-    Attributes:
-        end: offset in the stream just behind its last byte.
-    """
+    """One packet from the host."""
 
     id: int
     code: int
     params: bytes
-    end: int
+    end: int  # offset in the stream just behind its last byte
 
 
 def instructions_in(stream: bytearray) -> tuple[list[Instruction], int]:
@@ -114,7 +109,8 @@ class Chain(ServoChain[Servo]):
             asked = [(id, params[0], params[1]) for id in params[2:]]
             return self._in_turn(knowing, asked, t, Code.SYNC_READ)
         if instruction.code == Code.SYNC_WRITE:
-            self._sync_write(hearing, params, t)
+            if len(params) >= 2:
+                self._write_each(hearing, params[0], params[1], params[2:], t)
             return []
         is_for_all = instruction.id == BROADCAST
         there = [servo for servo in hearing if is_for_all or servo.id == instruction.id]
@@ -179,15 +175,6 @@ class Chain(ServoChain[Servo]):
         if address <= position.address and position.end <= address + size:
             self.samplings[servo.id] = Sampling(t, servo.angle(t))
         return servo["status"], servo.read(address, size, t) or b""
-
-    def _sync_write(self, servos: list[Servo], params: bytes, t: float) -> None:
-        if len(params) < 2:
-            return
-        address, size = params[0], params[1]
-        for k in range(2, len(params) - size, size + 1):
-            for servo in servos:
-                if servo.id == params[k]:
-                    servo.write(address, params[k + 1 : k + 1 + size], t)
 
 
 # Bits of the status.

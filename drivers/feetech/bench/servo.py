@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
+from bodyschema.drivers.bench.chain import EmulatedServo
+from bodyschema.drivers.bench.device import Angle
 from bodyschema.drivers.feetech.models import BAUDS, SCS
 from bodyschema.drivers.servos.model import Model
-
-Angle = Callable[[float], float]
 
 VELOCITY_STEP_S = 0.01
 RETURN_DELAY_UNIT_US = 2
@@ -60,16 +59,14 @@ READ_ONLY = ("firmware", "model", "position", "velocity", "load", "voltage", "te
 LARGEST_SPEED = 3400  # [ticks/s]
 
 
-class Servo:
-    """An emulated servo.
-
-    Torque has no effect on the shaft, whose angle is given by `angle`.
+class Servo(EmulatedServo):
+    """An emulated servo. Torque has no effect on the shaft.
 
     Attributes:
-        model: its model.
-        glitch_ticks: error of the encoder [ticks].
         knows_sync_read: it answers SYNC_READ.
     """
+
+    delay_unit_us = RETURN_DELAY_UNIT_US
 
     def __init__(
         self,
@@ -84,15 +81,12 @@ class Servo:
         """Create a servo with factory settings, except for the arguments.
 
         Args:
-            angle: shaft angle [rad] as a function of time [s]; 0 in the middle of its range, any number of turns.
             return_delay_s: delay between instruction and answer.
             multi_turn: it counts turns until it loses power.
         """
-        self.model, self.knows_sync_read = model, model.protocol != SCS
-        self.glitch_ticks = 0
-        self._angle, self._multi_turn, self._base = angle, multi_turn, 0
-        self._memory = bytearray(model.layout.size)
-        self._registered: tuple[int, bytes] | None = None
+        super().__init__(model, angle)
+        self.knows_sync_read = model.protocol != SCS
+        self._multi_turn, self._base = multi_turn, 0
         self["model"] = model.number
         self._set_factory_values()
         for name, value in RAM_OF_FACTORY.items():
@@ -103,30 +97,17 @@ class Servo:
         self._power_up()
 
     def __getitem__(self, name: str) -> int:
-        """Return the value of a register."""
         register = self.model.layout.registers.get(name)
         return 0 if register is None else register.value(bytes(self._memory[register.address : register.end]))
 
     def __setitem__(self, name: str, value: int) -> None:
-        """Write a register permanently, as the servo itself does, bypassing all locks."""
         register = self.model.layout[name]
         self._memory[register.address : register.end] = register.bytes(value)
         self._saved = bytes(self._memory[: self.model.layout.ram])
 
     @property
-    def id(self) -> int:
-        return self["id"]
-
-    @property
     def baud(self) -> int:
         return BAUDS[min(self["baud"], len(BAUDS) - 1)]
-
-    @property
-    def return_delay_s(self) -> float:
-        return self["return_delay"] * RETURN_DELAY_UNIT_US * 1e-6
-
-    def angle(self, t: float) -> float:
-        return self._angle(t)
 
     def fail(self, bits: int) -> None:
         """Report a hardware error until the servo is rebooted. Torque goes off if `unloading` includes it."""

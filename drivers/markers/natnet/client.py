@@ -27,7 +27,6 @@ class NatnetReceiver:
     """The stream of a NatNet server, by multicast or to this client alone, as the server is set up.
 
     Attributes:
-        server: the server's answer; None before it.
         names: names of the rigid bodies by streaming ID.
     """
 
@@ -90,11 +89,7 @@ class NatnetReceiver:
         return "Motive answers, but sends no frames: start its live mode, and check Rigid Bodies in Data Streaming"
 
     def decode(self, payload: bytes, _: bytes = b"") -> Iterator[Report]:
-        """Yield the rigid bodies of a frame.
-
-        Raises:
-            Unusable: it is damaged.
-        """
+        """Yield the rigid bodies of a frame; raise Unusable if it is damaged."""
         if self.server is None:
             return
         found = packets.frame(payload, self.server.version)

@@ -41,64 +41,40 @@ class Message(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class ServerInfo:
-    """The server's answer to CONNECT.
+    """The server's answer to CONNECT."""
 
-    Attributes:
-        application: name of the program.
-        program: its version.
-        version: of NatNet, in which it streams.
-        ticks_per_s: rate of the clock of its stamps.
-        data_port: where it sends the frames to.
-        group: address of the multicast group; empty if it sends to each client alone.
-    """
-
-    application: str
+    application: str  # name of the program
     program: Version
-    version: Version
-    ticks_per_s: int
-    data_port: int
-    group: str
+    version: Version  # of NatNet, in which it streams
+    ticks_per_s: int  # rate of the clock of its stamps
+    data_port: int  # where it sends the frames to
+    group: str  # address of the multicast group; empty if it sends to each client alone
 
 
 @dataclass(frozen=True, slots=True)
 class RigidBody:
-    """A rigid body in a frame.
+    """A rigid body in a frame."""
 
-    Attributes:
-        id: its streaming ID.
-        x: position of its pivot [m].
-        turn: quaternion (x, y, z, w).
-        error: mean distance of its markers from where the body has them [m].
-        is_tracked: whether the pose was measured in this frame.
-    """
-
-    id: int
-    x: tuple[float, float, float]
-    turn: tuple[float, float, float, float]
-    error: float
-    is_tracked: bool
+    id: int  # its streaming ID
+    x: tuple[float, float, float]  # position of its pivot [m]
+    turn: tuple[float, float, float, float]  # quaternion (x, y, z, w)
+    error: float  # mean distance of its markers from where the body has them [m]
+    is_tracked: bool  # whether the pose was measured in this frame
 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A frame of motion capture data, as far as it is used.
+    """A frame of motion capture data, as far as it is used."""
 
-    Attributes:
-        number: of the frame.
-        bodies: the rigid bodies.
-        exposed, sent: ticks of the server's clock at the middle of the exposure and when the frame was sent.
-        time_s: the program's own time, which a recording played back has, too [s].
-    """
-
-    number: int
+    number: int  # of the frame
     bodies: tuple[RigidBody, ...]
+    # exposed, sent: ticks of the server's clock at the middle of the exposure and when the frame was sent
     exposed: int
     sent: int
-    time_s: float
+    time_s: float  # the program's own time, which a recording played back has, too [s]
 
 
 def packet(message: Message, contents: bytes = b"") -> bytes:
-    """Return a packet."""
     return HEADER.pack(message, len(contents)) + contents
 
 
@@ -108,11 +84,7 @@ def connect() -> bytes:
 
 
 def opened(data: bytes) -> tuple[int, bytes]:
-    """Return the message and the contents of a packet.
-
-    Raises:
-        Unusable: its size is not the one announced.
-    """
+    """Return the message and the contents of a packet; raise Unusable if its size is not the one announced."""
     if len(data) < HEADER.size:
         raise Unusable(Fault.MALFORMED, f"{len(data)} bytes are no NatNet packet")
     message, size = HEADER.unpack_from(data)
@@ -122,11 +94,7 @@ def opened(data: bytes) -> tuple[int, bytes]:
 
 
 def server_info(contents: bytes) -> ServerInfo:
-    """Read the answer to CONNECT.
-
-    Raises:
-        Unusable: it is too short.
-    """
+    """Read the answer to CONNECT; raise Unusable if it is too short."""
     if len(contents) < SERVER.size + SERVER_CLOCK.size:
         raise Unusable(Fault.MALFORMED, f"{len(contents)} bytes are no answer of a NatNet 3 or 4 server")
     name, major, minor, _, _, net_major, net_minor, _, _ = SERVER.unpack_from(contents)
@@ -137,11 +105,7 @@ def server_info(contents: bytes) -> ServerInfo:
 
 
 def frame(contents: bytes, version: Version) -> Frame:
-    """Read a frame.
-
-    Raises:
-        Unusable: its sections do not fit into its bytes.
-    """
+    """Read a frame; raise Unusable if its sections do not fit into its bytes."""
     reader = _Reader(contents)
     is_sized = version >= SIZED_SINCE
     number = reader.int32()
@@ -252,7 +216,6 @@ class _Reader:
         self.at = at
 
     def section(self, is_sized: bool, skip: _Skip) -> None:
-        """Skip a section."""
         count = self.count()
         if is_sized:
             self.skip(self.int32())

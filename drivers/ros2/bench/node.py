@@ -40,11 +40,7 @@ def intact(message: JointState) -> bytes:
 
 
 def spoilt(fault: Fault, message: JointState, before_ns: int, rng: Random) -> bytes | None:
-    """Encode a message with a fault; return None for silence.
-
-    Args:
-        before_ns: stamp of the previous message.
-    """
+    """Encode a message with a fault; return None for silence."""
     if fault is Fault.SILENCE:
         return None
     if fault in OF_THE_NODE:
@@ -85,16 +81,10 @@ class Planned:
 
     Attributes:
         next: fault of the next message; reset to None once it is applied.
-        given: number of applied faults, by kind.
     """
 
     def __init__(self, rng: Random, *, share: float = 0.0, kinds: tuple[Fault, ...] = tuple(Fault)) -> None:
-        """Start without any corrupted message.
-
-        Args:
-            share: share of the messages that are corrupted at random.
-            kinds: faults to choose from.
-        """
+        """Start without any corrupted message."""
         self._rng, self._share, self._kinds = rng, share, kinds
         self._before_ns = 0
         self.next: Fault | None = None
@@ -128,8 +118,6 @@ class Node:
     """An emulated node.
 
     Attributes:
-        names: of its joints.
-        period_s: time between two messages.
         set_by_s: how far its clock was set forwards since the start [s].
     """
 
@@ -140,8 +128,6 @@ class Node:
 
         Args:
             paths: the position of each joint [rad] or [m] as a function of time [s].
-            rate_hz: messages per second.
-            name: makes its gid differ from other nodes'.
             drift: how much faster its clock runs than ours.
             send: encodes each message, corrupted or not.
         """

@@ -17,11 +17,7 @@ from .node import Node
 
 
 class ZenohRobot:
-    """Publisher of nodes' joint states, as rmw_zenoh would send them; its process is the router too.
-
-    Attributes:
-        published: number of messages so far.
-    """
+    """Publisher of nodes' joint states, as rmw_zenoh would send them; its process is the router too."""
 
     def __init__(
         self,
@@ -36,8 +32,6 @@ class ZenohRobot:
 
         Args:
             listen: endpoint of the router, such as tcp/127.0.0.1:7447.
-            domain: ROS_DOMAIN_ID.
-            via: whose keys: those of rmw_zenoh, or of zenoh-bridge-ros2dds.
         """
         self._via = via
         self._nodes, self._listen, self._domain, self._topic = list(nodes), listen, domain, topic

@@ -11,7 +11,8 @@ from typing import ClassVar
 import msgspec
 
 from bodyschema.drivers.bench.asked_faults import ON_THE_WIRE, AskedFault, FaultKinds, WireFaults
-from bodyschema.drivers.bench.dry_run import GLITCH_TICKS, Angle, BenchArm
+from bodyschema.drivers.bench.device import Angle
+from bodyschema.drivers.bench.dry_run import GLITCH_TICKS, BenchArm
 from bodyschema.drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
 
 from .board import EncoderBoard
@@ -37,13 +38,7 @@ class EncoderArm(BenchArm):
         rate_hz: float = 200.0,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Create a board with its power on.
-
-        Args:
-            angles: by joint, its angle as a function of time [rad].
-            seed: of the faults on the wire.
-            rate_hz: lines per second.
-        """
+        """Create a board with its power on."""
         self._config, rng = config, Random(seed)
         self._names = {encoder.joint: encoder.name for encoder in config.encoders}
         wire = WireFaults.asked(faults, KINDS, dict.fromkeys(self._names, 0), rng)  # one line contains all encoders

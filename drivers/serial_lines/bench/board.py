@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Self
 
-from bodyschema.drivers.bench.device import Faults, Reply, byte_s, no_faults
+from bodyschema.drivers.bench.device import Angle, Faults, Reply, byte_s, no_faults
 from bodyschema.drivers.serial_lines.lines import SEQUENCES, STAMP_S, STAMPS, VERSION, with_checksum
 from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.protocols import JointSource
@@ -15,18 +15,15 @@ from bodyschema.interfaces.records import JointReading
 from bodyschema.interfaces.waits import POLL_S
 
 HEADER_EVERY_S = 1.0
-Angle = Callable[[float], float]
 
 
 class EncoderBoard:
     """An emulated board of encoders.
 
     Attributes:
-        encoders: by name, ticks per turn and shaft angle.
         faults: applied to the lines; their id is 0.
         failing: encoders whose sensor has no value.
         glitch_ticks: error of an encoder [ticks], by name.
-        lines: number of lines sent.
     """
 
     def __init__(
@@ -44,9 +41,6 @@ class EncoderBoard:
         Args:
             encoders: by name, ticks per turn, and shaft angle as a function of time [s]: [rad], 0 at the raw position
                 0.
-            rate_hz: lines per second.
-            begun_s: time of power-up.
-            boot: its boot number.
             drift: how much its clock is too fast.
         """
         self.encoders, self.faults = dict(encoders), faults
