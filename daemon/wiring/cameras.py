@@ -100,8 +100,9 @@ def common_error(config: Config) -> CommonError | None:
     if vision.further_cameras or config.tables.marker_source:
         return None
     rig = read_rig(calibration_file(config))
-    sized = isinstance(rig, OneEyeRig) and vision.marker in ("tag", "cluster")  # a fix of a ball has its radius's error
-    error = CommonError(rig, vision.tag.side_sigma_m / vision.tag.side_m if sized else 0.0)
+    # A fix of a ball has its radius's error.
+    sized = isinstance(rig, OneEyeRig) and vision.marker in ("tag", "cluster", "chessboard")
+    error = CommonError(rig, vision.size_sigma if sized else 0.0)
     error.require_usable()
     return error
 

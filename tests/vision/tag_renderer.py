@@ -35,6 +35,7 @@ class Sheet:
         side_m: side of the black square.
         margin: width of the white margin, in squares of the pattern.
         curl: curvature of the paper across its width, towards the camera [1/m].
+        squares: columns and rows of a chessboard in the place of a tag; `side_m` is then that of a square.
     """
 
     id: int
@@ -44,10 +45,25 @@ class Sheet:
     margin: float = 1.0
     dictionary: int = cv2.aruco.DICT_APRILTAG_36h11
     curl: float = 0.0
+    squares: tuple[int, int] | None = None
+
+    @property
+    def halves_m(self) -> tuple[float, float]:
+        if self.squares is None:
+            return (self.side_m * (0.5 + self.margin / 8.0),) * 2
+        columns, rows = self.squares
+        return self.side_m * (0.5 * columns + self.margin), self.side_m * (0.5 * rows + self.margin)
 
     @property
     def half_m(self) -> float:
-        return self.side_m * (0.5 + self.margin / 8.0)
+        return max(self.halves_m)
+
+    @property
+    def black(self) -> np.ndarray:
+        """The pattern (rows from the top), True where it is black."""
+        if self.squares is None:
+            return pattern(self.id, self.dictionary)
+        return np.indices(self.squares[::-1]).sum(axis=0) % 2 == 0
 
 
 @dataclass(frozen=True)
@@ -58,6 +74,10 @@ class Card:
     x: FloatArray
     half_m: float
     grey: float = 0.5
+
+    @property
+    def halves_m(self) -> tuple[float, float]:
+        return self.half_m, self.half_m
 
 
 def photograph(
@@ -133,15 +153,18 @@ def _cover(
         for _ in range(3 if curl else 0):  # the parabola meets each ray after three steps, to a micrometre
             depth = (away + curl * (depth * to_right - right) ** 2 / 2) / facing
         across, up = depth * to_right - right, depth * to_top - top
-    hit = (facing < 0.0) & (depth > 0.0) & (depth < nearest) & (np.maximum(abs(across), abs(up)) < thing.half_m)
+    hit = (facing < 0.0) & (depth > 0.0) & (depth < nearest)
+    hit &= (abs(across) < thing.halves_m[0]) & (abs(up) < thing.halves_m[1])
     light = np.array(look.light) / np.linalg.norm(look.light)
     level = look.ambient + look.diffuse * max(float(normal @ light), 0.0)
     if isinstance(thing, Sheet):
-        squares = pattern(thing.id, thing.dictionary)
-        column = np.floor((across[hit] / thing.side_m + 0.5) * 8.0).astype(int)
-        row = np.floor((0.5 - up[hit] / thing.side_m) * 8.0).astype(int)
-        inside = (column >= 0) & (column < 8) & (row >= 0) & (row < 8)
-        black = inside & squares[np.clip(row, 0, 7), np.clip(column, 0, 7)]
+        squares = thing.black
+        rows, columns = squares.shape
+        square_m = thing.side_m / (1.0 if thing.squares else 8.0)
+        column = np.floor(across[hit] / square_m + 0.5 * columns).astype(int)
+        row = np.floor(0.5 * rows - up[hit] / square_m).astype(int)
+        inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+        black = inside & squares[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)]
         shown[hit] = level * np.where(black, BLACK, WHITE)
     else:
         shown[hit] = level * thing.grey

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from bodyschema.interfaces.records import FloatArray, ImageArray
 
@@ -139,8 +139,7 @@ class BoardDetector:
             found, px = cv2.findChessboardCornersSB(grey, size, flags=cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY)
         if not found:
             return self._no_chessboard(grey)
-        corners = _in_order(grey, np.reshape(px, (size[1], size[0], 2)).astype(np.float64), self.board)
-        return Corners(np.arange(len(self.board.corners_m)), corners.reshape(-1, 2))
+        return measured_grid(grey, np.reshape(px, (size[1], size[0], 2)), self.board)
 
     def _no_chessboard(self, grey: ImageArray) -> NotFound:
         wanted = self.board.columns, self.board.rows
@@ -189,11 +188,23 @@ def _markers(grey: ImageArray, family: str) -> list[int]:
 
 def _plain_squares(grey: ImageArray) -> tuple[int, int] | None:
     """Return the squares, the more first, of the chessboard in an image, or of as much of one as is in view."""
-    found, _, grid = cv2.findChessboardCornersSBWithMeta(grey, _SMALLEST_GRID, cv2.CALIB_CB_LARGER)
+    grid = any_grid(grey)
+    return None if grid is None else (grid.shape[1] + 1, grid.shape[0] + 1)
+
+
+def any_grid(grey: ImageArray) -> FloatArray | None:
+    """Return the corners (rows, columns, 2) [px], more columns than rows, of as much of a chessboard as is in view."""
+    found, px, grid = cv2.findChessboardCornersSBWithMeta(grey, _SMALLEST_GRID, cv2.CALIB_CB_LARGER)
     if not found:
         return None
-    rows, columns = sorted(each + 1 for each in np.shape(grid)[:2])
-    return columns, rows
+    corners = np.reshape(np.asarray(px, dtype=np.float64), (*np.shape(grid)[:2], 2))
+    return corners if corners.shape[0] <= corners.shape[1] else corners.transpose(1, 0, 2)
+
+
+def measured_grid(grey: ImageArray, rough_px: ArrayLike, board: Board) -> Corners:
+    """Return the corners of a plain chessboard, refined and in order, from rough ones (rows, columns, 2) [px]."""
+    ordered = _in_order(grey, np.asarray(rough_px, dtype=np.float64), board)
+    return Corners(*refined(grey, board, np.arange(len(board.corners_m)), ordered.reshape(-1, 2)))
 
 
 def _in_order(grey: ImageArray, grid: FloatArray, board: Board) -> FloatArray:

@@ -26,7 +26,7 @@ from bodyschema.vision.triangulate import triangulate
 
 from .body import TagBody
 from .config import TagConfig
-from .dictionary import require_tag
+from .chessboard import ChessboardFinder
 from .finder import Seen, TagFinder
 from .image import TagImage
 from .settings import TagSettings as _Settings
@@ -41,6 +41,7 @@ _TELLING = (
     Reason.NOT_STRAIGHT,
     Reason.BLURRED,
     Reason.LOW_CONTRAST,
+    Reason.REPROJECTION,
     Reason.AT_BORDER,
     Reason.NO_MARKER,
 )
@@ -56,7 +57,13 @@ class TagTracker:
     not. Then the pose of the previous frame decides, if it was unambiguous; else the frame is ambiguous.
     """
 
-    def __init__(self, calibration: StereoCalibration, body: TagBody, config: TagConfig | None = None) -> None:
+    def __init__(
+        self,
+        calibration: StereoCalibration,
+        body: TagBody,
+        config: TagConfig | None = None,
+        finder: ChessboardFinder | None = None,
+    ) -> None:
         """Prepare for images of `calibration`.
 
         Raises:
@@ -64,9 +71,7 @@ class TagTracker:
         """
         check_calibration(calibration)
         self.calibration, self.body, self.config = calibration, body, config or TagConfig()
-        for id in body.corners:
-            require_tag(self.config.dictionary, id)
-        self._finder = TagFinder(self.config, body.corners)
+        self._finder = finder or TagFinder(self.config, body.corners)
         self._whole = (0, 0, *calibration.image_size_px)
         self._last: tuple[float, list[FloatArray], FloatArray] | None = None
         self._planes: dict[frozenset[int], tuple[FloatArray, FloatArray]] = {}
@@ -135,7 +140,7 @@ class TagTracker:
     def _rows_agree(self, left: TagImage, right: TagImage) -> bool:
         """Return True if the rows of a tag's corners differ by no more than noise, and its disparity is positive."""
         apart = left.corners_px - right.corners_px
-        rows = np.arange(1, 8, 2)
+        rows = np.arange(1, len(left.cov_px), 2)
         cov = (left.cov_px + right.cov_px)[np.ix_(rows, rows)]
         sigma = math.sqrt(float(cov.mean()) + 2.0 * self.calibration.pixel_sigma**2)
         allowed = self.config.epipolar_px + self.config.epipolar_sigmas * sigma
@@ -169,7 +174,7 @@ class TagTracker:
             grown, sigma = estimator.scale(best)
             if abs(grown) > self.config.size_tolerance + 4.0 * sigma:
                 return Reason.SIZE_MISMATCH
-        freedom = 8 * len(sightings) - 6
+        freedom = sum(sighting.pixels.size for sighting in sightings) - 6
         misfit = best.squares / freedom
         if misfit > self.config.max_reprojection**2:
             return Reason.REPROJECTION
