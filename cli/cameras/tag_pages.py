@@ -109,6 +109,8 @@ def sheet(tags: Tags, paper: str) -> Page:
 
 def face_mm(tags: Tags) -> float:
     """Return the width of a face between cuts or folds, or of a board's square [mm]."""
+    if tags.shape == "chessboard":
+        return tags.side_mm
     return tags.side_mm / MARKER_SHARE if tags.shape == "board" else FACE_SIDES * tags.side_mm
 
 
