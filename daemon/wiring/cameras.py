@@ -159,7 +159,7 @@ def _tracked(config: Config, **layout: VideosConfig | ImagesConfig) -> TrackedCa
     cameras = CamerasConfig(calibration=None if given is None else given.calibration, **layout)  # pyright: ignore[reportArgumentType]
     seen = seen_through(config, cameras)
     camera = camera_of(seen, open_eyes(seen, SystemClock()))
-    return TrackedCamera(camera, tracker_of(camera.calibration, seen.tables.vision))
+    return TrackedCamera(camera, tracker_of(camera.calibration, seen.tables.vision), readout_s=cameras.readout_s)
 
 
 def seen_through(config: Config, cameras: CamerasConfig) -> Config:

@@ -36,6 +36,9 @@ class Sheet:
         margin: width of the white margin, in squares of the pattern.
         curl: curvature of the paper across its width, towards the camera [1/m].
         squares: columns and rows of a chessboard in the place of a tag; `side_m` is then that of a square.
+        moved_m, turned_rad: motion, and rotation about the axes of the left optical frame, while a rolling shutter
+            reads the image from its first row to its last; `rotation` and `x` are the pose at the middle row.
+        exposed: exposure of each row, as a share of the time that reading the image takes.
     """
 
     id: int
@@ -46,6 +49,9 @@ class Sheet:
     dictionary: int = cv2.aruco.DICT_APRILTAG_36h11
     curl: float = 0.0
     squares: tuple[int, int] | None = None
+    moved_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    turned_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    exposed: float = 0.0
 
     @property
     def halves_m(self) -> tuple[float, float]:
@@ -118,11 +124,13 @@ def _painted(
     rays = np.ones((3, *shape), np.float32)
     rays[0] = ((np.arange(shape[1]) + places[..., 0]) / n - 0.5 + columns.start - cx) / calibration.focal_px
     rays[1] = ((np.arange(shape[0])[:, None] + places[..., 1]) / n - 0.5 + rows.start - cy) / calibration.focal_px
+    # When each ray is exposed, from half a readout before the middle row to half a readout after it.
+    times = (rays[1] * calibration.focal_px + cy) / calibration.image_size_px[1] - 0.5
     before = painted[rows, columns]
     shown = before.mean(axis=2, dtype=np.float32).repeat(n, axis=0).repeat(n, axis=1)
     nearest = np.full(shape, np.inf, np.float32)
     for thing in things:
-        _cover(thing, rays, eye, look, shown, nearest)
+        _cover(thing, rays, times, eye, look, shown, nearest, rng)
     hit = pixel_means(np.isfinite(nearest).astype(np.float32), n)[..., None]
     painted[rows, columns] = np.where(hit > 0.0, pixel_means(shown, n)[..., None], before)
     return painted
@@ -141,12 +149,37 @@ def _window(things: Sequence[Sheet | Card], eye: FloatArray, calibration: Stereo
     return slice(first[1], last[1]), slice(first[0], last[0])
 
 
+def _seen_from(
+    thing: Sheet | Card, rays: FloatArray, times: FloatArray, eye: FloatArray, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Return the rays (3, ...) and the thing's middle (3, ...) in the axes of the thing, each at the ray's time."""
+    into = thing.rotation.T.astype(np.float32)
+    middle = (thing.x - eye).astype(np.float32)[:, None, None]
+    if isinstance(thing, Card) or not any((*thing.moved_m, *thing.turned_rad)):
+        return np.tensordot(into, rays, axes=1), np.tensordot(into, middle, axes=1)
+    when = times + thing.exposed * (rng.random(times.shape, np.float32) - 0.5)
+    middle = middle + np.multiply.outer(thing.moved_m, when)
+    turn = np.multiply.outer(thing.turned_rad, when)
+
+    def back(v: FloatArray) -> FloatArray:
+        once = np.cross(turn, v, axis=0)  # second order: the third is below 1e-6 for turns of a degree
+        return v - once + 0.5 * np.cross(turn, once, axis=0)
+
+    return np.tensordot(into, back(rays), axes=1), np.tensordot(into, back(middle), axes=1)
+
+
 def _cover(
-    thing: Sheet | Card, rays: FloatArray, eye: FloatArray, look: Look, shown: FloatArray, nearest: FloatArray
+    thing: Sheet | Card,
+    rays: FloatArray,
+    times: FloatArray,
+    eye: FloatArray,
+    look: Look,
+    shown: FloatArray,
+    nearest: FloatArray,
+    rng: np.random.Generator,
 ) -> None:
     normal = thing.rotation[:, 2]
-    to_right, to_top, facing = np.tensordot(thing.rotation.T.astype(np.float32), rays, axes=1)
-    right, top, away = ((thing.x - eye) @ thing.rotation).astype(np.float32)
+    (to_right, to_top, facing), (right, top, away) = _seen_from(thing, rays, times, eye, rng)
     curl = np.float32(thing.curl if isinstance(thing, Sheet) else 0.0)
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = away / facing
