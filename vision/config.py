@@ -54,8 +54,8 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         marker: what is looked for: a coloured ball, a ball that is brighter than all around it, one tag ([vision.tag]),
-            a rigid cluster of tags ([vision.cluster]), a plain chessboard ([vision.chessboard]), or what a tracker of another package finds ([vision.plugin]).
-            The other keys of this table are a ball's.
+            a rigid cluster of tags ([vision.cluster]), a plain chessboard ([vision.chessboard]), or what a tracker of
+            another package finds ([vision.plugin]). The other keys of this table are a ball's.
         colour: a name, or a band of hues as the table [vision.colour].
         min_brightness: of a bright ball, where 1 is the brightest that the camera can tell.
         radius_m: radius of the marker ball [m].

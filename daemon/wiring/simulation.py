@@ -70,7 +70,11 @@ def _require_found(config: Config, calibration: StereoCalibration, camera: Camer
         if isinstance(seen, MarkerFix):
             return
         reasons.append(seen.reason)
-    keys = {"chessboard": "[vision.chessboard]", "ball": "[vision.colour] or [vision] radius_m", "bright_ball": "[vision] min_brightness"}
+    keys = {
+        "chessboard": "[vision.chessboard]",
+        "ball": "[vision.colour] or [vision] radius_m",
+        "bright_ball": "[vision] min_brightness",
+    }
     raise ConfigError(
         "the tracker would not find the marker of [vision] in the simulation's images, not even alone before a plain "
         f"wall: {WORDS[reasons[0]]}",

@@ -7,7 +7,7 @@ says black or white. Light, blur, exposure and noise come after. Nothing here pr
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -39,6 +39,8 @@ class Sheet:
         moved_m, turned_rad: motion, and rotation about the axes of the left optical frame, while a rolling shutter
             reads the image from its first row to its last; `rotation` and `x` are the pose at the middle row.
         exposed: exposure of each row, as a share of the time that reading the image takes.
+        screen: pixels of a display across a square, each of a red, a green and a blue stripe on black; 0 is paper.
+        channel: the colour that is painted, 0 is red.
     """
 
     id: int
@@ -52,6 +54,8 @@ class Sheet:
     moved_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     turned_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
     exposed: float = 0.0
+    screen: int = 0
+    channel: int = 1
 
     @property
     def halves_m(self) -> tuple[float, float]:
@@ -100,7 +104,12 @@ def photograph(
     images = []
     for eye, picture in enumerate(behind):
         shift = np.array([calibration.baseline_m * eye, 0.0, 0.0])
-        images.append(take(_painted(picture, things, shift, calibration, look, rng), look, rng))
+        painted = _painted(picture, things, shift, calibration, look, rng)
+        if any(isinstance(thing, Sheet) and thing.screen for thing in things):
+            for channel in (0, 2):
+                lit = [replace(thing, channel=channel) if isinstance(thing, Sheet) else thing for thing in things]
+                painted[..., channel] = _painted(picture, lit, shift, calibration, look, rng)[..., channel]
+        images.append(take(painted, look, rng))
     return StereoFrame(t, images[0], images[1])
 
 
@@ -153,8 +162,7 @@ def _seen_from(
     thing: Sheet | Card, rays: FloatArray, times: FloatArray, eye: FloatArray, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
     """Return the rays (3, ...) and the thing's middle (3, ...) in the axes of the thing, each at the ray's time."""
-    into = thing.rotation.T.astype(np.float32)
-    middle = (thing.x - eye).astype(np.float32)[:, None, None]
+    into, middle = thing.rotation.T.astype(np.float32), (thing.x - eye).astype(np.float32)[:, None, None]
     if isinstance(thing, Card) or not any((*thing.moved_m, *thing.turned_rad)):
         return np.tensordot(into, rays, axes=1), np.tensordot(into, middle, axes=1)
     when = times + thing.exposed * (rng.random(times.shape, np.float32) - 0.5)
@@ -198,7 +206,16 @@ def _cover(
         row = np.floor(0.5 * rows - up[hit] / square_m).astype(int)
         inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
         black = inside & squares[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)]
-        shown[hit] = level * np.where(black, BLACK, WHITE)
+        lit = np.where(black, BLACK, WHITE)
+        if thing.screen:
+            at = np.stack([across[hit], up[hit]]) / square_m * thing.screen % 1.0 - [
+                [(thing.channel + 0.5) / 3.0],
+                [0.5],
+            ]
+            stripe = (abs(at[0]) < 0.42 / 3.0) & (abs(at[1]) < 0.42)
+            # As bright as paper on the whole, black does not glow.
+            lit = np.where(stripe & ~black, WHITE / (0.84 * 0.84 / 3.0), 0.01)
+        shown[hit] = level * lit
     else:
         shown[hit] = level * thing.grey
     nearest[hit] = depth[hit]

@@ -143,7 +143,7 @@ def test_printed_chessboard_is_found_as_its_tables_say() -> None:
 
 @pytest.mark.parametrize(("columns", "rows"), [(8, 6), (2, 1)])
 def test_chessboard_that_is_no_marker_is_not_printed(columns, rows) -> None:
-    with pytest.raises(ConfigError, match="looks the same turned by half a turn|is too small"):
+    with pytest.raises(ConfigError, match=r"looks the same turned by half a turn|is too small"):
         sheet(Tags("chessboard", columns=columns, rows=rows), "A4")
 
 

@@ -72,7 +72,8 @@ def both_fixes(eyes: str, readout_s: float) -> tuple[MarkerFix | MarkerMiss | No
 def sigmas_off(fix: MarkerFix | MarkerMiss | None) -> FloatArray:
     """Return the errors of place and turn (6,) at the time that the fix states, in its sigmas."""
     assert isinstance(fix, MarkerFix), fix
-    assert fix.R is not None and fix.cov_R is not None
+    assert fix.R is not None
+    assert fix.cov_R is not None
     rotation, x = pose(fix.t)
     turn = (Rotation.from_quat(fix.R) * rotation.inv()).as_rotvec()
     return np.array([*(fix.x - x), *turn]) / np.sqrt([*np.diag(fix.cov), *np.diag(fix.cov_R)])
@@ -89,14 +90,16 @@ def test_unknown_readout_is_felt_by_a_moving_tag() -> None:
 
 def test_time_of_a_fix_is_that_of_its_row() -> None:
     first, second = both_fixes("one", READOUT_S)
-    assert isinstance(first, MarkerFix) and isinstance(second, MarkerFix)
+    assert isinstance(first, MarkerFix)
+    assert isinstance(second, MarkerFix)
     row = SMALL.project(second.x)[1] / SMALL.image_size_px[1]
     assert second.t == pytest.approx(FRAME_S + READOUT_S * (row - 0.5), abs=1e-9)
 
 
 def test_first_frame_is_unsure_of_its_time() -> None:
     first, second = both_fixes("one", READOUT_S)
-    assert isinstance(first, MarkerFix) and isinstance(second, MarkerFix)
+    assert isinstance(first, MarkerFix)
+    assert isinstance(second, MarkerFix)
     assert (first.t_sigma, second.t_sigma) == (READOUT_S, 0.0)
 
 
@@ -104,5 +107,6 @@ def test_tag_at_rest_is_not_moved() -> None:
     still = film("one", moving=0.0)
     trackers = [tracker_of(EYES["one"], vision(s)) for s in (0.0, READOUT_S)]
     a, b = ([tracker.track(frame) for frame in still][1] for tracker in trackers)
-    assert isinstance(a, MarkerFix) and isinstance(b, MarkerFix)
+    assert isinstance(a, MarkerFix)
+    assert isinstance(b, MarkerFix)
     assert np.abs(a.x - b.x).max() < np.sqrt(np.diag(a.cov)).max()

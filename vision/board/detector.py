@@ -202,9 +202,28 @@ def any_grid(grey: ImageArray) -> FloatArray | None:
 
 
 def measured_grid(grey: ImageArray, rough_px: ArrayLike, board: Board) -> Corners:
-    """Return the corners of a plain chessboard, refined and in order, from rough ones (rows, columns, 2) [px]."""
-    ordered = _in_order(grey, np.asarray(rough_px, dtype=np.float64), board)
-    return Corners(*refined(grey, board, np.arange(len(board.corners_m)), ordered.reshape(-1, 2)))
+    """Return all corners of a plain chessboard in order, from rough ones (rows, columns, 2) [px].
+
+    They are refined if they then lie better on a plane: outer squares that are cut short disturb some.
+    """
+    ordered = _in_order(grey, np.asarray(rough_px, dtype=np.float64), board).reshape(-1, 2)
+    numbers = np.arange(len(ordered))
+    kept, px = refined(grey, board, numbers, ordered)
+    if len(kept) < len(numbers) or _scatter(board, px) > _scatter(board, ordered):
+        px = ordered
+    return Corners(numbers, px)
+
+
+def _scatter(board: Board, px: FloatArray) -> float:
+    """Return the sum of the squared distances [px²] of all corners from a plane's image."""
+    return float(np.square(px - on_plane(board, px)).sum())
+
+
+def on_plane(board: Board, px: FloatArray) -> FloatArray:
+    """Return the image of a plane (n, 2) [px] that is nearest to all corners of a board."""
+    places = board.corners_m[:, :2] / board.square_m
+    H, _ = cv2.findHomography(places, px, 0)
+    return np.asarray(cv2.perspectiveTransform(places[:, None], H)[:, 0], dtype=np.float64)
 
 
 def _in_order(grey: ImageArray, grid: FloatArray, board: Board) -> FloatArray:

@@ -52,7 +52,7 @@ class TagBody:
         columns, rows = np.meshgrid(np.arange(1, config.columns), np.arange(1, config.rows))
         across, up = columns - 0.5 * config.columns, 0.5 * config.rows - rows
         places = np.stack([across.ravel(), up.ravel(), np.zeros(across.size)], axis=1)
-        return cls({0: config.square_m * places})
+        return cls({0: np.asarray(config.square_m * places, np.float64)})
 
     @classmethod
     def single(cls, config: TagConfig) -> TagBody:

@@ -9,7 +9,7 @@ import numpy as np
 
 from bodyschema.interfaces.records import FloatArray, ImageArray, Reason
 from bodyschema.vision.board.board import Board
-from bodyschema.vision.board.detector import any_grid, measured_grid
+from bodyschema.vision.board.detector import any_grid, measured_grid, on_plane
 from bodyschema.vision.images import is_black, too_white
 
 from .config import ChessboardConfig, TagConfig
@@ -72,13 +72,9 @@ class ChessboardFinder:
         Its plane leaves residuals at the corners. Their scatter is the corners' 1-sigma.
         """
         px = measured_grid(grey, rough_px, self._board).px
-        places = self._board.corners_m[:, :2] / self._board.square_m
-        if len(px) < len(places):
-            return Reason.OCCLUDED
-        H, _ = cv2.findHomography(places, px, 0)
-        if (reason := self._squares_fault(grey, H)) is not None:
+        if (reason := self._squares_fault(grey, px)) is not None:
             return reason
-        residuals = px - cv2.perspectiveTransform(places[:, None], H)[:, 0]
+        residuals = px - on_plane(self._board, px)
         variance = float(np.square(residuals).sum()) / (residuals.size - 8)
         grid = px.reshape(self._board.rows - 1, self._board.columns - 1, 2)
         side_px = min(float(np.linalg.norm(np.diff(grid, axis=axis), axis=2).mean()) for axis in (0, 1))
@@ -86,12 +82,14 @@ class ChessboardFinder:
             return Reason.NOT_STRAIGHT
         return TagImage(0, px, variance * np.eye(residuals.size))
 
-    def _squares_fault(self, grey: ImageArray, H: FloatArray) -> Reason | None:
+    def _squares_fault(self, grey: ImageArray, px: FloatArray) -> Reason | None:
         """Return what is wrong with the squares' levels: too little contrast, or more of them beyond the border."""
         columns, rows = np.meshgrid(np.arange(-1, self._board.columns + 1), np.arange(-1, self._board.rows + 1))
         middles = np.stack([columns, rows], axis=-1) + 0.5
+        H, _ = cv2.findHomography(self._board.corners_m[:, :2] / self._board.square_m, px, 0)
         at = cv2.perspectiveTransform(middles.reshape(-1, 1, 2), H).reshape(middles.shape).astype(np.float32)
-        levels = np.asarray(cv2.remap(grey, at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), np.float64)
+        seen = cv2.remap(grey, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        levels = np.asarray(seen, np.float64)
         dark = (columns + rows) % 2 == 0
         inner = np.s_[1:-1, 1:-1]
         contrast = levels[inner][~dark[inner]].mean() - levels[inner][dark[inner]].mean()

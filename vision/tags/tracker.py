@@ -26,8 +26,8 @@ from bodyschema.vision.pose import Pose, PoseEstimator, Sighting, angle_between,
 from bodyschema.vision.triangulate import triangulate
 
 from .body import TagBody
-from .config import TagConfig
 from .chessboard import ChessboardFinder
+from .config import TagConfig
 from .finder import Seen, TagFinder
 from .image import TagImage
 from .settings import TagSettings as _Settings

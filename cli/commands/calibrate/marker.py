@@ -52,7 +52,8 @@ def print_tags(
     ] = None,
     family: Family = "apriltag_36h11",
     side_mm: Annotated[
-        float, Parameter(help="Side of a tag's black square, or of a chessboard's [mm].", validator=Number(gte=5, lte=500))
+        float,
+        Parameter(help="Side of a tag's black square, or of a chessboard's [mm].", validator=Number(gte=5, lte=500)),
     ] = 40.0,
     columns: Annotated[int, Parameter(help="Of a plate, or a board.", validator=Number(gte=1, lte=20))] = 2,
     rows: Annotated[int, Parameter(help="Of a plate, or a board.", validator=Number(gte=1, lte=20))] = 1,

@@ -62,8 +62,8 @@ def init(
     With --urdf the longest chain of joints is filled in; fingers and joints that mimic others are left out. With
     --from scan each joint gets a servo: you are asked which, and the result is checked against the URDF. With
     --lerobot IDs, directions and zeros come from LeRobot's calibration: one robot.toml for a leader, another one for a
-    follower. --webcam, --tag-mm, --ball-mm and --chessboard fill in camera and marker. Without --urdf the names are examples. Nothing
-    is written to any servo.
+    follower. --webcam, --tag-mm, --ball-mm and --chessboard fill in camera and marker. Without --urdf the names are
+    examples. Nothing is written to any servo.
 
     Needs: your robot's URDF; with --from scan, powered servos; with --lerobot, LeRobot's calibration of the arm; with
     --sim, nothing.
