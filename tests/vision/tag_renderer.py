@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -60,7 +61,8 @@ class Sheet:
     @property
     def halves_m(self) -> tuple[float, float]:
         if self.squares is None:
-            return (self.side_m * (0.5 + self.margin / 8.0),) * 2
+            half_m = self.side_m * (0.5 + self.margin / 8.0)
+            return half_m, half_m
         columns, rows = self.squares
         return self.side_m * (0.5 * columns + self.margin), self.side_m * (0.5 * rows + self.margin)
 
@@ -136,11 +138,11 @@ def _painted(
     # When each ray is exposed, from half a readout before the middle row to half a readout after it.
     times = (rays[1] * calibration.focal_px + cy) / calibration.image_size_px[1] - 0.5
     before = painted[rows, columns]
-    shown = before.mean(axis=2, dtype=np.float32).repeat(n, axis=0).repeat(n, axis=1)
-    nearest = np.full(shape, np.inf, np.float32)
+    shown: Any = before.mean(axis=2, dtype=np.float32).repeat(n, axis=0).repeat(n, axis=1)
+    nearest: np.ndarray = np.full(shape, np.inf, np.float32)
     for thing in things:
         _cover(thing, rays, times, eye, look, shown, nearest, rng)
-    hit = pixel_means(np.isfinite(nearest).astype(np.float32), n)[..., None]
+    hit = pixel_means(np.isfinite(nearest).astype(np.float64), n)[..., None]
     painted[rows, columns] = np.where(hit > 0.0, pixel_means(shown, n)[..., None], before)
     return painted
 
@@ -159,8 +161,8 @@ def _window(things: Sequence[Sheet | Card], eye: FloatArray, calibration: Stereo
 
 
 def _seen_from(
-    thing: Sheet | Card, rays: FloatArray, times: FloatArray, eye: FloatArray, rng: np.random.Generator
-) -> tuple[FloatArray, FloatArray]:
+    thing: Sheet | Card, rays: np.ndarray, times: np.ndarray, eye: np.ndarray, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the rays (3, ...) and the thing's middle (3, ...) in the axes of the thing, each at the ray's time."""
     into, middle = thing.rotation.T.astype(np.float32), (thing.x - eye).astype(np.float32)[:, None, None]
     if isinstance(thing, Card) or not any((*thing.moved_m, *thing.turned_rad)):
@@ -169,7 +171,7 @@ def _seen_from(
     middle = middle + np.multiply.outer(thing.moved_m, when)
     turn = np.multiply.outer(thing.turned_rad, when)
 
-    def back(v: FloatArray) -> FloatArray:
+    def back(v: np.ndarray) -> np.ndarray:
         once = np.cross(turn, v, axis=0)  # second order: the third is below 1e-6 for turns of a degree
         return v - once + 0.5 * np.cross(turn, once, axis=0)
 
@@ -178,12 +180,12 @@ def _seen_from(
 
 def _cover(
     thing: Sheet | Card,
-    rays: FloatArray,
-    times: FloatArray,
-    eye: FloatArray,
+    rays: np.ndarray,
+    times: np.ndarray,
+    eye: np.ndarray,
     look: Look,
-    shown: FloatArray,
-    nearest: FloatArray,
+    shown: np.ndarray,
+    nearest: np.ndarray,
     rng: np.random.Generator,
 ) -> None:
     normal = thing.rotation[:, 2]

@@ -189,7 +189,9 @@ def _markers(grey: ImageArray, family: str) -> list[int]:
 def _plain_squares(grey: ImageArray) -> tuple[int, int] | None:
     """Return the squares, the more first, of the chessboard in an image, or of as much of one as is in view."""
     grid = any_grid(grey)
-    return None if grid is None else (grid.shape[1] + 1, grid.shape[0] + 1)
+    if grid is None:
+        return None
+    return len(grid[0]) + 1, len(grid) + 1
 
 
 def any_grid(grey: ImageArray) -> FloatArray | None:
@@ -198,7 +200,7 @@ def any_grid(grey: ImageArray) -> FloatArray | None:
     if not found:
         return None
     corners = np.reshape(np.asarray(px, dtype=np.float64), (*np.shape(grid)[:2], 2))
-    return corners if corners.shape[0] <= corners.shape[1] else corners.transpose(1, 0, 2)
+    return corners if len(corners) <= len(corners[0]) else corners.transpose(1, 0, 2)
 
 
 def measured_grid(grey: ImageArray, rough_px: ArrayLike, board: Board) -> Corners:
