@@ -270,7 +270,7 @@ def _require_colour(tables: Tables, file: Path, text: str) -> None:
             "the infra-red eyes of a RealSense see no colours, and the marker is a coloured ball",
             file=file,
             line=line_of(text, ("vision", "cameras", "realsense")),
-            remedy='Write marker = "tag", "cluster" or "bright_ball" in [vision]',
+            remedy='Write marker = "tag", "cluster", "chessboard" or "bright_ball" in [vision]',
         )
 
 
@@ -289,7 +289,7 @@ def _require_size(robot: RobotDescription, tables: Tables, vision: Mapping[str, 
         case "cluster":
             place, what = ("vision", "tag", "side_m"), "the side of the tags' black squares [m]"
             said = "side_m" in vision.get("tag", {}) or all(tag.side_m for tag in tables.vision.cluster.tags)
-        case "plugin":
+        case "chessboard" | "plugin":
             return
     if not said:
         raise ConfigError(

@@ -36,9 +36,9 @@ WORDS: Mapping[Reason, str] = {
 }
 REMEDIES: Mapping[Reason, str] = {
     Reason.NO_MARKER: "Is it in sight of all eyes, large enough in their images, and are [vision] marker, colour, "
-    "number and light right?",
+    "number and light right? A chessboard has to be seen whole.",
     Reason.AT_BORDER: "Bring it nearer to the middle of both images.",
-    Reason.OCCLUDED: "Is a hand, a cable or the tool before it?",
+    Reason.OCCLUDED: "Is a hand, a cable or the tool before it? A chessboard has to be seen whole.",
     Reason.NOT_ROUND: "Is a finger or a cable before its edge, or does it move too fast for the exposure? Light its "
     "dark side, and take a plain, matt ball.",
     Reason.NOT_STRAIGHT: "Glue the paper flat, and take away what covers an edge.",

@@ -38,18 +38,22 @@ class SimTag(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
         id: its number.
         xyz: its centre in the marker's frame [m].
         rpy: how its frame (x right, y up, z out of it) is turned in the marker's [rad], URDF convention.
-        side_m: side of its black square [m]; the white margin is an eighth of it.
+        side_m: side of its black square, or of each of a chessboard's [m]; the white margin is an eighth of a tag, or
+            half a square.
+        squares: columns and rows of a plain chessboard in the place of a tag.
     """
 
     id: Annotated[int, Meta(ge=0)]
     xyz: tuple[float, float, float]
     rpy: tuple[float, float, float]
     side_m: Positive
+    squares: tuple[int, int] | None = None
 
     @property
-    def half_sheet_m(self) -> float:
-        """Half the side of the sheet that it is printed on."""
-        return 0.625 * self.side_m
+    def half_sheet_m(self) -> tuple[float, float]:
+        """Half the sides of the sheet that it is printed on."""
+        columns, rows = self.squares or (0.25, 0.25)
+        return 0.5 * (columns + 1) * self.side_m, 0.5 * (rows + 1) * self.side_m
 
 
 class CameraConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -91,7 +95,7 @@ class CameraConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         """Radius of the smallest ball around the marker's origin that holds it [m]."""
         if not self.tags:
             return self.ball_radius_m or BALL_RADIUS_M
-        return max(math.hypot(*tag.xyz, math.sqrt(2.0) * tag.half_sheet_m) for tag in self.tags)
+        return max(math.hypot(*tag.xyz, *tag.half_sheet_m) for tag in self.tags)
 
 
 class ErrorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

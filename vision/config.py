@@ -7,17 +7,18 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta
 
+from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.plugins import PluginConfig
 from bodyschema.robot.toml_file import Fraction, Positive
 from bodyschema.vision.cameras.config import CamerasConfig, FurtherCameras
-from bodyschema.vision.tags.config import ClusterConfig, TagConfig
+from bodyschema.vision.tags.config import ChessboardConfig, ClusterConfig, TagConfig
 
 Ratio = Annotated[float, Meta(gt=1)]
 
 # After a longer pause the last fixes of a marker predict nothing [s].
 LONGEST_PAUSE_S = 0.5
 
-MarkerKind = Literal["ball", "bright_ball", "tag", "cluster", "plugin"]
+MarkerKind = Literal["ball", "bright_ball", "tag", "cluster", "chessboard", "plugin"]
 ColourName = Literal["red", "orange", "yellow", "green", "cyan", "blue", "magenta"]
 
 
@@ -53,8 +54,8 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         marker: what is looked for: a coloured ball, a ball that is brighter than all around it, one tag ([vision.tag]),
-            a rigid cluster of tags ([vision.cluster]), or what a tracker of another package finds ([vision.plugin]).
-            The other keys of this table are a ball's.
+            a rigid cluster of tags ([vision.cluster]), a plain chessboard ([vision.chessboard]), or what a tracker of
+            another package finds ([vision.plugin]). The other keys of this table are a ball's.
         colour: a name, or a band of hues as the table [vision.colour].
         min_brightness: of a bright ball, where 1 is the brightest that the camera can tell.
         radius_m: radius of the marker ball [m].
@@ -73,6 +74,7 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         further_cameras: others that see the same marker; their positions are fused.
         tag: the tag, or what the tags of a cluster have in common.
         cluster: where on the marker which tag is.
+        chessboard: the squares of a chessboard; the limits are those of [vision.tag].
         plugin: the tracker of another package.
     """
 
@@ -94,9 +96,27 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     further_cameras: tuple[FurtherCameras, ...] = ()
     tag: TagConfig = TagConfig()
     cluster: ClusterConfig = ClusterConfig()
+    chessboard: ChessboardConfig | None = None
     plugin: PluginConfig | None = None
 
     @property
     def band(self) -> HueBand:
         """The colour as a band of hues."""
         return NAMED_COLOURS[self.colour] if isinstance(self.colour, str) else self.colour
+
+    @property
+    def board(self) -> ChessboardConfig:
+        """The chessboard. ConfigError if there is none."""
+        if self.chessboard is None:
+            raise ConfigError(
+                '[vision] marker = "chessboard" names none',
+                remedy="Add [vision.chessboard] with its columns, rows and square_m",
+            )
+        return self.chessboard
+
+    @property
+    def size_sigma(self) -> float:
+        """Relative 1-sigma of the size of tags or a chessboard."""
+        if self.marker == "chessboard":
+            return self.board.square_sigma_m / self.board.square_m
+        return self.tag.side_sigma_m / self.tag.side_m

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from types import TracebackType
 from typing import Protocol, Self
@@ -39,8 +40,11 @@ class Draws(Protocol):
 class TrackedCamera:
     """A `MarkerSource`: opens and closes the camera, and tracks the marker in every frame."""
 
-    def __init__(self, camera: StereoCamera, tracker: MarkerTracker, annotator: Draws | None = None) -> None:
-        self._camera, self._tracker, self._annotator = camera, tracker, annotator
+    def __init__(
+        self, camera: StereoCamera, tracker: MarkerTracker, annotator: Draws | None = None, readout_s: float = 0.0
+    ) -> None:
+        """Track in images whose first and last rows are exposed `readout_s` [s] apart."""
+        self._camera, self._tracker, self._annotator, self._readout_s = camera, tracker, annotator, readout_s
         self._newest: tuple[StereoFrame, MarkerFix | MarkerMiss] | None = None
 
     def __enter__(self) -> Self:
@@ -74,4 +78,9 @@ class TrackedCamera:
             return None
         seen = self._tracker.track(frame)
         self._newest = frame, seen
-        return replace(seen, t_sigma=frame.t_sigma) if isinstance(seen, MarkerFix) else seen
+        if not isinstance(seen, MarkerFix):
+            return seen
+        calibration = self._camera.calibration
+        row = float(calibration.project(seen.x)[1]) / calibration.image_size_px[1]
+        late_s = self._readout_s * (row - 0.5)
+        return replace(seen, t=seen.t + late_s, t_sigma=math.hypot(frame.t_sigma, seen.t_sigma))

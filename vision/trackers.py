@@ -21,14 +21,15 @@ def tracker_of(calibration: StereoCalibration, config: VisionConfig) -> MarkerTr
     match config.marker:
         case "ball" | "bright_ball":
             return (StereoTracker if calibration.is_stereo else OneEyeBallTracker)(calibration, config)
-        case "tag" | "cluster":
+        case "tag" | "cluster" | "chessboard":
             # They import scipy, which takes half a second, and a ball is found without it.
             from bodyschema.vision.tags.body import TagBody
+            from bodyschema.vision.tags.chessboard import ChessboardFinder
             from bodyschema.vision.tags.tracker import TagTracker
 
-            single = config.marker == "tag"
-            body = TagBody.single(config.tag) if single else TagBody.cluster(config.cluster, config.tag)
-            return TagTracker(calibration, body, config.tag)
+            board = ChessboardFinder(config.board, config.tag) if config.marker == "chessboard" else None
+            readout_s = 0.0 if config.cameras is None else config.cameras.readout_s
+            return TagTracker(calibration, TagBody.of(config), config.tag, board, readout_s)
         case "plugin":
             if config.plugin is None:
                 raise ConfigError('[vision] marker = "plugin" names none', remedy="Add [vision.plugin] with its name")

@@ -13,13 +13,13 @@ from bodyschema.vision.board.board import MARKER_SHARE
 from bodyschema.vision.board.page import page as board_page
 from bodyschema.vision.cluster.page import FACE_SIDES, shape_page, tags_page
 from bodyschema.vision.cluster.shapes import Shape, chessboard, cube, plate
-from bodyschema.vision.cluster.tables import cluster_tables, tag_tables
+from bodyschema.vision.cluster.tables import chessboard_tables, cluster_tables, tag_tables
 from bodyschema.vision.printing import Page
 from bodyschema.vision.tags.config import Dictionary
 
 from .board_pages import write_page
 
-ShapeName = Literal["tags", "plate", "cube", "board"]
+ShapeName = Literal["tags", "plate", "cube", "board", "chessboard"]
 _RUN = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?")
 _MOST_TAGS = 100
 
@@ -41,7 +41,7 @@ class Tags:
     def body(self) -> Shape | None:
         """The body of the tags; None if they are cut apart."""
         match self.shape:
-            case "tags":
+            case "tags" | "chessboard":
                 return None
             case "cube":
                 return cube()
@@ -91,6 +91,9 @@ def sheet(tags: Tags, paper: str) -> Page:
             raise ConfigError("the tags of a board are numbered from 0", remedy="Leave out --ids")
         family = tags.dictionary.replace("aruco_6x6", "6X6").replace("apriltag", "APRILTAG")
         return board_page(Board(tags.columns, tags.rows, 1e-3 * face_mm(tags), dictionary=family), paper)
+    if tags.shape == "chessboard":
+        tables(tags)  # raises where there is no such marker
+        return board_page(Board(tags.columns, tags.rows, 1e-3 * tags.side_mm, pattern="chessboard"), paper)
     body, ids = tags.body, tags.numbers
     if body is None:
         return tags_page(ids, tags.dictionary, tags.side_mm, paper)
@@ -99,12 +102,16 @@ def sheet(tags: Tags, paper: str) -> Page:
 
 def face_mm(tags: Tags) -> float:
     """Return the width of a face between cuts or folds, or of a board's square [mm]."""
+    if tags.shape == "chessboard":
+        return tags.side_mm
     return tags.side_mm / MARKER_SHARE if tags.shape == "board" else FACE_SIDES * tags.side_mm
 
 
 def tables(tags: Tags) -> str:
     """Return the tables of robot.toml for the nominal shape; for single tags those of the first one."""
     body, side_m = tags.body, 1e-3 * tags.side_mm
+    if tags.shape == "chessboard":
+        return chessboard_tables(tags.columns, tags.rows, side_m)
     if body is None:
         return tag_tables(tags.dictionary, side_m, tags.numbers[0])
     return cluster_tables(tags.dictionary, side_m, body.placed(tags.numbers, 1e-3 * face_mm(tags)))

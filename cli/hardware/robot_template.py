@@ -28,8 +28,18 @@ class Seen(NamedTuple):
 
     cameras: Sequence[str] = ()  # those that are plugged in; with two or more, the first two are the eyes
     webcam: str | None = None  # one camera alone, in their place
-    tag_mm: float | None = None  # side of the tag; ball_mm: diameter of the ball. Without both a ball of 40 mm.
+    tag_mm: float | None = None  # side of the tag; ball_mm: diameter of the ball. Without any marker a ball of 40 mm.
     ball_mm: float | None = None
+    chessboard: tuple[int, int, float] | None = None  # columns and rows of squares, and the side of a square [mm]
+
+    def marker(self) -> str:
+        """Return the marker's keys and tables."""
+        if self.chessboard is not None:
+            columns, rows, square_mm = self.chessboard
+            return _CHESSBOARD.format(columns=columns, rows=rows, square_m=_metres(square_mm))
+        if self.tag_mm is not None:
+            return _TAG.format(side_m=_metres(self.tag_mm))
+        return _BALL.format(radius_m=_metres((self.ball_mm or 40.0) / 2))
 
 
 _NOTHING_SEEN = Seen()
@@ -116,6 +126,15 @@ marker = "tag"
 id = 0
 side_m = {side_m}
 """
+_CHESSBOARD = """\
+marker = "chessboard"
+
+[vision.chessboard]
+# Its squares, one number even and one odd, and the side of a square as measured across all of them [m].
+columns = {columns}
+rows = {rows}
+square_m = {square_m}
+"""
 _CAMERAS = """\
 [vision.cameras]
 {hidden}calibration = "cameras.toml"   # as `bodyschema calibrate cameras` writes it; else images are rectified
@@ -144,7 +163,6 @@ _EXAMPLES = "/dev/v4l/by-id/usb-LEFT-video-index0", "/dev/v4l/by-id/usb-RIGHT-vi
 def robot_toml(guess: Guess, seen: Seen = _NOTHING_SEEN) -> str:
     """Return the text of a commented robot.toml."""
     joints = "[" + ", ".join(quoted(joint) for joint in guess.joints) + "]"
-    marker = _BALL.format(radius_m=_metres((seen.ball_mm or 40.0) / 2))
     return _TEMPLATE.format(
         name=quoted(guess.name),
         urdf=quoted(guess.urdf),
@@ -153,7 +171,7 @@ def robot_toml(guess: Guess, seen: Seen = _NOTHING_SEEN) -> str:
         camera_link=quoted(guess.camera_link),
         frame="left optical frame" if seen.webcam is None else "camera's optical frame",
         eyes=_TWO_EYES if seen.webcam is None else _ONE_EYE,
-        marker=marker if seen.tag_mm is None else _TAG.format(side_m=_metres(seen.tag_mm)),
+        marker=seen.marker(),
         cameras=_camera_tables(seen),
     )
 

@@ -96,8 +96,9 @@ def common_error(config: Config) -> CommonError | None:
     if vision.further_cameras or config.tables.marker_source:
         return None
     rig = read_rig(calibration_file(config))
-    sized = isinstance(rig, OneEyeRig) and vision.marker in ("tag", "cluster")  # a fix of a ball has its radius's error
-    error = CommonError(rig, vision.tag.side_sigma_m / vision.tag.side_m if sized else 0.0)
+    # A fix of a ball has its radius's error.
+    sized = isinstance(rig, OneEyeRig) and vision.marker in ("tag", "cluster", "chessboard")
+    error = CommonError(rig, vision.size_sigma if sized else 0.0)
     error.require_usable()
     return error
 
@@ -154,7 +155,7 @@ def _tracked(config: Config, **layout: VideosConfig | ImagesConfig) -> TrackedCa
     cameras = CamerasConfig(calibration=None if given is None else given.calibration, **layout)  # pyright: ignore[reportArgumentType]
     seen = seen_through(config, cameras)
     camera = camera_of(seen, open_eyes(seen, SystemClock()))
-    return TrackedCamera(camera, tracker_of(camera.calibration, seen.tables.vision))
+    return TrackedCamera(camera, tracker_of(camera.calibration, seen.tables.vision), readout_s=cameras.readout_s)
 
 
 def seen_through(config: Config, cameras: CamerasConfig) -> Config:

@@ -43,7 +43,7 @@ def simulation_settings(config: Config) -> SimConfig:
 
 def _marker(vision: VisionConfig) -> dict[str, Any]:
     """Return the keys of [sim.camera] that show the marker of [vision]."""
-    if vision.marker in ("tag", "cluster"):
+    if vision.marker in ("tag", "cluster", "chessboard"):
         from bodyschema.vision.tags.dictionary import DICTIONARIES
 
         return {"tags": _tags(vision), "tag_dictionary": DICTIONARIES[vision.tag.dictionary]}
@@ -70,7 +70,11 @@ def _require_found(config: Config, calibration: StereoCalibration, camera: Camer
         if isinstance(seen, MarkerFix):
             return
         reasons.append(seen.reason)
-    keys = {"ball": "[vision.colour] or [vision] radius_m", "bright_ball": "[vision] min_brightness"}
+    keys = {
+        "chessboard": "[vision.chessboard]",
+        "ball": "[vision.colour] or [vision] radius_m",
+        "bright_ball": "[vision] min_brightness",
+    }
     raise ConfigError(
         "the tracker would not find the marker of [vision] in the simulation's images, not even alone before a plain "
         f"wall: {WORDS[reasons[0]]}",
@@ -83,5 +87,8 @@ def _tags(vision: VisionConfig) -> tuple[SimTag, ...]:
     from bodyschema.sim_backend.config import SimTag
     from bodyschema.vision.tags.config import PlacedTag
 
+    if vision.marker == "chessboard":
+        board, none = vision.board, (0.0, 0.0, 0.0)
+        return (SimTag(id=0, xyz=none, rpy=none, side_m=board.square_m, squares=(board.columns, board.rows)),)
     placed = (PlacedTag(id=vision.tag.id),) if vision.marker == "tag" else vision.cluster.tags
     return tuple(SimTag(id=tag.id, xyz=tag.xyz, rpy=tag.rpy, side_m=tag.side_m or vision.tag.side_m) for tag in placed)

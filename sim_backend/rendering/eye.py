@@ -131,7 +131,12 @@ class TagSheets:
         self._tags = tuple(tags)
         self._turns = [rotation_of(np.array(tag.rpy)) for tag in tags]
         # One pixel a square, from the top left; True where it is black.
-        self._black = [patterns.generateImageMarker(tag.id, _Settings.squares, borderBits=1) < 128 for tag in tags]
+        self._black = [
+            np.indices(tag.squares[::-1]).sum(axis=0) % 2 == 0
+            if tag.squares
+            else patterns.generateImageMarker(tag.id, _Settings.squares, borderBits=1) < 128
+            for tag in tags
+        ]
 
     def cast(
         self, directions: FloatArray, x: FloatArray, R: FloatArray, depth: FloatArray, to_light: FloatArray
@@ -155,10 +160,11 @@ class TagSheets:
             z = np.divide(centre @ axes[:, 2], facing, out=np.full(depth.shape, np.inf), where=seen)
             seen &= (z > 0.0) & (z < nearest)
             place = (directions[seen] * z[seen][:, None] - centre) @ axes[:, :2]
-            on_sheet = np.abs(place).max(axis=1) < tag.half_sheet_m
+            on_sheet = (np.abs(place) < tag.half_sheet_m).all(axis=1)
             seen[seen] = on_sheet
             lit = _Settings.ambient + _Settings.diffuse * max(float(axes[:, 2] @ to_light), 0.0)
-            dark = _is_black(place[on_sheet] / tag.side_m, black)
+            square_m = tag.side_m if tag.squares else tag.side_m / _Settings.squares
+            dark = _is_black(place[on_sheet] / square_m, black)
             level[seen] = lit * np.where(dark, _Settings.black, _Settings.white)
             nearest[seen] = z[seen]
         mask = np.isfinite(level)
@@ -166,11 +172,12 @@ class TagSheets:
 
 
 def _is_black(place: FloatArray, black: np.ndarray) -> np.ndarray:
-    """Return a mask (k,) of the points (k, 2) that are black on a tag of side 1, x right and y up from its middle."""
-    column = np.floor((place[:, 0] + 0.5) * _Settings.squares).astype(np.intp)
-    row = np.floor((0.5 - place[:, 1]) * _Settings.squares).astype(np.intp)
-    inside = (column >= 0) & (column < _Settings.squares) & (row >= 0) & (row < _Settings.squares)
-    return inside & black[row.clip(0, _Settings.squares - 1), column.clip(0, _Settings.squares - 1)]
+    """Return a mask (k,) of the points (k, 2) [squares] that are black on a pattern, x right, y up from its middle."""
+    rows, columns = black.shape
+    column = np.floor(place[:, 0] + 0.5 * columns).astype(np.intp)
+    row = np.floor(0.5 * rows - place[:, 1]).astype(np.intp)
+    inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+    return inside & black[row.clip(0, rows - 1), column.clip(0, columns - 1)]
 
 
 TO_LIGHT = np.array([0.35, 0.45, 0.82]) / np.linalg.norm([0.35, 0.45, 0.82])

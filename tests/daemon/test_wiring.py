@@ -85,6 +85,7 @@ side_m = 0.06
 [[vision.cluster.tags]]
 id = 8
 """
+CHESSBOARD = '[vision]\nmarker = "chessboard"\n[vision.chessboard]\ncolumns = 7\nrows = 4\nsquare_m = 0.0121\n'
 
 
 @pytest.mark.parametrize(
@@ -97,8 +98,9 @@ id = 8
         ('[vision]\nmarker = "bright_ball"\n', {"rgb": (0.9, 0.9, 0.9), "light": 0.27}),
         ('[vision]\nmarker = "tag"\n[vision.tag]\nid = 3\nside_m = 0.05\n', {"tag_dictionary": 20}),
         (CLUSTER, {"marker_radius_m": pytest.approx(0.0729, abs=1e-4)}),
+        (CHESSBOARD, {"marker_radius_m": pytest.approx(0.0571, abs=1e-4)}),
     ],
-    ids=["red", "green", "yellow", "band", "bright", "tag", "cluster"],
+    ids=["red", "green", "yellow", "band", "bright", "tag", "cluster", "chessboard"],
 )
 def test_the_simulation_shows_the_marker_of_vision(tmp_path, vision, shown) -> None:
     camera = simulation_settings(load(tmp_path, STEREO + vision)).camera

@@ -57,6 +57,12 @@ def test_init_writes_the_tables_of_the_page(written) -> None:
     assert {key: found["camera"][key] for key in shown["camera"]} == shown["camera"]
 
 
+def test_init_writes_a_chessboard(written, capsys) -> None:
+    typed("bodyschema init --urdf my_robot.urdf --robot other.toml --chessboard 8 5 29.9", capsys)
+    vision = tomllib.loads(Path("other.toml").read_text(encoding="utf-8"))["vision"]
+    assert vision == {"marker": "chessboard", "chessboard": {"columns": 8, "rows": 5, "square_m": 0.0299}}
+
+
 def test_one_camera_has_no_left_eye(written) -> None:
     assert "left" not in written
 

@@ -131,6 +131,22 @@ def test_a_charuco_board_that_was_printed_is_found_as_its_tables_say(dictionary)
     assert Rotation.from_matrix(rotation.T @ Rotation.from_quat(fix.R).as_matrix()).magnitude() < np.radians(0.2)
 
 
+def test_printed_chessboard_is_found_as_its_tables_say() -> None:
+    board = Tags("chessboard", side_mm=32.0, columns=5, rows=4)
+    square_m, x, rotation = 1e-3 * face_mm(board), np.array([-0.02, -0.02, 0.40]), facing(0, 12, 10)
+    # Its frame is in its middle, the shape's in that of the upper left square.
+    corner = x - square_m * rotation @ [2.0, -1.5, 0.0]
+    fix = tracked(tables(board), photographed(sheet(board, "A4"), plate(5, 4, 0.0), rotation, corner, square_m))
+    assert np.abs(fix.x - x).max() < 3e-4
+    assert Rotation.from_matrix(rotation.T @ Rotation.from_quat(fix.R).as_matrix()).magnitude() < np.radians(0.2)
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(8, 6), (2, 1)])
+def test_chessboard_that_is_no_marker_is_not_printed(columns, rows) -> None:
+    with pytest.raises(ConfigError, match=r"looks the same turned by half a turn|is too small"):
+        sheet(Tags("chessboard", columns=columns, rows=rows), "A4")
+
+
 @pytest.mark.parametrize("dictionary", ["aruco_6x6_250", "aruco_mip_36h12"])
 def test_a_single_tag_of_another_family_is_found(dictionary) -> None:
     shape, x = plate(1, 1, 0.0), np.array([0.0, 0.0, 0.4])

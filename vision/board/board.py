@@ -77,7 +77,9 @@ class Board:
 
     @property
     def marker_side_m(self) -> float:
-        """Side of a marker's black frame [m]."""
+        """Side of a marker's black frame [m]; 0 of a chessboard, which has none."""
+        if self.pattern == "chessboard":
+            return 0.0
         return MARKER_SHARE * self.square_m if self.marker_m is None else self.marker_m
 
     @property

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from bodyschema.interfaces.records import FloatArray, ImageArray
 
@@ -139,8 +139,7 @@ class BoardDetector:
             found, px = cv2.findChessboardCornersSB(grey, size, flags=cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY)
         if not found:
             return self._no_chessboard(grey)
-        corners = _in_order(grey, np.reshape(px, (size[1], size[0], 2)).astype(np.float64), self.board)
-        return Corners(np.arange(len(self.board.corners_m)), corners.reshape(-1, 2))
+        return measured_grid(grey, np.reshape(px, (size[1], size[0], 2)), self.board)
 
     def _no_chessboard(self, grey: ImageArray) -> NotFound:
         wanted = self.board.columns, self.board.rows
@@ -189,11 +188,44 @@ def _markers(grey: ImageArray, family: str) -> list[int]:
 
 def _plain_squares(grey: ImageArray) -> tuple[int, int] | None:
     """Return the squares, the more first, of the chessboard in an image, or of as much of one as is in view."""
-    found, _, grid = cv2.findChessboardCornersSBWithMeta(grey, _SMALLEST_GRID, cv2.CALIB_CB_LARGER)
+    grid = any_grid(grey)
+    if grid is None:
+        return None
+    return len(grid[0]) + 1, len(grid) + 1
+
+
+def any_grid(grey: ImageArray) -> FloatArray | None:
+    """Return the corners (rows, columns, 2) [px], more columns than rows, of as much of a chessboard as is in view."""
+    found, px, grid = cv2.findChessboardCornersSBWithMeta(grey, _SMALLEST_GRID, cv2.CALIB_CB_LARGER)
     if not found:
         return None
-    rows, columns = sorted(each + 1 for each in np.shape(grid)[:2])
-    return columns, rows
+    corners = np.reshape(np.asarray(px, dtype=np.float64), (*np.shape(grid)[:2], 2))
+    return corners if len(corners) <= len(corners[0]) else corners.transpose(1, 0, 2)
+
+
+def measured_grid(grey: ImageArray, rough_px: ArrayLike, board: Board) -> Corners:
+    """Return all corners of a plain chessboard in order, from rough ones (rows, columns, 2) [px].
+
+    They are refined if they then lie better on a plane: outer squares that are cut short disturb some.
+    """
+    ordered = _in_order(grey, np.asarray(rough_px, dtype=np.float64), board).reshape(-1, 2)
+    numbers = np.arange(len(ordered))
+    kept, px = refined(grey, board, numbers, ordered)
+    if len(kept) < len(numbers) or _scatter(board, px) > _scatter(board, ordered):
+        px = ordered
+    return Corners(numbers, px)
+
+
+def _scatter(board: Board, px: FloatArray) -> float:
+    """Return the sum of the squared distances [px²] of all corners from a plane's image."""
+    return float(np.square(px - on_plane(board, px)).sum())
+
+
+def on_plane(board: Board, px: FloatArray) -> FloatArray:
+    """Return the image of a plane (n, 2) [px] that is nearest to all corners of a board."""
+    places = board.corners_m[:, :2] / board.square_m
+    H, _ = cv2.findHomography(places, px, 0)
+    return np.asarray(cv2.perspectiveTransform(places[:, None], H)[:, 0], dtype=np.float64)
 
 
 def _in_order(grey: ImageArray, grid: FloatArray, board: Board) -> FloatArray:

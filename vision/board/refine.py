@@ -122,6 +122,7 @@ def _crossings(
     half_widths = (
         np.maximum(strip_px - _Settings.blurred_px, np.minimum(strip_px, _Settings.least_strip_px)) * squares_a_px
     )
+    half_widths = np.minimum(half_widths, _Settings.reach)  # a plain square may be cut not far beyond
     reach = min(
         int(np.ceil(_Settings.reach * np.abs(frames).sum(axis=2).max(initial=0.0))) + 1, _Settings.most_reach_px
     )

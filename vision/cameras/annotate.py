@@ -43,7 +43,7 @@ class Annotator:
         self._calibration, self._config = calibration, config
         self._gate = gate_of(config)
         self._is_ball = config.marker in ("ball", "bright_ball")
-        self._tags = TagDrawing(calibration, config) if config.marker in ("tag", "cluster") else None
+        self._tags = TagDrawing(calibration, config) if config.marker in ("tag", "cluster", "chessboard") else None
         self._eye = Pinhole(calibration.focal_px, calibration.principal_point_px)
         width, height = calibration.image_size_px
         self._whole = Region(0, 0, width, height)

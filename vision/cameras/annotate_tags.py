@@ -37,19 +37,27 @@ class TagDrawing:
     def __init__(self, calibration: StereoCalibration, config: VisionConfig) -> None:
         # They import scipy, which takes half a second, and where a ball is sought they are not needed.
         from bodyschema.vision.tags.body import TagBody
+        from bodyschema.vision.tags.chessboard import ChessboardFinder
         from bodyschema.vision.tags.dictionary import tags_of
         from bodyschema.vision.tags.finder import TagFinder
         from bodyschema.vision.tags.image import measure_tag
 
         self._calibration, self._config, self._measured = calibration, config.tag, measure_tag
-        single = config.marker == "tag"
-        self._body = TagBody.single(config.tag) if single else TagBody.cluster(config.cluster, config.tag)
+        self._body, self._rim, self._side_m = TagBody.of(config), [0, 1, 2, 3], config.tag.side_m
         self._finder = TagFinder(config.tag, range(len(tags_of(config.tag.dictionary).bytesList)))
+        self._board: ChessboardFinder | None = None
+        if config.marker == "chessboard":
+            across = config.board.columns - 1
+            self._board, self._side_m = ChessboardFinder(config.board, config.tag), 2.0 * config.board.square_m
+            self._rim = [0, across - 1, -1, -across]
 
     def sights(self, image: ImageArray) -> Iterator[TagSight]:
         """Yield all tags of the dictionary in one eye's image."""
         grey = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
-        for id, rough in self._finder.squares(grey):
+        for found in {} if self._board is None else self._board.find(grey).values():
+            if not isinstance(found, Reason):
+                yield TagSight(0, found.corners_px[self._rim], None, True)
+        for id, rough in [] if self._board is not None else self._finder.squares(grey):
             found = self._measured(grey, id, rough, self._config)
             corners, reason = (rough, found) if isinstance(found, Reason) else (found.corners_px, None)
             yield TagSight(id, corners, reason, id in self._body.corners)
@@ -61,12 +69,12 @@ class TagDrawing:
         if fix.R is None:
             return
         turn = Rotation.from_quat(fix.R).as_matrix()
-        shown = [corners @ turn.T + fix.x for corners in self._body.corners.values()]
+        shown = [corners[self._rim] @ turn.T + fix.x for corners in self._body.corners.values()]
         for corners in shown:
             if np.cross(corners[1] - corners[0], corners[3] - corners[0]) @ corners.mean(axis=0) > 0.0:
                 for image, px in zip(eyes, self._seen(corners), strict=False):
                     outline(image, px, colour)
-        ends = fix.x + 0.75 * self._config.side_m * np.vstack([np.zeros(3), turn.T])
+        ends = fix.x + 0.75 * self._side_m * np.vstack([np.zeros(3), turn.T])
         for image, px in zip(eyes, self._seen(ends), strict=False):
             for end, shade in zip(px[1:], AXES, strict=True):
                 cv2.line(image, _fixed(px[0]), _fixed(end), shade, 2, cv2.LINE_AA, SUBPIXEL_BITS)

@@ -154,11 +154,13 @@ class CamerasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
             images are assumed to be rectified, as [camera] describes.
         latency_s: time from mid-exposure to the time stamp [s]; `bodyschema calibrate latency` measures it.
         latency_sigma_s: its 1-sigma; without it 15 ms for devices, 0 for files.
+        readout_s: time from the first to the last row of a rolling shutter [s]; 0 is a global shutter.
     """
 
     calibration: str | None = None
     latency_s: Annotated[float, Meta(ge=-1, le=1)] = 0.0
     latency_sigma_s: NonNegative | None = None
+    readout_s: Annotated[float, Meta(ge=0, le=0.1)] = 0.0
     one: OneConfig | None = None
     two: TwoConfig | None = None
     side_by_side: SideBySideConfig | None = None

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from bodyschema.vision.tags.config import Dictionary, PlacedTag, Vector
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.vision.tags.config import ChessboardConfig, Dictionary, PlacedTag, Vector
 
 
 def cluster_tables(dictionary: Dictionary, side_m: float, tags: Sequence[PlacedTag], notes: Sequence[str] = ()) -> str:
@@ -21,6 +22,16 @@ def cluster_tables(dictionary: Dictionary, side_m: float, tags: Sequence[PlacedT
         if tag.side_m is not None:
             lines.append(f"side_m = {tag.side_m:.6g}")
     return "\n".join(lines) + "\n"
+
+
+def chessboard_tables(columns: int, rows: int, square_m: float) -> str:
+    """Return the tables [vision] and [vision.chessboard]. ConfigError if it is no marker."""
+    try:
+        ChessboardConfig(columns=columns, rows=rows, square_m=square_m)
+    except ValueError as error:
+        raise ConfigError(str(error), remedy="Give other --columns and --rows") from error
+    size = f"columns = {columns}\nrows = {rows}\nsquare_m = {square_m:.6g}"
+    return f'[vision]\nmarker = "chessboard"\n\n[vision.chessboard]\n{size}\n'
 
 
 def tag_tables(dictionary: Dictionary, side_m: float, id: int) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -11,7 +12,10 @@ from scipy.spatial.transform import Rotation
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray, frozen_array
 
-from .config import ClusterConfig, PlacedTag, TagConfig
+from .config import ChessboardConfig, ClusterConfig, PlacedTag, TagConfig
+
+if TYPE_CHECKING:
+    from bodyschema.vision.config import VisionConfig
 
 # Corners of a tag of side 1 in its own frame (x right, y up, z out of it): as `TagImage` has them.
 TAG_CORNERS = np.array([[-0.5, 0.5, 0.0], [0.5, 0.5, 0.0], [0.5, -0.5, 0.0], [-0.5, -0.5, 0.0]])
@@ -21,11 +25,34 @@ class TagBody:
     """Tags on a rigid body.
 
     Attributes:
-        corners: by a tag's number, its corners in the body's frame (4, 3) [m].
+        corners: by a tag's number, its corners in the body's frame (4, 3) [m]; a chessboard is one with more corners.
     """
 
     def __init__(self, tags: Mapping[int, FloatArray]) -> None:
         self.corners: Mapping[int, FloatArray] = MappingProxyType({i: frozen_array(c) for i, c in tags.items()})
+
+    @classmethod
+    def of(cls, config: VisionConfig) -> TagBody:
+        """Create the body that [vision] names.
+
+        Raises:
+            ConfigError: it is not described.
+        """
+        match config.marker:
+            case "cluster":
+                return cls.cluster(config.cluster, config.tag)
+            case "chessboard":
+                return cls.chessboard(config.board)
+            case _:
+                return cls.single(config.tag)
+
+    @classmethod
+    def chessboard(cls, config: ChessboardConfig) -> TagBody:
+        """Create a body from the inner corners (n, 3) of a chessboard, row by row, with its frame in its middle."""
+        columns, rows = np.meshgrid(np.arange(1, config.columns), np.arange(1, config.rows))
+        across, up = columns - 0.5 * config.columns, 0.5 * config.rows - rows
+        places = np.stack([across.ravel(), up.ravel(), np.zeros(across.size)], axis=1)
+        return cls({0: np.asarray(config.square_m * places, np.float64)})
 
     @classmethod
     def single(cls, config: TagConfig) -> TagBody:

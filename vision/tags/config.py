@@ -69,3 +69,27 @@ class ClusterConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     """The table [vision.cluster]: several tags on one rigid body."""
 
     tags: tuple[PlacedTag, ...] = ()
+
+
+class ChessboardConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """The table [vision.chessboard]: a plain chessboard, whose upper left square is black. Its frame is in its middle.
+
+    Attributes:
+        columns, rows: number of squares, one even and one odd.
+        square_m: side of a square as printed [m]: measure across all of them.
+        square_sigma_m: how far that may be off, 1-sigma [m]. One camera takes all distances from it.
+    """
+
+    columns: Annotated[int, Meta(le=40)]
+    rows: Annotated[int, Meta(le=40)]
+    square_m: Annotated[float, Meta(ge=0.001, le=1)]
+    square_sigma_m: Annotated[float, Meta(ge=0)] = 0.00002
+
+    def __post_init__(self) -> None:
+        name = f"a chessboard of {self.columns}x{self.rows} squares"
+        if min(self.columns, self.rows) < 4:
+            raise ValueError(f"{name} is too small. Take 4 and more each way")  # patterns like it are in any texture
+        if (self.columns + self.rows) % 2 == 0:
+            raise ValueError(
+                f"{name} looks the same turned by half a turn. Take an even and an odd number, as in 8x5 or 7x6"
+            )

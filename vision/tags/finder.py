@@ -12,7 +12,7 @@ import numpy as np
 from bodyschema.interfaces.records import FloatArray, ImageArray, Reason
 
 from .config import TagConfig
-from .dictionary import DICTIONARIES, OTHER_DICTIONARIES, tags_of
+from .dictionary import DICTIONARIES, OTHER_DICTIONARIES, require_tag, tags_of
 from .image import TagImage, measure_tag
 from .settings import TagSettings as _Settings
 
@@ -27,7 +27,9 @@ class TagFinder:
     """Detector of the tags with the given numbers."""
 
     def __init__(self, config: TagConfig, ids: Collection[int]) -> None:
-        """Prepare OpenCV's detector of the dictionary."""
+        """Prepare OpenCV's detector of the dictionary. ConfigError if a tag's number is not in it."""
+        for id in ids:
+            require_tag(config.dictionary, id)
         self._config, self._ids = config, ids
         self._detector = _detector(tags_of(config.dictionary))
         self._suspect, self._warned = 0, False

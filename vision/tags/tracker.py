@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -25,8 +26,8 @@ from bodyschema.vision.pose import Pose, PoseEstimator, Sighting, angle_between,
 from bodyschema.vision.triangulate import triangulate
 
 from .body import TagBody
+from .chessboard import ChessboardFinder
 from .config import TagConfig
-from .dictionary import require_tag
 from .finder import Seen, TagFinder
 from .image import TagImage
 from .settings import TagSettings as _Settings
@@ -41,6 +42,7 @@ _TELLING = (
     Reason.NOT_STRAIGHT,
     Reason.BLURRED,
     Reason.LOW_CONTRAST,
+    Reason.REPROJECTION,
     Reason.AT_BORDER,
     Reason.NO_MARKER,
 )
@@ -56,19 +58,27 @@ class TagTracker:
     not. Then the pose of the previous frame decides, if it was unambiguous; else the frame is ambiguous.
     """
 
-    def __init__(self, calibration: StereoCalibration, body: TagBody, config: TagConfig | None = None) -> None:
-        """Prepare for images of `calibration`.
+    def __init__(
+        self,
+        calibration: StereoCalibration,
+        body: TagBody,
+        config: TagConfig | None = None,
+        finder: ChessboardFinder | None = None,
+        readout_s: float = 0.0,
+    ) -> None:
+        """Prepare for images of `calibration`, whose first and last rows are exposed `readout_s` [s] apart.
 
         Raises:
             ConfigError: the calibration describes no cameras, or a tag's number is not in the dictionary.
         """
         check_calibration(calibration)
         self.calibration, self.body, self.config = calibration, body, config or TagConfig()
-        for id in body.corners:
-            require_tag(self.config.dictionary, id)
-        self._finder = TagFinder(self.config, body.corners)
+        self._finder = finder or TagFinder(self.config, body.corners)
         self._whole = (0, 0, *calibration.image_size_px)
-        self._last: tuple[float, list[FloatArray], FloatArray] | None = None
+        self._readout_s, self._t_sigma = readout_s, 0.0
+        self._last: tuple[float, list[dict[int, FloatArray]], FloatArray] | None = None
+        self._seen: tuple[float, list[dict[int, FloatArray]]] = -math.inf, []  # with refused frames
+        self._before = self._seen
         self._planes: dict[frozenset[int], tuple[FloatArray, FloatArray]] = {}
         self._met = False  # a marker that has been found is neither mirrored nor of another dictionary
 
@@ -79,6 +89,7 @@ class TagTracker:
             SourceError: the images are not uint8 BGR of the calibration's size.
         """
         check_images(frame, self.calibration)
+        self._before = self._seen
         greys = [np.asarray(cv2.cvtColor(eye, cv2.COLOR_BGR2GRAY), np.uint8) for eye in frame.images]
         found: Pose | Reason = Reason.NO_MARKER
         regions = self._predicted(frame.t)
@@ -97,13 +108,14 @@ class TagTracker:
 
     def forget(self) -> None:
         """Look for the marker in the whole images next time."""
-        self._last = None
+        self._last, self._seen = None, (-math.inf, [])
 
     def _fix(self, t: float, pose: Pose) -> MarkerFix:
         ul, vl, ur, vr = self.calibration.project(pose.x).tolist()
         centres = (ul, vl, ur, vr) if self.calibration.is_stereo else None
         cov, cov_R = frozen_array(pose.cov[3:, 3:]), frozen_array(pose.cov[:3, :3])
-        return MarkerFix(t, frozen_array(pose.x), cov, centres, R=frozen_array(_quaternion(pose.rotation)), cov_R=cov_R)
+        turn = frozen_array(_quaternion(pose.rotation))
+        return MarkerFix(t, frozen_array(pose.x), cov, centres, self._t_sigma, R=turn, cov_R=cov_R)
 
     def _look(
         self, t: float, greys: Sequence[ImageArray], regions: Sequence[tuple[int, int, int, int]]
@@ -116,11 +128,33 @@ class TagTracker:
             seen = self._agreeing(*seen)
             if isinstance(seen, Reason):
                 return seen
-        pose = self._pose(t, seen)
+        corners = [{id: tag.corners_px for id, tag in eye.items()} for eye in seen]
+        self._seen = t, corners
+        pose = self._pose(t, self._at_one_time(t, seen) if self._readout_s else seen)
         if isinstance(pose, Pose):
-            corners = [np.concatenate([tag.corners_px for tag in eye.values()]) for eye in seen]
             self._last, self._met = (t, corners, pose.rotation), True
         return pose
+
+    def _at_one_time(self, t: float, seen: list[dict[int, TagImage]]) -> list[dict[int, TagImage]]:
+        """Return the tags with their corners where they were when the rolling shutter read the marker's middle row.
+
+        Each corner moves as it did since the last frame. Tags that were not seen there stay, and the time is uncertain.
+        """
+        row_s = self._readout_s / self.calibration.image_size_px[1]
+        middle = np.mean([tag.corners_px[:, 1].mean() for eye in seen for tag in eye.values()])
+        last_t, last = self._before
+        if not 0 < t - last_t <= LONGEST_PAUSE_S:
+            last = []
+        moved, self._t_sigma = [], 0.0 if last else self._readout_s
+        for eye, before in zip(seen, last or [{}] * len(seen), strict=True):
+            tags = dict(eye)
+            for id in eye.keys() & before.keys():
+                px = eye[id].corners_px
+                since_s = t - last_t + row_s * (px[:, 1:] - before[id][:, 1:])
+                late_s = row_s * (px[:, 1:] - middle)
+                tags[id] = replace(eye[id], corners_px=px - late_s * (px - before[id]) / since_s)
+            moved.append(tags)
+        return moved
 
     def _agreeing(self, left: dict[int, TagImage], right: dict[int, TagImage]) -> list[dict[int, TagImage]] | Reason:
         """Return both eyes' tags without those whose rows differ."""
@@ -135,7 +169,7 @@ class TagTracker:
     def _rows_agree(self, left: TagImage, right: TagImage) -> bool:
         """Return True if the rows of a tag's corners differ by no more than noise, and its disparity is positive."""
         apart = left.corners_px - right.corners_px
-        rows = np.arange(1, 8, 2)
+        rows = np.arange(1, len(left.cov_px), 2)
         cov = (left.cov_px + right.cov_px)[np.ix_(rows, rows)]
         sigma = math.sqrt(float(cov.mean()) + 2.0 * self.calibration.pixel_sigma**2)
         allowed = self.config.epipolar_px + self.config.epipolar_sigmas * sigma
@@ -169,7 +203,7 @@ class TagTracker:
             grown, sigma = estimator.scale(best)
             if abs(grown) > self.config.size_tolerance + 4.0 * sigma:
                 return Reason.SIZE_MISMATCH
-        freedom = 8 * len(sightings) - 6
+        freedom = sum(sighting.pixels.size for sighting in sightings) - 6
         misfit = best.squares / freedom
         if misfit > self.config.max_reprojection**2:
             return Reason.REPROJECTION
@@ -239,7 +273,8 @@ class TagTracker:
             return None
         width, height = self.calibration.image_size_px
         regions = []
-        for corners in self._last[1]:
+        for eye in self._last[1]:
+            corners = np.concatenate(list(eye.values()))
             low, high = corners.min(axis=0), corners.max(axis=0)
             room = _Settings.region_share * (high - low).max() + _Settings.region_px
             low, high = np.floor(low - room).astype(int), np.ceil(high + room).astype(int)

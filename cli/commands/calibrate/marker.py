@@ -40,10 +40,10 @@ Family = Annotated[
 def print_tags(
     *,
     shape: Annotated[
-        Literal["tags", "plate", "cube", "board"],
+        Literal["tags", "plate", "cube", "board", "chessboard"],
         Parameter(
             help="Single tags to cut apart; a plate, flat or folded between its columns; a cube to fold; a ChArUco "
-            "board, which calibrates cameras, too."
+            "board, which calibrates cameras, too; a plain chessboard."
         ),
     ] = "tags",
     ids: Annotated[
@@ -52,7 +52,8 @@ def print_tags(
     ] = None,
     family: Family = "apriltag_36h11",
     side_mm: Annotated[
-        float, Parameter(help="Side of a tag's black square [mm].", validator=Number(gte=5, lte=500))
+        float,
+        Parameter(help="Side of a tag's black square, or of a chessboard's [mm].", validator=Number(gte=5, lte=500)),
     ] = 40.0,
     columns: Annotated[int, Parameter(help="Of a plate, or a board.", validator=Number(gte=1, lte=20))] = 2,
     rows: Annotated[int, Parameter(help="Of a plate, or a board.", validator=Number(gte=1, lte=20))] = 1,

@@ -50,6 +50,10 @@ def init(
     ball_mm: Annotated[
         float | None, Parameter(help="The marker is a red ball of this diameter.", validator=Number(gt=0, lte=500))
     ] = None,
+    chessboard: Annotated[
+        tuple[int, int, float] | None,
+        Parameter(help="The marker is a plain chessboard: columns and rows of squares, side of a square [mm]."),
+    ] = None,
     yes: Annotated[bool, flag("Do not ask: the joints of the URDF get the servos in the order of their IDs.")] = False,
     sim: Annotated[bool, flag("A whole example: the simulated upper body.")] = False,
 ) -> None:
@@ -58,8 +62,8 @@ def init(
     With --urdf the longest chain of joints is filled in; fingers and joints that mimic others are left out. With
     --from scan each joint gets a servo: you are asked which, and the result is checked against the URDF. With
     --lerobot IDs, directions and zeros come from LeRobot's calibration: one robot.toml for a leader, another one for a
-    follower. --webcam, --tag-mm and --ball-mm fill in camera and marker. Without --urdf the names are examples. Nothing
-    is written to any servo.
+    follower. --webcam, --tag-mm, --ball-mm and --chessboard fill in camera and marker. Without --urdf the names are
+    examples. Nothing is written to any servo.
 
     Needs: your robot's URDF; with --from scan, powered servos; with --lerobot, LeRobot's calibration of the arm; with
     --sim, nothing.
@@ -70,7 +74,7 @@ def init(
     _require_one_way(sim=sim, lerobot=lerobot, source=source, urdf=urdf)
     if os.path.lexists(robot):
         raise ConfigError("is there already", file=robot, remedy="Give another --robot, or move it away")
-    seen = _seen(webcam, tag_mm, ball_mm, plugged_in=bool(lerobot or source))
+    seen = _seen(webcam, tag_mm, ball_mm, chessboard, plugged_in=bool(lerobot or source))
     try:
         if sim:
             _copy_model(robot)
@@ -98,20 +102,29 @@ def _require_one_way(*, sim: bool, lerobot: str | None, source: str | None, urdf
         raise ConfigError("--from needs the robot's URDF", remedy="Give it with --urdf")
 
 
-def _seen(webcam: str | None, tag_mm: float | None, ball_mm: float | None, *, plugged_in: bool) -> Seen:
+def _seen(
+    webcam: str | None,
+    tag_mm: float | None,
+    ball_mm: float | None,
+    chessboard: tuple[int, int, float] | None,
+    *,
+    plugged_in: bool,
+) -> Seen:
     """Return the cameras, those that are plugged in if `plugged_in`, and the marker."""
     from bodyschema.cli.hardware.robot_template import Seen
     from bodyschema.daemon.wiring.wiring import connected_cameras
 
-    if tag_mm is not None and ball_mm is not None:
-        raise ConfigError("--tag-mm and --ball-mm exclude each other", remedy="Give the one that is on the hand")
+    markers = {"--tag-mm": tag_mm, "--ball-mm": ball_mm, "--chessboard": chessboard}
+    given = [name for name, value in markers.items() if value is not None]
+    if len(given) > 1:
+        raise ConfigError(f"{' and '.join(given)} exclude each other", remedy="Give the one that is on the hand")
     cameras = connected_cameras() if plugged_in or webcam == ANY else ()
     if webcam == ANY:
         if len(cameras) != 1:
             what = f"the cameras here are {', '.join(cameras)}" if cameras else "no camera is plugged in"
             raise ConfigError(f"--webcam any: {what}", remedy="Give the name of one, from /dev/v4l/by-id")
         webcam = cameras[0]
-    return Seen(cameras, webcam, tag_mm, ball_mm)
+    return Seen(cameras, webcam, tag_mm, ball_mm, chessboard)
 
 
 def _guess(urdf: Path, robot: Path, marker_link: str | None, camera_link: str | None) -> Guess:

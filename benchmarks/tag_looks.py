@@ -1,0 +1,147 @@
+"""Tags before a rolling shutter while they move, and tags on a display whose pixels alias with the camera's.
+
+Run `python -m benchmarks.tag_looks moving|display [--tags N] [--eyes 1|2]`. A tag of 50 mm at 0.45 to 0.7 m swings at
+0.7 Hz; each row is rendered at its own time, 20 ms from first to last, exposed for 5 ms. The second frame is judged
+at the time of the tag's middle row. A display has pixels of three coloured stripes on black; truth is the place of
+their luminance.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "vision"))
+
+from ball_renderer import SMALL, VGA, Look
+from tag_renderer import Sheet, photograph
+
+from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss
+from bodyschema.vision.tags.body import TagBody
+from bodyschema.vision.tags.config import TagConfig
+from bodyschema.vision.tags.tracker import TagTracker
+
+READOUT_S, SWING_HZ, SIDE_M = 0.02, 0.7, 0.05
+TAG = TagConfig(side_m=SIDE_M)
+# Luminance of red, green and blue stripes is left of a pixel's middle by this share of it.
+LEFT = 0.062
+
+
+@dataclass
+class Judged:
+    """Errors of fixes (n, 6), place [m] and turn [rad], beside what they claim."""
+
+    errors: list[FloatArray] = field(default_factory=list)
+    sigmas: list[FloatArray] = field(default_factory=list)
+    misses: Counter[str] = field(default_factory=Counter)
+
+    def add(self, found: MarkerFix | MarkerMiss, rotation: Rotation, x: FloatArray) -> None:
+        """Judge one answer."""
+        if isinstance(found, MarkerMiss) or found.R is None or found.cov_R is None:
+            self.misses[str(getattr(found, "reason", ""))] += 1
+            return
+        turn = (Rotation.from_quat(found.R) * rotation.inv()).as_rotvec()
+        self.errors.append(np.array([*(found.x - x), *turn]))
+        self.sigmas.append(np.sqrt([*np.diag(found.cov), *np.diag(found.cov_R)]))
+
+    def __str__(self) -> str:
+        if not self.errors:
+            return f"no fix {dict(self.misses)}"
+        off, sigma = np.array(self.errors), np.array(self.sigmas)
+        rms = [np.sqrt(np.square(each).mean(axis=0)) for each in (off, sigma)]
+        place, turn = (
+            (" ".join(f"{1e3 * value:.3f}" for value in each[:3]) for each in rms),
+            [f"{np.degrees(np.sqrt(np.square(each[3:]).mean())):.3f}" for each in rms],
+        )
+        within = [f"{100.0 * (np.abs(off) < times * sigma).mean():.0f}" for times in (1.0, 2.0)]
+        claims = f"{' | '.join(place)} mm | {' | '.join(turn)}° | {' '.join(within)} %"
+        return f"{len(off)} fixes {dict(self.misses)} | {claims}"
+
+
+def some_rotation(rng: np.random.Generator) -> Rotation:
+    """Return a tag turned away from the camera by 10 to 45°."""
+    axis = np.append(rng.normal(size=2), 0.0)
+    tilt = Rotation.from_rotvec(np.radians(rng.uniform(10.0, 45.0)) * axis / np.linalg.norm(axis))
+    spin = Rotation.from_euler("z", rng.uniform(0.0, 2.0 * np.pi))
+    return tilt * Rotation.from_matrix(np.diag([1.0, -1.0, -1.0])) * spin
+
+
+def moving(tags: int, eyes: int) -> None:
+    """Print how moving tags fare, with and without a known readout."""
+    camera = VGA if eyes == 2 else replace(VGA, baseline_m=0.0)
+    look = Look(samples=6, noise_sd=2.0, blur_px=0.6, wall=0.5)
+    for speed, spin_deg in ((0.02, 3.0), (0.05, 6.0), (0.1, 12.0), (0.3, 30.0)):
+        rng, judged = np.random.default_rng(7), {told: Judged() for told in (0.0, READOUT_S, 1.3 * READOUT_S)}
+        for _ in range(tags):
+            z = rng.uniform(0.45, 0.7)
+            x0 = np.array([rng.uniform(-0.05, 0.15) * z, rng.uniform(-0.22, 0.22) * z, z])
+            R0, v, w = some_rotation(rng), rng.normal(size=3), rng.normal(size=3)
+            v, w = v * speed / np.linalg.norm(v), w * np.radians(spin_deg) / np.linalg.norm(w)
+            omega, phase = 2.0 * np.pi * SWING_HZ, rng.uniform(-1.0, 1.0)
+
+            def at(t: float) -> tuple[Rotation, FloatArray]:
+                swung = (np.sin(omega * t + phase) - np.sin(phase)) / omega  # noqa: B023
+                return Rotation.from_rotvec(w * swung) * R0, x0 + v * swung  # noqa: B023
+
+            trackers = {told: TagTracker(camera, TagBody.single(TAG), TAG, readout_s=told) for told in judged}
+            for t in (0.0, 1.0 / 30.0):
+                (rotation, x), now = at(t), READOUT_S * np.cos(omega * t + phase)
+                sheet = Sheet(0, rotation.as_matrix(), x, SIDE_M, moved_m=tuple(now * v), turned_rad=tuple(now * w))
+                frame = photograph([replace(sheet, exposed=0.25)], VGA, look, rng, t=t)
+                late_s = READOUT_S * (VGA.project(x)[1] / VGA.image_size_px[1] - 0.5)
+                for told, tracker in trackers.items():
+                    found = tracker.track(frame if eyes == 2 else replace(frame, right=None))
+                    if t > 0.0:
+                        judged[told].add(found, *at(t + late_s))
+        for told, each in judged.items():
+            print(f"{speed:g} m/s {spin_deg:g} °/s, readout_s = {told:g}: {each}", flush=True)
+
+
+def display(tags: int) -> None:
+    """Print how tags on a display fare, by display pixels a camera pixel; 0 is paper."""
+    camera = replace(SMALL, baseline_m=0.0)
+    phone = {"bayer": True, "tone": 1.0 / 2.2, "jpeg": 85}
+    for name, kind in (("linear", {}), ("colour mosaic, tone curve, JPEG 85", phone)):
+        look = Look(samples=8, noise_sd=2.0, blur_px=0.5, wall=0.4, exposure=0.7, **kind)
+        for ratio in (0.5, 0.9, 1.1, 2.0, 0.0):
+            rng, judged = np.random.default_rng(3), Judged()
+            for k in range(tags):
+                side_px = rng.uniform(70.0, 110.0)
+                z = SMALL.focal_px * SIDE_M / side_px
+                screen = max(1, round(ratio * side_px / 8.0)) if ratio else 0
+                x, rotation = (
+                    np.array([rng.uniform(-0.08, 0.08) * z, rng.uniform(-0.05, 0.05) * z, z]),
+                    some_rotation(rng),
+                )
+                frame = photograph(
+                    [Sheet(0, rotation.as_matrix(), x, SIDE_M, screen=screen)], SMALL, look, rng, t=10.0 * k
+                )
+                found = TagTracker(camera, TagBody.single(TAG), TAG).track(replace(frame, right=None))
+                left = LEFT * SIDE_M / 8.0 / screen if screen else 0.0
+                judged.add(found, rotation, x - left * rotation.as_matrix()[:, 0])
+            print(f"{name}, {ratio:g}: {judged}", flush=True)
+
+
+def main() -> None:
+    """Run one of the two."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("look", choices=("moving", "display"))
+    parser.add_argument("--tags", type=int, default=20)
+    parser.add_argument("--eyes", type=int, choices=(1, 2), default=1)
+    arguments = parser.parse_args()
+    cv2.setNumThreads(1)
+    if arguments.look == "moving":
+        moving(arguments.tags, arguments.eyes)
+    else:
+        display(arguments.tags)
+
+
+if __name__ == "__main__":
+    main()
