@@ -32,7 +32,7 @@ from bodyschema.diagnosis.fit.worth import NAMED
 from bodyschema.diagnosis.search.drives import with_small_ripples
 from bodyschema.diagnosis.search.held_out import Added, Blocks, added, gain_percent, held_out_errors, is_marker
 from bodyschema.diagnosis.search.hypotheses import Hypotheses
-from bodyschema.diagnosis.search.scan import Candidate, Scan
+from bodyschema.diagnosis.search.scan import Candidate, Scan, moment_again
 from bodyschema.diagnosis.search.search import Search, are_a_description
 from bodyschema.diagnosis.search.together import Tolerated, together, tolerated
 from bodyschema.diagnosis.unnamed.rattle import Rattle, likelihood, rattle, rattle_beside
@@ -427,10 +427,7 @@ def _moment_anew(fit: Fit, cause: Effect, searched: FloatArray) -> Candidate | N
     """Return a cause that begins at a moment with the best one, which was sought at some times (m,) alone."""
     clock, after = fit.observations.motion.clock, int(np.searchsorted(searched, cause.values[-1]))
     between = (clock > searched[max(after - 1, 0)]) & (clock < searched[min(after, len(searched) - 1)])
-    # Rows on the wrong side of the moment seem to be outliers.
-    weights = np.where(between & fit.observations.trusted, 1.0, fit.noise.weights)
-    counted = replace(fit, noise=replace(fit.noise, weights=weights))
-    return Scan(counted, [cause]).without(cause).candidate(cause)
+    return moment_again(fit, cause, between)
 
 
 def _left_out(fit: Fit) -> NDArray[np.bool_]:
