@@ -46,6 +46,14 @@ class Scales(NamedTuple):
         return Scales(*np.minimum(self, 1.0).tolist())
 
     @property
+    def several_times(self) -> float:
+        """How many of links' lengths and angles are made several times as large as a workshop's, from 0 to 2.
+
+        Up to 1 each, for e times as large.
+        """
+        return float(np.clip(np.log(self[:2]), 0.0, 1.0).sum())
+
+    @property
     def doubt(self) -> float:
         """Penalty of these scales under their prior, relative to a scale of 1; 0 for an exact arm [nats]."""
         if max(self) <= SMALLEST:

@@ -387,7 +387,7 @@ class Sets:
             exact = self._solved(inner, toward, group, np.full(_SCALES, _LOG_SMALLEST), sigma)
             if (evidence := self._evidence(exact, toward, sigma)) > worth:
                 worth, solution, scales = evidence, exact, Scales(*[SMALLEST] * _SCALES)
-        worth += self._outliers - self._cost(chosen)
+        worth += self._outliers - self._cost(chosen) - NAMED * scales.several_times
         factor, _, amounts = solution
         return Together(chosen, worth, scales, sigma, spent, amounts, factor, columns)
 
