@@ -34,7 +34,7 @@ from bodyschema.diagnosis.search.held_out import Added, Blocks, added, gain_perc
 from bodyschema.diagnosis.search.hypotheses import Hypotheses
 from bodyschema.diagnosis.search.scan import Candidate, Scan, moment_again
 from bodyschema.diagnosis.search.search import Search, are_a_description
-from bodyschema.diagnosis.search.together import Tolerated, together, tolerated
+from bodyschema.diagnosis.search.together import Tolerated, in_place_of_tolerances, together, tolerated
 from bodyschema.diagnosis.unnamed.rattle import Rattle, likelihood, rattle, rattle_beside
 from bodyschema.diagnosis.unnamed.unknown import Unknowns
 from bodyschema.effects import Effect, Identity, Simulation
@@ -271,6 +271,11 @@ class Diagnosis:
     def sought(self) -> Fit:
         """The complete fit over the rows in which causes were sought."""
         return self.extended if self.part is None else self.extended.over(self.part)
+
+    @cached_property
+    def in_place_of_tolerances(self) -> list[tuple[Effect, float]]:
+        """Causes that may be there instead of tolerances several times a workshop's, with probabilities."""
+        return [] if self.left.is_there else in_place_of_tolerances(self.sought, self.hypotheses.effects)
 
     @cached_property
     def rejected(self) -> list[tuple[Candidate, Added]]:

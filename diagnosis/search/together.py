@@ -263,6 +263,18 @@ class Sets:
         added = [_without(group, here.chosen) for group in self._groups if len(group) > 1]
         return _better([self.of((*here.chosen, *group), near) for group in added if group], here)
 
+    def with_one(self, here: Together) -> Iterator[tuple[Effect, Together]]:
+        """Yield each cause that is not in a set with the best set that has it, beside tolerances that may be smaller."""
+        near = replace(here, scales=here.scales.no_larger)
+        own = {self._keys[k] for k in here.chosen}
+        best: dict[Key, Together] = {}
+        for group in self._groups:
+            key = self._keys[group[0]]
+            if key not in own:
+                one = self.of((*here.chosen, *group), near)
+                best[key] = max(best.get(key, one), one, key=lambda tried: tried.worth)
+        yield from ((self.effects[self._keys.index(key)], one) for key, one in best.items())
+
     def _count(self, here: Together) -> int:
         """Return the number of causes of a set."""
         return len({self.effects[k].identity for k in here.chosen})
@@ -552,6 +564,24 @@ def together(start: Fit, hypotheses: Sequence[Effect], tell: Callable[[str], Non
     return max(known, key=lambda place: place.here.worth).fit
 
 
+def in_place_of_tolerances(fit: Fit, hypotheses: Sequence[Effect]) -> list[tuple[Effect, float]]:
+    """Return what may be there instead of tolerances several times a workshop's, with probabilities; no causes of a fit.
+
+    These are links, the camera's pose and the marker's place: beside one of them the tolerances may be smaller. The
+    probabilities are those of sets with one of these or none of them, without what a set costs before it is named.
+    """
+    if fit.background.scales is None or not fit.background.scales.several_times:
+        return []
+    large = [one for one in hypotheses if one.kind.rigid and not one.kind.is_zero]
+    sets = _sets_about(fit, large, float(np.log(max(len(hypotheses), 1))))
+    here = sets.of(sets.again(fit.causes))
+    found = [(effect, one.worth + NAMED * (one.scales.several_times + 1.0)) for effect, one in sets.with_one(here)]
+    without = here.worth + NAMED * here.scales.several_times
+    odds = np.exp(np.minimum([worth - without for _, worth in found], 700.0))
+    shares = (odds / (1.0 + odds.sum())).tolist()
+    return sorted(((effect, p) for (effect, _), p in zip(found, shares, strict=True)), key=lambda one: -one[1])
+
+
 def tolerated(fit: Fit) -> Tolerated:
     """Return the scales of tolerances with the most evidence beside the causes of a fit."""
     if fit.background.scales is None:
@@ -604,14 +634,8 @@ class _Place:
 
     def __init__(self, fit: Fit, hypotheses: Sequence[Effect], others: Sequence[_Place]) -> None:
         self.fit = fit
-        present = {cause.key for cause in fit.causes}
-        absent = [one for one in hypotheses if one.key not in present and not one.kind.refines]
-        absent = [one for one in absent if not has_simpler_name(one, hypotheses, fit.simulation)]
-        scanned = _beside_links(fit, absent)
-        candidates = [Candidate(cause, 0.0, 1) for cause in fit.causes] + [_at_rest(one) for one in scanned]
-        candidates = [part for candidate in candidates for part in _in_parts(candidate)]
         self._doubt = float(np.log(max(len(hypotheses), 1)))
-        self._sets = Sets(fit, candidates, self._doubt)
+        self._sets = _sets_about(fit, hypotheses, self._doubt)
         own = self._sets.again(fit.causes)
         self.here = self._sets.of(own)
         if self.here.worth > max((place.here.worth for place in others), default=-np.inf) + _COMES_NEAR:
@@ -684,6 +708,20 @@ def _own(fit: Fit, doubt: float) -> Together:
     parts = [part for cause in fit.causes for part in _in_parts(Candidate(cause, 0.0, 1))]
     sets = Sets(fit, parts, doubt)
     return sets.of(sets.again(fit.causes))
+
+
+def _sets_about(fit: Fit, hypotheses: Sequence[Effect], doubt: float) -> Sets:
+    """Return the sets of a fit's causes and of the hypotheses that are none.
+
+    Args:
+        doubt: minimum cost of naming one of them [nats].
+    """
+    present = {cause.key for cause in fit.causes}
+    absent = [one for one in hypotheses if one.key not in present and not one.kind.refines]
+    absent = [one for one in absent if not has_simpler_name(one, hypotheses, fit.simulation)]
+    candidates = [Candidate(cause, 0.0, 1) for cause in fit.causes]
+    candidates += [_at_rest(one) for one in _beside_links(fit, absent)]
+    return Sets(fit, [part for candidate in candidates for part in _in_parts(candidate)], doubt)
 
 
 def _beside_links(fit: Fit, absent: Sequence[Effect]) -> list[Candidate]:
