@@ -264,7 +264,7 @@ class Sets:
         return _better([self.of((*here.chosen, *group), near) for group in added if group], here)
 
     def with_one(self, here: Together) -> Iterator[tuple[Effect, Together]]:
-        """Yield each cause that is not in a set with the best set that has it, beside tolerances that may be smaller."""
+        """Yield each cause that a set lacks with the best set that has it, beside tolerances that may be smaller."""
         near = replace(here, scales=here.scales.no_larger)
         own = {self._keys[k] for k in here.chosen}
         best: dict[Key, Together] = {}
@@ -565,10 +565,12 @@ def together(start: Fit, hypotheses: Sequence[Effect], tell: Callable[[str], Non
 
 
 def in_place_of_tolerances(fit: Fit, hypotheses: Sequence[Effect]) -> list[tuple[Effect, float]]:
-    """Return what may be there instead of tolerances several times a workshop's, with probabilities; no causes of a fit.
+    """Return what may be there, beside a fit's causes, instead of tolerances several times a workshop's.
 
-    These are links, the camera's pose and the marker's place: beside one of them the tolerances may be smaller. The
-    probabilities are those of sets with one of these or none of them, without what a set costs before it is named.
+    These are links, the camera's pose and the marker's place: beside one of them the tolerances may be smaller.
+
+    Returns:
+        Each with its probability among sets with one of these or none, without the margin for naming it.
     """
     if fit.background.scales is None or not fit.background.scales.several_times:
         return []

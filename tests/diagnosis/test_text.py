@@ -130,9 +130,11 @@ def test_what_large_tolerances_may_be_is_told_in_the_headline_and_beside_them() 
     rough = Tolerances(size, size, size, links_share_percent=90.0, rivals=(link,))
     assert "a wrong link before joint elbow (30 %)" in made_to(rough, "camera")
     errors = Errors(5.0, 5.0, 1.0, 1.0, 0.9)
-    for verdict, causes in (("nothing_found", []), ("undecided", [_zero("wrist")])):
-        said = sentence(verdict, causes, errors, gain, rough)
-        assert "small errors everywhere (or a wrong link before joint elbow, 30 %)" in said
+    said = [
+        sentence("nothing_found", [], errors, gain, rough),
+        sentence("undecided", [_zero("wrist")], errors, gain, rough),
+    ]
+    assert all("small errors everywhere (or a wrong link before joint elbow, 30 %)" in one for one in said)
     assert not replace(rough, links_share_percent=1.0).leaves_open
 
 
