@@ -47,11 +47,8 @@ class Scales(NamedTuple):
 
     @property
     def several_times(self) -> float:
-        """How many of links' lengths and angles are made several times as large as a workshop's, from 0 to 2.
-
-        Up to 1 each, for e times as large.
-        """
-        return float(np.clip(np.log(self[:2]), 0.0, 1.0).sum())
+        """How much larger links' lengths or angles are than a workshop's: from 0 to 1, for e times as large or more."""
+        return float(np.clip(np.log(self[:2]), 0.0, 1.0).max())
 
     @property
     def doubt(self) -> float:
