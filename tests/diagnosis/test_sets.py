@@ -16,7 +16,8 @@ from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.fit.worth import ways_to_choose
 from bodyschema.diagnosis.search.hypotheses import Hypotheses
 from bodyschema.diagnosis.search.scan import Candidate
-from bodyschema.diagnosis.search.together import Sets, _Place, in_place_of_tolerances, together, tolerated
+from bodyschema.diagnosis.search.sets import Sets
+from bodyschema.diagnosis.search.together import _Place, in_place_of_tolerances, together, tolerated
 from bodyschema.effects import Effect, Simulation
 from bodyschema.robot.description import RobotDescription
 
