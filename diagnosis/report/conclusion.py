@@ -87,7 +87,9 @@ def _tolerances(diagnosis: Diagnosis) -> Tolerances:
     links, drives = 100.0 * shares.links, 100.0 * shares.drives
     probable = [(effect, share) for effect, share in diagnosis.in_place_of_tolerances if share >= PROBABLE]
     rivals = tuple(Indistinguishable(*effect.key, "this_motion", share) for effect, share in probable)
-    return Tolerances(*intervals, links, drives, in_extended, rivals)
+    return Tolerances(
+        *intervals, links_share_percent=links, drives_share_percent=drives, in_extended=in_extended, rivals=rivals
+    )
 
 
 def _verdict(diagnosis: Diagnosis, causes: tuple[Cause, ...], gain_percent: float, tolerances: Tolerances) -> Verdict:
