@@ -32,9 +32,9 @@ from bodyschema.diagnosis.fit.worth import NAMED
 from bodyschema.diagnosis.search.drives import with_small_ripples
 from bodyschema.diagnosis.search.held_out import Added, Blocks, added, gain_percent, held_out_errors, is_marker
 from bodyschema.diagnosis.search.hypotheses import Hypotheses
-from bodyschema.diagnosis.search.scan import Candidate, Scan
+from bodyschema.diagnosis.search.scan import Candidate, Scan, moment_again
 from bodyschema.diagnosis.search.search import Search, are_a_description
-from bodyschema.diagnosis.search.together import Tolerated, together, tolerated
+from bodyschema.diagnosis.search.together import Tolerated, in_place_of_tolerances, together, tolerated
 from bodyschema.diagnosis.unnamed.rattle import Rattle, likelihood, rattle, rattle_beside
 from bodyschema.diagnosis.unnamed.unknown import Unknowns
 from bodyschema.effects import Effect, Identity, Simulation
@@ -273,6 +273,11 @@ class Diagnosis:
         return self.extended if self.part is None else self.extended.over(self.part)
 
     @cached_property
+    def in_place_of_tolerances(self) -> list[tuple[Effect, float]]:
+        """Causes that may be there instead of tolerances several times a workshop's, with probabilities."""
+        return [] if self.left.is_there else in_place_of_tolerances(self.sought, self.hypotheses.effects)
+
+    @cached_property
     def rejected(self) -> list[tuple[Candidate, Added]]:
         """Rejected hypotheses, each with its best fit beside the causes."""
         present = {cause.key for cause in self.causes}
@@ -427,10 +432,7 @@ def _moment_anew(fit: Fit, cause: Effect, searched: FloatArray) -> Candidate | N
     """Return a cause that begins at a moment with the best one, which was sought at some times (m,) alone."""
     clock, after = fit.observations.motion.clock, int(np.searchsorted(searched, cause.values[-1]))
     between = (clock > searched[max(after - 1, 0)]) & (clock < searched[min(after, len(searched) - 1)])
-    # Rows on the wrong side of the moment seem to be outliers.
-    weights = np.where(between & fit.observations.trusted, 1.0, fit.noise.weights)
-    counted = replace(fit, noise=replace(fit.noise, weights=weights))
-    return Scan(counted, [cause]).without(cause).candidate(cause)
+    return moment_again(fit, cause, between)
 
 
 def _left_out(fit: Fit) -> NDArray[np.bool_]:

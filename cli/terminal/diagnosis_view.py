@@ -59,7 +59,7 @@ def view(diagnosis: DiagnosisFile, remedies: Sequence[str], *, timed: bool) -> G
     if diagnosis.causes:
         parts.append(_causes(diagnosis, timed))
     if diagnosis.tolerances is not None:
-        parts.append(Text(made_to(diagnosis.tolerances)))
+        parts.append(Text(made_to(diagnosis.tolerances, diagnosis.seen_by)))
     if rivals := _rivals(diagnosis):
         parts.append(_list("Not distinguished", rivals))
     if diagnosis.rejected:

@@ -46,6 +46,11 @@ class Scales(NamedTuple):
         return Scales(*np.minimum(self, 1.0).tolist())
 
     @property
+    def several_times(self) -> float:
+        """How much larger links' lengths or angles are than a workshop's: from 0 to 1, for e times as large or more."""
+        return float(np.clip(np.log(self[:2]), 0.0, 1.0).max())
+
+    @property
     def doubt(self) -> float:
         """Penalty of these scales under their prior, relative to a scale of 1; 0 for an exact arm [nats]."""
         if max(self) <= SMALLEST:

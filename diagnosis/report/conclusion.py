@@ -7,7 +7,7 @@ import math
 import msgspec
 import numpy as np
 
-from bodyschema.diagnosis.assess.rivals import Rival, Standing, resembles_sag
+from bodyschema.diagnosis.assess.rivals import PROBABLE, Rival, Standing, resembles_sag
 from bodyschema.diagnosis.diagnosis import MOST_DOUBTFUL, Diagnosis
 from bodyschema.diagnosis.fit.background import ANGLE_RAD, DRIVE_RAD, LENGTH_M
 from bodyschema.diagnosis.fit.fit import Fit
@@ -48,10 +48,10 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
     seen_by = "instrument" if diagnosis.aligned.simulation.robot.calibration is None else "camera"
     causes = _causes(diagnosis, seen_by)
     rms = _rms_mm(diagnosis)
-    verdict = _verdict(diagnosis, causes, percent)
+    tolerances = _tolerances(diagnosis)
+    verdict = _verdict(diagnosis, causes, percent, tolerances)
     counted = diagnosis.gain_with_outliers() if diagnosis.outliers else (None, None)
     gain = Gain(percent, interval, with_outliers_percent=counted[0], with_outliers_ci95=counted[1])
-    tolerances = _tolerances(diagnosis)
     timed = diagnosis.aligned.observations.motion.t is not None
     weighed = diagnosis.aligned.simulation.gravity.known
     named_mm, tolerated_mm = _named_mm(diagnosis), _tolerated_mm(diagnosis)
@@ -88,16 +88,20 @@ def _tolerances(diagnosis: Diagnosis) -> Tolerances:
     shares = diagnosis.shares
     in_extended = diagnosis.stored is diagnosis.extended or diagnosis.stored.background.scales is not None
     links, drives = 100.0 * shares.links, 100.0 * shares.drives
-    return Tolerances(*intervals, links_share_percent=links, drives_share_percent=drives, in_extended=in_extended)
+    probable = [(effect, share) for effect, share in diagnosis.in_place_of_tolerances if share >= PROBABLE]
+    rivals = tuple(Indistinguishable(*effect.key, "this_motion", share) for effect, share in probable)
+    return Tolerances(
+        *intervals, links_share_percent=links, drives_share_percent=drives, in_extended=in_extended, rivals=rivals
+    )
 
 
-def _verdict(diagnosis: Diagnosis, causes: tuple[Cause, ...], gain_percent: float) -> Verdict:
+def _verdict(diagnosis: Diagnosis, causes: tuple[Cause, ...], gain_percent: float, tolerances: Tolerances) -> Verdict:
     # A search that ends at its limit has described the error and not explained it; so have tolerances of no workshop.
     if diagnosis.left.is_there or diagnosis.ended_early or is_at_limit(diagnosis.extended.background.scales):
         return "unexplained"
     if not causes:
         return "nothing_found"
-    is_open = any(cause.leaves_open for cause in causes) or gain_percent <= 0.0
+    is_open = any(cause.leaves_open for cause in causes) or tolerances.leaves_open or gain_percent <= 0.0
     return "undecided" if is_open else "explained"
 
 

@@ -166,7 +166,7 @@ def _tolerances(file: DiagnosisFile) -> str:
     if file.tolerances is None:
         return ""
     use = to_do(file, [])[0]
-    told = " ".join([made_to(file.tolerances), *use])
+    told = " ".join([made_to(file.tolerances, file.seen_by), *use])
     return f'<section id="tolerances"><p>{escape(told)}</p></section>'
 
 

@@ -148,6 +148,7 @@ class Tolerances(msgspec.Struct, frozen=True):
         drive_deg: RMS of a drive's periodic error over a turn.
         links_share_percent, drives_share_percent: shares of the gain of links and axes, and of drives.
         in_extended: False where extended.toml leaves them out, since it would not surely be better elsewhere.
+        rivals: causes that may be there instead of tolerances several times a workshop's, the most probable first.
     """
 
     length_mm: Interval
@@ -156,11 +157,17 @@ class Tolerances(msgspec.Struct, frozen=True):
     links_share_percent: float = 0.0
     drives_share_percent: float = 0.0
     in_extended: bool = True
+    rivals: tuple[Indistinguishable, ...] = ()
 
     @property
     def share_percent(self) -> float:
         """Share of the gain of all tolerances together."""
         return self.links_share_percent + self.drives_share_percent
+
+    @property
+    def leaves_open(self) -> bool:
+        """True where a cause may be there in their place, and they are not small."""
+        return self.links_share_percent >= SMALL and any(rival.probability > 1.0 - SURE for rival in self.rivals)
 
 
 class Pairs(msgspec.Struct, frozen=True):

@@ -127,7 +127,8 @@ def sentence(
     """
     figures = f"{rms.aligned:.3g} → {rms.extended:.3g} mm on held-out data"
     if verdict == "nothing_found" and rms.extended < _Settings.by_tolerances * rms.aligned:
-        return f"No cause stands out: small errors everywhere explain {_share(gain)} ({figures})"
+        everywhere = f"small errors everywhere{_or_a_cause(tolerances, seen_by)}"
+        return f"No cause stands out: {everywhere} explain {_share(gain)} ({figures})"
     if verdict == "nothing_found" and tolerances is not None and not tolerances.in_extended:
         return f"No cause stands out; small errors everywhere are not known well enough to correct {rms.aligned:.3g} mm"
     if verdict == "nothing_found":
@@ -153,7 +154,7 @@ def sentence(
 def _head(causes: Sequence[Cause], tolerances: Tolerances | None, seen_by: str, *, timed: bool, weighed: bool) -> str:
     """Return the largest causes as a sentence without its full stop."""
     ordered = in_order(causes)
-    everywhere = ["small errors everywhere"] if _shows(tolerances) else []
+    everywhere = [f"small errors everywhere{_or_a_cause(tolerances, seen_by)}"] if _shows(tolerances) else []
     first = [cause for cause in ordered if not (cause.is_correction or (everywhere and cause.is_small))]
     first = first[: _Settings.named]
     said = [finding(c.effect, c.where, c.source, told_values(c), seen_by, timed=timed, weighed=weighed) for c in first]
@@ -180,6 +181,14 @@ def _or(cause: Cause, seen_by: str) -> str:
     return f" ({'more probably' if cause.is_outvoted else 'or'} {rival_named(cause.rivals[0], seen_by)})"
 
 
+def _or_a_cause(tolerances: Tolerances | None, seen_by: str) -> str:
+    """Return the most probable cause that may be there in the place of large tolerances, in parentheses."""
+    if tolerances is None or not tolerances.leaves_open:
+        return ""
+    rival = tolerances.rivals[0]
+    return f" (or {rival_named(rival, seen_by)}, {100.0 * rival.probability:.0f} %)"
+
+
 def _open(verdict: Verdict, causes: Sequence[Cause], seen_by: str) -> str:
     """Return the part of a verdict's sentence on what remains open."""
     if verdict == "unexplained":
@@ -196,7 +205,7 @@ def _share(gain: Gain) -> str:
     return f"{explained} % of the error" if explained > 0 else "less than 1 % of the error"
 
 
-def made_to(tolerances: Tolerances) -> str:
+def made_to(tolerances: Tolerances, seen_by: str) -> str:
     """Return one sentence on the manufacturing tolerances of an arm; upper bounds where they do not show."""
 
     def told(size: Interval, unit: str, sign: str = "") -> str:
@@ -207,7 +216,15 @@ def made_to(tolerances: Tolerances) -> str:
 
     length, angle = told(tolerances.length_mm, " mm"), told(tolerances.angle_deg, "°")
     drives = told(tolerances.drive_deg, "°", "±")
-    return f"The arm is made to {length} and {angle}; its drives run true to {drives}."
+    return f"The arm is made to {length} and {angle}; its drives run true to {drives}.{_instead(tolerances, seen_by)}"
+
+
+def _instead(tolerances: Tolerances, seen_by: str) -> str:
+    """Return a sentence on what may be there in the place of large tolerances."""
+    told = [f"{rival_named(rival, seen_by)} ({100.0 * rival.probability:.0f} %)" for rival in tolerances.rivals]
+    if not told:
+        return ""
+    return f" Instead of links as inexact as that there may be {' or '.join(told)}, and the others are more exact."
 
 
 def to_do(diagnosis: DiagnosisFile, remedies: Sequence[str]) -> tuple[list[str], list[str]]:

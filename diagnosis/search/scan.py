@@ -379,6 +379,17 @@ class Scan:
         return ((shares > TOLD_APART) & told).sum(axis=1)
 
 
+def moment_again(fit: Fit, cause: Effect, doubted: NDArray[np.bool_]) -> Candidate | None:
+    """Return a cause that begins at a moment with its best moment.
+
+    Args:
+        doubted: rows (n,) that count in full: those on the wrong side of the moment seem to be outliers.
+    """
+    weights = np.where(doubted & fit.observations.trusted, 1.0, fit.noise.weights)
+    counted = replace(fit, noise=replace(fit.noise, weights=weights))
+    return Scan(counted, [cause]).without(cause).candidate(cause)
+
+
 @cache
 def _subsets(count: int) -> NDArray[np.bool_]:
     """Return all sets of some of `count` amounts (m, count)."""

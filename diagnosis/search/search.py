@@ -18,7 +18,7 @@ from bodyschema.effects import Effect, Identity
 
 from .held_out import Blocks, block_p_value
 from .hypotheses import has_simpler_name
-from .scan import Candidate, Scan
+from .scan import Candidate, Scan, moment_again
 
 
 class _Settings:
@@ -43,6 +43,9 @@ class _Settings:
     # Largest part of the evidence between two memory effects of a joint that may lie in a few rows [nats].
     of_single_rows = 10.0
     elsewhere = 1.0  # a moment or a period that promises this much more than the fitted one is tried
+    # As many rows beside a moment may be on its wrong side and seem to be outliers (more are a change, as the noise has
+    # it), where the weight of some is smaller than this.
+    near_a_moment, off = 27, 0.5
     astray = 5.0  # a period that explains less than before by this has diverged [nats]
     # With fewer blocks of time, p-values are too coarse; a gain above this needs no p-value [nats].
     few_blocks, beyond_doubt = 20, 30.0
@@ -105,9 +108,21 @@ class Beside:
         least = self._fit.log_likelihood - rise
         return improved(self._fit.starting(self.others), least).log_likelihood > least
 
-    def elsewhere(self, least: float) -> Fit:
-        """Refit with the best moment or period of the cause; give up where `least` is out of reach [nats]."""
-        return improved(self._fit.starting([*self.others, self.itself.effect]), least)
+    def elsewhere(self) -> Fit | None:
+        """Refit with a better moment or period of the cause; None where there is none."""
+        fit, cause = self._fit, self._cause
+        least = fit.log_likelihood + _Settings.elsewhere
+        tried = [self.itself] if self.itself.gain > self.gain + _Settings.elsewhere else []
+        if cause.kind.begins:
+            row = int(np.searchsorted(fit.observations.motion.clock, cause.values[-1]))
+            near = np.abs(np.arange(len(fit.left)) + 0.5 - row) < _Settings.near_a_moment
+            if (fit.noise.weights[near & fit.observations.trusted] < _Settings.off).any():
+                tried += [again for again in [moment_again(fit, cause, near)] if again is not None]
+        for candidate in tried:
+            there = improved(fit.starting([*self.others, candidate.effect]), least)
+            if there.log_likelihood > least:
+                return there
+        return None
 
     def exchanged(self, candidate: Candidate, least: float) -> Fit:
         """Refit with a candidate in the place of the cause; the best such fit is kept."""
@@ -327,10 +342,8 @@ class Search:
     def _second_thoughts(self, fit: Fit, cause: Effect) -> Fit | None:
         """Return the fit with a cause refined, dropped or exchanged; None if it stays as it is."""
         beside = self.beside(fit, cause)
-        if beside.itself.gain > beside.gain + _Settings.elsewhere:
-            tried = beside.elsewhere(fit.log_likelihood + _Settings.elsewhere)
-            if tried.log_likelihood > fit.log_likelihood + _Settings.elsewhere:
-                return tried
+        if (there := beside.elsewhere()) is not None:
+            return there
         if beside.in_parts is not None and beside.in_parts.effect.free != cause.free:
             tried, worth = self._exchanged(fit, beside, beside.in_parts, _Settings.elsewhere)
             if worth > _Settings.elsewhere:

@@ -229,6 +229,18 @@ def test_a_cause_far_ahead_is_not_reviewed_after_a_small_change(robot) -> None:
     assert search.reviewed.count(large.name) == 1
 
 
+@pytest.mark.parametrize("early", [-4, -2, 2, 4])
+def test_a_moment_moves_across_rows_that_seemed_outliers(robot, early) -> None:
+    slip = Effect.at(robot, "tool_slip", values=[6e-3, -8e-3, 4e-3, 30.1])
+    start = start_of(robot, walk(robot, 4), (slip,), 4)
+    misled = start.with_causes([slip.with_values(slip.values + np.array([0.0, 0.0, 0.0, early * INTERVAL_S]))])
+    assert (misled.noise.weights < 0.1).sum() >= abs(early)
+    found = Search([Effect.at(robot, "tool_slip")], lambda _: None).run(misled)
+    (moment,) = [effect.value("t0") for effect in found.causes]
+    assert abs(moment - 30.1) < INTERVAL_S
+    assert (found.noise.weights[found.observations.trusted] > 0.5).all()
+
+
 def test_a_moment_is_sought_again_beside_causes_that_came_later(robot) -> None:
     slip = Effect.at(robot, "tool_slip", values=[2e-3, 0.0, 0.0, 30.0])
     turned = Effect.at(robot, "joint_eccentricity", SHOULDER, values=[0.03, 0.0])

@@ -16,7 +16,8 @@ from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.fit.worth import ways_to_choose
 from bodyschema.diagnosis.search.hypotheses import Hypotheses
 from bodyschema.diagnosis.search.scan import Candidate
-from bodyschema.diagnosis.search.together import Sets, _Place, together, tolerated
+from bodyschema.diagnosis.search.sets import Sets
+from bodyschema.diagnosis.search.together import _Place, in_place_of_tolerances, together, tolerated
 from bodyschema.effects import Effect, Simulation
 from bodyschema.robot.description import RobotDescription
 
@@ -107,6 +108,35 @@ def test_a_roughly_made_arm_has_no_cause(seed, angle) -> None:
     start = rough(desk_arm(), seed, angle)
     hypotheses = Hypotheses.of(start.simulation, start.observations).effects
     assert together(start, hypotheses).causes == ()
+
+
+def bent(seed: int, angle: float) -> tuple[Fit, Sequence[Effect]]:
+    """Return the start of an arm made to 0.06° with one link bent by an angle about each axis, and the hypotheses."""
+    robot = desk_arm()
+    start = rough(robot, seed, 1e-3, Effect.at(robot, "link_geometry", WRIST, values=[0, 0, 0, angle, -angle, angle]))
+    return start, Hypotheses.of(start.simulation, start.observations).effects
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_link_is_named_rather_than_tolerances_that_no_workshop_needs(seed) -> None:
+    # Without it angles would have to be made five times as roughly.
+    assert [cause.where for cause in together(*bent(seed, 0.012)).causes] == [WRIST]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_large_tolerances_may_be_instead_has_a_probability(seed) -> None:
+    start, hypotheses = bent(seed, 0.008)
+    fit = start.tolerating(Scales())
+    found = in_place_of_tolerances(fit.tolerating(tolerated(fit).scales), hypotheses)
+    assert found[0][0].where == WRIST
+    assert 0.1 < found[0][1] < 0.9
+    assert all(share < 0.02 for _, share in found[1:])
+
+
+def test_tolerances_of_a_workshop_are_no_cause_instead() -> None:
+    start, hypotheses = bent(1, 0.0)
+    fit = start.tolerating(Scales())
+    assert in_place_of_tolerances(fit.tolerating(tolerated(fit).scales), hypotheses) == []
 
 
 @pytest.mark.parametrize("seed", range(3))

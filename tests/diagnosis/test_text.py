@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from msgspec.structs import replace
+
 from bodyschema.diagnosis.report import tables
 from bodyschema.diagnosis.report.result import (
     Cause,
@@ -117,9 +119,23 @@ def test_a_slides_ripple_is_told_where_its_pitch_is_unsure():
 
 def test_tolerances_that_do_not_show_are_told_by_what_they_are_at_most():
     size, none = Interval(0.3, (0.2, 0.4)), Interval(0.01, (0.0, 0.02))
-    assert made_to(Tolerances(size, none, none)) == (
+    assert made_to(Tolerances(size, none, none), "camera") == (
         "The arm is made to about 0.3 mm and at most 0.02°; its drives run true to at most ±0.02°."
     )
+
+
+def test_what_large_tolerances_may_be_is_told_in_the_headline_and_beside_them() -> None:
+    size, gain = Interval(0.6, (0.5, 0.7)), Gain(80.0, (75.0, 85.0))
+    link = Indistinguishable("link_geometry", "elbow", None, "this_motion", 0.3)
+    rough = Tolerances(size, size, size, links_share_percent=90.0, rivals=(link,))
+    assert "a wrong link before joint elbow (30 %)" in made_to(rough, "camera")
+    errors = Errors(5.0, 5.0, 1.0, 1.0, 0.9)
+    said = [
+        sentence("nothing_found", [], errors, gain, rough),
+        sentence("undecided", [_zero("wrist")], errors, gain, rough),
+    ]
+    assert all("small errors everywhere (or a wrong link before joint elbow, 30 %)" in one for one in said)
+    assert not replace(rough, links_share_percent=1.0).leaves_open
 
 
 def test_an_alternative_that_is_more_probable_is_told_to_be_so() -> None:

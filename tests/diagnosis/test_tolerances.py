@@ -18,7 +18,8 @@ from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.report.conclusion import conclusion
 from bodyschema.diagnosis.report.result import DiagnosisFile
 from bodyschema.diagnosis.search.scan import Candidate
-from bodyschema.diagnosis.search.together import Sets, beyond_tolerances, tolerated
+from bodyschema.diagnosis.search.sets import Sets
+from bodyschema.diagnosis.search.together import beyond_tolerances, tolerated
 from bodyschema.effects import Effect, Simulation, load_simulation, write_extended
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.description import RobotDescription

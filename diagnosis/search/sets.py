@@ -1,0 +1,506 @@
+"""Sets of causes about one fit, each with its evidence beside the background.
+
+Everything is linearised about the fit: a set costs its normal equations, whatever the number of rows (MacKay 1992,
+"Bayesian interpolation"; Tipping and Faul 2003, "Fast marginal likelihood maximisation").
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import get_blas_funcs, get_lapack_funcs
+
+from bodyschema.diagnosis.fit.background import MOST, SMALLEST, SPREAD, Scales
+from bodyschema.diagnosis.fit.fit import Fit
+from bodyschema.diagnosis.fit.worth import ANOTHER, NAMED, ways_to_choose
+from bodyschema.effects import Effect, EffectType, Identity
+from bodyschema.interfaces.records import FloatArray
+
+from .scan import Candidate
+from .search import Key
+
+# Rounds for scales and noise, from afar and beside a similar set; stop when their logarithms change by less.
+_ROUNDS, _ROUNDS_NEAR, STILL = 25, 8, 0.02
+# Limit of a step in the logarithms.
+_FARTHEST = 1.0
+# Lower limit of the noise as a share of that of the fit.
+_QUIETEST = 1e-3
+# Number of the most promising moves that are tried with their own scales.
+_TRIED = 4
+# With all scales below this, also try an arm exactly as described, such as a simulated one.
+_MAY_BE_EXACT = 0.5
+# Prior width of what robot.toml does not know, about the fit, in usual sizes; the same in all fits, to compare them.
+_FREE = 100.0
+# Relative rounding of squares, and of columns that are collinear up to rounding.
+_ROUNDED_OFF, _ONE_BEYOND_ROUNDING = 1e-13, 1e-8
+# Evidence loss without a scale's tolerances from which they show in the data [nats].
+_SHOWN = 3.0
+# Loss of evidence that rules a scale out with 95 % (a likelihood ratio on one side), and the step of logarithms tried.
+_RULED_OUT, _FINER = 1.35, 0.2
+# Maximum of changes to a set of causes, and of its causes for more to be added: beyond, the first order is not enough.
+_MOST_MOVES, _MOST_TOGETHER = 60, 8
+# Margin to the best within which a set is refitted, and a change tried [nats].
+COMES_NEAR = 15.0
+
+_LOG_SMALLEST, _LOG_MOST, SCALES = math.log(SMALLEST), math.log(MOST), len(Scales())
+
+dpotrf, dpotri, dpotrs = get_lapack_funcs(("potrf", "potri", "potrs"), dtype=np.float64)
+(dtrsm,) = get_blas_funcs(("trsm",), dtype=np.float64)
+
+# Factor (p, p) of a precision, prior variances (p,), and amounts (p,).
+_Solution = tuple[FloatArray, FloatArray, FloatArray]
+
+
+@dataclass(frozen=True, eq=False)
+class Together:
+    """A set of causes with its evidence.
+
+    Attributes:
+        chosen: indices of its candidates.
+        worth: its evidence less the cost of naming its causes [nats]; comparable only with that of other sets.
+        scales: scales of the tolerances.
+        sigma: size of the noise, in units of the stated one.
+        spent: effective number of data that determine each scale (4,).
+        amounts: amounts of all its columns (p,).
+        factor: lower Cholesky factor (p, p) of their precision; what is above its diagonal has no meaning.
+        columns: indices of its columns (p,).
+    """
+
+    chosen: tuple[int, ...]
+    worth: float
+    scales: Scales
+    sigma: float
+    spent: FloatArray
+    amounts: FloatArray
+    factor: FloatArray
+    columns: NDArray[np.intp]
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Covariance of the amounts (p, p)."""
+        lower = np.tril(dpotri(self.factor, lower=True)[0])
+        return lower + np.tril(lower, -1).T
+
+
+class Sets:
+    """Sets of causes beside one fit, to first order.
+
+    Args:
+        fit: a fit with a background.
+        candidates: possible causes, each with the amounts, periods and moments about which it is linearised.
+        doubt: minimum cost of naming one of them [nats].
+    """
+
+    def __init__(self, fit: Fit, candidates: Sequence[Candidate], doubt: float) -> None:
+        columns, amounts = fit.columns, fit.effect_columns.shape[2]
+        causes = sum(len(effect.amounts) for effect in fit.causes)
+        found = [effect.values[effect.amounts] for effect in fit.causes]
+        # What robot.toml does not know counts from where the fit has it, however far from its nominal place.
+        now = np.concatenate([np.zeros(amounts - causes), *found, fit.tolerated])
+        rows = fit.left.size
+        target = fit.left.ravel() + columns.reshape(rows, -1) @ now
+        parts = [columns[:, :, : amounts - causes], columns[:, :, amounts:]]
+        self.effects = [candidate.effect for candidate in candidates]
+        parts += [*_columns(fit, self.effects)]
+        self._nuisances, self._tolerances = amounts - causes, len(fit.tolerated)
+        self._of_scale, self._noise = fit.background.group, fit.noise.sigma
+        scales = np.asarray(fit.background.scales or Scales())[fit.background.group]
+        flat = np.concatenate(parts, axis=2).reshape(rows, -1)
+        unknown = _FREE * _usual(fit.simulation.effects[: fit.nuisances])
+        self._units = np.concatenate([unknown, fit.background.tolerances / scales, _usual(self.effects)])
+        flat *= self._units
+        self._inner, self._toward = flat.T @ flat, flat.T @ target
+        self._square, self._rows = float(target @ target), 3.0 * float(fit.noise.weights.sum())
+        # Outliers of one fit may be the marker in another, with other causes: compare all rows.
+        left = float(np.square(fit.left).sum()) / fit.noise.sigma**2
+        self._outliers = fit.noise.log_likelihood + self._rows * math.log(fit.noise.sigma) + 0.5 * left
+        self._kinds, self._keys = [one.kind for one in self.effects], [one.key for one in self.effects]
+        self._trials = [float(np.log(candidate.trials)) for candidate in candidates]
+        self._bits = [sum(1 << k for k in one.amounts) for one in self.effects]
+        self._first = doubt + NAMED
+        ends = np.cumsum([0, *(len(effect.amounts) for effect in self.effects)])
+        first = self._nuisances + self._tolerances
+        self._places = [np.arange(first + a, first + b) for a, b in pairwise(ends)]
+        self._known_places: dict[tuple[int, ...], NDArray[np.intp]] = {}
+        # Numbers of one cause that are added and removed together.
+        groups: dict[tuple[object, ...], list[int]] = {}
+        for k, effect in enumerate(self.effects):
+            for group in (k,), *_parts(effect):
+                groups.setdefault(group, []).append(k)
+        self._groups = [tuple(group) for group in dict.fromkeys(map(tuple, groups.values()))]
+        self._known: dict[frozenset[int], Together] = {}
+        known = {cause.identity for cause in fit.causes}
+        # The moment of each was sought without the others, so it is right for one of them at most.
+        self._begins = {k for k, one in enumerate(self.effects) if one.kind.begins and one.identity not in known}
+
+    def climbed(self, starts: Iterable[tuple[int, ...]]) -> list[Together]:
+        """Improve each start by single changes, and return the sets reached, without causes that cannot be.
+
+        Without them different sets may be the same.
+        """
+        seen: dict[frozenset[int], Together] = {}
+        reached = (self.possible(self._climbed(start, seen)) for start in starts)
+        return list({frozenset(one.chosen): one for one in reached}.values())
+
+    def possible(self, here: Together) -> Together:
+        """Return a set without the causes whose amounts would be impossible, such as a negative backlash."""
+        absent = {cause.identity for cause in self.causes(here) if not cause.is_possible}
+        if not absent:
+            return here
+        stays = tuple(k for k in here.chosen if self.effects[k].identity not in absent)
+        return self.possible(self.of(stays, here))
+
+    def starts(self, own: tuple[int, ...], *, links: bool) -> Iterator[tuple[int, ...]]:
+        """Yield the starting sets: the fit's causes, none, all joint offsets, and all effects of each kind.
+
+        Args:
+            links: also yield each cause that may have only some of its numbers, with all of them.
+        """
+        yield own
+        yield ()
+        steady = [effect for k, effect in enumerate(self.effects) if k not in self._begins]
+        kinds = dict.fromkeys(effect.kind for effect in steady if effect.kind.at_joint and not effect.source)
+        zeros = tuple(k for k, effect in enumerate(self.effects) if effect.kind.is_zero)
+        for kind in kinds:
+            yield tuple(k for k, effect in enumerate(self.effects) if effect.kind is kind)
+        yield tuple(dict.fromkeys((*own, *zeros)))
+        yield from self.zeros_for_links(own)
+        for key in dict.fromkeys(effect.key for effect in self.effects if effect.kind.in_parts and links):
+            yield tuple(k for k, effect in enumerate(self.effects) if effect.key == key)
+
+    def zeros_for_links(self, own: tuple[int, ...]) -> list[tuple[int, ...]]:
+        """Return the set with all joint offsets in the place of its links; an empty list if it has no links."""
+        zeros = [k for k, effect in enumerate(self.effects) if effect.kind.is_zero]
+        others = [k for k in own if not self.effects[k].kind.in_parts]
+        return [tuple(dict.fromkeys((*others, *zeros)))] if len(others) < len(own) else []
+
+    def again(self, effects: Iterable[Effect]) -> tuple[int, ...]:
+        """Return the set of the same effects and numbers, as far as they are candidates here."""
+        wanted = {(effect.key, k) for effect in effects for k in effect.amounts}
+        return tuple(k for k, one in enumerate(self.effects) if (one.key, one.amounts[0]) in wanted)
+
+    def _climbed(self, start: tuple[int, ...], seen: dict[frozenset[int], Together]) -> Together:
+        here = self.of(start)
+        for _ in range(_MOST_MOVES):
+            if frozenset(here.chosen) in seen:
+                return seen[frozenset(here.chosen)]
+            seen[frozenset(here.chosen)] = here
+            better = self._without_one(here)
+            if better is None and self._count(here) < _MOST_TOGETHER:
+                better = self._with_one_more(here) or self._exchanged(here) or self._with_smaller_tolerances(here)
+            if better is None:
+                return here
+            here = better
+        return here
+
+    def _without_one(self, here: Together) -> Together | None:
+        """Remove one cause or a part of one, where that is more probable."""
+        present = frozenset(here.chosen)
+        groups = [group for group in self._groups if present.issuperset(group)]
+        losses = self._losses(here, groups)
+        for k in np.argsort(losses, kind="stable")[:_TRIED].tolist():
+            if losses[k] > COMES_NEAR:
+                break
+            if better := _better([self.of(_without(here.chosen, groups[k]), here)], here):
+                return better
+        return None
+
+    def _with_one_more(self, here: Together) -> Together | None:
+        more = self._promising(here, here.worth)
+        return _better([self.of((*here.chosen, *group), here) for group in more[:_TRIED]], here)
+
+    def _exchanged(self, here: Together) -> Together | None:
+        """Exchange one cause for another, where that is more probable."""
+        tried = []
+        for identity in dict.fromkeys(self.effects[k].identity for k in here.chosen):
+            own = tuple(k for k in here.chosen if self.effects[k].identity == identity)
+            without = self.of(_without(here.chosen, own), here)
+            others = [
+                group for group in self._promising(without, here.worth) if self.effects[group[0]].identity != identity
+            ]
+            tried += [self.of((*without.chosen, *group), without) for group in others[:_TRIED]]
+        return _better(tried, here)
+
+    def _with_smaller_tolerances(self, here: Together) -> Together | None:
+        """Add the shifts or the turns of a link, where tolerances are then so much smaller that it is more probable.
+
+        Beside tolerances as large as the link's own error it seems to be worth nothing, however large they are.
+        """
+        if max(here.scales.lengths, here.scales.angles) <= 1.0:
+            return None
+        near = replace(here, scales=here.scales.no_larger)
+        added = [_without(group, here.chosen) for group in self._groups if len(group) > 1]
+        return _better([self.of((*here.chosen, *group), near) for group in added if group], here)
+
+    def with_one(self, here: Together) -> Iterator[tuple[Effect, Together]]:
+        """Yield each cause that a set lacks with the best set that has it, beside tolerances that may be smaller."""
+        near = replace(here, scales=here.scales.no_larger)
+        own = {self._keys[k] for k in here.chosen}
+        best: dict[Key, Together] = {}
+        for group in self._groups:
+            key = self._keys[group[0]]
+            if key not in own:
+                one = self.of((*here.chosen, *group), near)
+                best[key] = max(best.get(key, one), one, key=lambda tried: tried.worth)
+        yield from ((self.effects[self._keys.index(key)], one) for key, one in best.items())
+
+    def _count(self, here: Together) -> int:
+        """Return the number of causes of a set."""
+        return len({self.effects[k].identity for k in here.chosen})
+
+    def _losses(self, here: Together, groups: Sequence[tuple[int, ...]]) -> FloatArray:
+        """Return the worth of each of some groups of numbers with scales and noise held fixed [nats]."""
+        own = [np.searchsorted(here.columns, self._places_of(group)) for group in groups]
+        squares, volumes = _in_groups(here.covariance, here.amounts, own)
+        return squares + volumes - self._costs_of(here.chosen, groups, are_in=True)
+
+    def _cost(self, chosen: Sequence[int]) -> float:
+        """Return the cost of naming the causes of a set [nats]."""
+        total, kinds = 0.0, set[EffectType]()
+        numbers: Counter[Key] = Counter()
+        for k in chosen:
+            kind = self._kinds[k]
+            if kind.in_parts:
+                numbers[self._keys[k]] += self._bits[k]
+                continue
+            total += self._trials[k] + (ANOTHER if kind in kinds else self._first)
+            kinds.add(kind)
+        total += sum(self._first + self._of_numbers[key][bits] for key, bits in numbers.items())
+        return total - math.lgamma(len(kinds) + len(numbers) + 1)
+
+    def _places_of(self, group: tuple[int, ...]) -> NDArray[np.intp]:
+        """Return the columns of some candidates (p,)."""
+        if group not in self._known_places:
+            self._known_places[group] = np.concatenate([self._places[k] for k in group])
+        return self._known_places[group]
+
+    @cached_property
+    def _of_numbers(self) -> dict[Key, FloatArray]:
+        """Cost of each choice of the numbers of each cause that may have only some of them [nats]."""
+        in_parts = {effect.key: effect for effect in self.effects if effect.kind.in_parts}
+        return {key: np.log(ways_to_choose(effect)) for key, effect in in_parts.items()}
+
+    def _promising(self, here: Together, least: float) -> list[tuple[int, ...]]:
+        """Return the groups of candidates that may reach the worth `least`, the best first.
+
+        Their own worth is that with scales and noise held fixed; with scales of their own they may be worth more.
+        """
+        present = frozenset(here.chosen)
+        closed = present | (self._begins if present & self._begins else set())
+        groups = dict.fromkeys(tuple(k for k in group if k not in present) for group in self._groups)
+        open_groups = [group for group in groups if group and closed.isdisjoint(group)]
+        if not open_groups:
+            return []
+        places = self._places_of(tuple(sorted(frozenset[int]().union(*open_groups))))
+        across = self._inner[np.ix_(here.columns, places)] / here.sigma**2
+        solved = dpotrs(here.factor, across, lower=True)[0]
+        inner = self._inner[np.ix_(places, places)] / here.sigma**2 - across.T @ solved
+        inner[np.diag_indices_from(inner)] += 1.0
+        gradient = self._toward[places] / here.sigma**2 - solved.T @ (self._toward[here.columns] / here.sigma**2)
+        at = np.empty(len(self._toward), dtype=np.intp)
+        at[places] = np.arange(len(places))
+        own = [at[self._places_of(group)] for group in open_groups]
+        squares, volumes = _in_groups(inner, gradient, own)
+        worths = squares - volumes - self._costs_of(here.chosen, open_groups, are_in=False)
+        best = np.argsort(worths)[::-1]
+        return [open_groups[k] for k in best[here.worth + worths[best] > least - COMES_NEAR].tolist()]
+
+    def _costs_of(self, chosen: Sequence[int], groups: Sequence[tuple[int, ...]], *, are_in: bool) -> FloatArray:
+        """Return the part of each of some groups in the cost of naming a set [nats], or what it would add to it."""
+        kinds = Counter(self._kinds[k] for k in chosen if not self._kinds[k].in_parts)
+        numbers: Counter[Key] = Counter()
+        for k in chosen:
+            if self._kinds[k].in_parts:
+                numbers[self._keys[k]] += self._bits[k]
+        # Names have no order: so many ways to write the same set.
+        first = self._first - math.log(max(len(kinds) + len(numbers) + (not are_in), 1))
+        costs = []
+        for group in groups:
+            kind, key = self._kinds[group[0]], self._keys[group[0]]
+            if kind.in_parts:
+                own = sum(self._bits[k] for k in group)
+                before = numbers[key] - (own if are_in else 0)
+                of_numbers = self._of_numbers[key]
+                costs.append(of_numbers[before + own] + (first if before == 0 else -of_numbers[before]))
+            else:
+                costs.append(self._trials[group[0]] + (ANOTHER if kinds[kind] > are_in else first))
+        return np.array(costs)
+
+    def of(self, chosen: tuple[int, ...], near: Together | None = None) -> Together:
+        """Fit the scales and the noise of a set of causes by maximum evidence; each set once, whatever is near."""
+        key = frozenset(chosen)
+        if key not in self._known:
+            self._known[key] = self._fitted(chosen, near)
+        return self._known[key]
+
+    def _fitted(self, chosen: tuple[int, ...], near: Together | None) -> Together:
+        own = [self._places[k] for k in chosen]
+        columns = np.sort(np.concatenate([np.arange(self._nuisances + self._tolerances), *own]).astype(np.intp))
+        group = self._group(columns)
+        inner, toward = self._inner[np.ix_(columns, columns)], self._toward[columns]
+        logs = np.log(near.scales if near else Scales())
+        sigma = near.sigma if near else self._noise
+        members, spent = (group == np.arange(SCALES)[:, None]).astype(np.float64), np.zeros(SCALES)
+        unit = np.eye(len(columns), order="F")
+        for done in range(_ROUNDS if near is None else _ROUNDS_NEAR):
+            factor, variances, amounts = solution = self._solved(inner, toward, group, logs, sigma)
+            inverse = dtrsm(1.0, factor, unit, lower=True)
+            told = 1.0 - np.einsum("ij,ij->j", inverse, inverse) / variances
+            # Update from a scale's tolerances and its prior (MacKay 1992, equation 4.10).
+            spent, squares = members @ told, members @ (np.square(amounts) / variances)
+            steps = (squares - spent - logs / SPREAD**2) / (2.0 * np.maximum(spent, 0.5) + 1.0 / SPREAD**2)
+            steps = np.minimum(np.maximum(steps, -_FARTHEST), _FARTHEST)
+            moved = np.minimum(np.maximum(logs + steps, _LOG_SMALLEST), _LOG_MOST)
+            rss = self._square - 2.0 * float(amounts @ toward) + float(amounts @ inner @ amounts)
+            free = max(self._rows - float(told.sum()), 1.0)
+            quieter = 0.5 * math.log(max(rss, 1e-300) / free) - math.log(sigma)
+            quieter = min(max(quieter, -_FARTHEST), _FARTHEST)
+            if done and max(np.abs(moved - logs).max(), abs(quieter)) < STILL:
+                break
+            logs = moved
+            sigma = max(sigma * math.exp(quieter), _QUIETEST * self._noise)
+        else:
+            solution = self._solved(inner, toward, group, logs, sigma)
+        worth = self._evidence(solution, toward, sigma)
+        scales = Scales(*np.exp(logs).tolist())
+        worth -= scales.doubt + _volume(spent)
+        if math.exp(logs[members.any(axis=1)].max()) < _MAY_BE_EXACT:
+            exact = self._solved(inner, toward, group, np.full(SCALES, _LOG_SMALLEST), sigma)
+            if (evidence := self._evidence(exact, toward, sigma)) > worth:
+                worth, solution, scales = evidence, exact, Scales(*[SMALLEST] * SCALES)
+        worth += self._outliers - self._cost(chosen) - NAMED * scales.several_times
+        factor, _, amounts = solution
+        return Together(chosen, worth, scales, sigma, spent, amounts, factor, columns)
+
+    def shown(self, here: Together) -> NDArray[np.bool_]:
+        """Return True for each scale without whose tolerances the data would be much less probable (4,)."""
+        inner, toward = self._inner[np.ix_(here.columns, here.columns)], self._toward[here.columns]
+        group = self._group(here.columns)
+        whole = self._worth(inner, toward, group, np.log(here.scales), here.sigma)
+        without = []
+        for g in range(SCALES):
+            logs = np.log(here.scales)
+            logs[g] = _LOG_SMALLEST
+            without.append(self._worth(inner, toward, group, logs, here.sigma))
+        return whole - np.array(without) > _SHOWN
+
+    def largest(self, here: Together) -> FloatArray:
+        """Return the largest scales (4,), each beside the others as they are, that the data do not rule out."""
+        inner, toward = self._inner[np.ix_(here.columns, here.columns)], self._toward[here.columns]
+        group, found = self._group(here.columns), np.array(here.scales)
+        for g in range(SCALES):
+            logs, best = np.log(here.scales), -np.inf
+            while logs[g] < _LOG_MOST:
+                worth = self._worth(inner, toward, group, logs, here.sigma)
+                best = max(best, worth)
+                if worth < best - _RULED_OUT:
+                    break
+                logs[g] = min(logs[g] + _FINER, _LOG_MOST)
+            found[g] = np.exp(logs[g])
+        return found
+
+    def _group(self, columns: NDArray[np.intp]) -> NDArray[np.int64]:
+        """Return the scale of each column (p,); -1 where it is not a tolerance."""
+        group = np.full(len(columns), -1)
+        group[self._nuisances : self._nuisances + self._tolerances] = self._of_scale
+        return group
+
+    def _worth(self, inner: FloatArray, toward: FloatArray, group: np.ndarray, logs: FloatArray, sigma: float) -> float:
+        """Return the evidence of scales and noise [nats]."""
+        return self._evidence(self._solved(inner, toward, group, logs, sigma), toward, sigma)
+
+    def _evidence(self, solution: _Solution, toward: FloatArray, sigma: float) -> float:
+        """Return the evidence of the scales and the noise of a solution [nats]."""
+        factor, variances, amounts = solution
+        left = self._square - float(amounts @ toward)
+        evidence = -0.5 * left / sigma**2 - self._rows * float(np.log(sigma))
+        return evidence - float(np.log(factor.diagonal()).sum()) - 0.5 * float(np.log(variances).sum())
+
+    def _solved(
+        self, inner: FloatArray, toward: FloatArray, group: np.ndarray, logs: FloatArray, sigma: float
+    ) -> _Solution:
+        """Return the factor of the precision, prior variances (p,) and amounts (p,), in units of `_units`."""
+        # The last of the scales stands for columns that are no tolerances.
+        variances = np.append(np.exp(2.0 * logs), 1.0)[group]
+        precision = inner / sigma**2
+        diagonal = precision.reshape(-1)[:: len(precision) + 1]
+        squares = diagonal.copy()
+        diagonal += 1.0 / variances + _ROUNDED_OFF * squares
+        factor, failed = dpotrf(precision, lower=True, clean=False)
+        if failed:
+            diagonal += _ONE_BEYOND_ROUNDING * squares
+            factor = dpotrf(precision, lower=True, clean=False)[0]
+        return factor, variances, dpotrs(factor, toward / sigma**2, lower=True)[0]
+
+    def causes(self, here: Together) -> list[Effect]:
+        """Return the causes of a set, with their amounts."""
+        found: dict[Identity, Effect] = {}
+        for k in here.chosen:
+            effect, places = self.effects[k], self._places[k]
+            one = found.get(effect.identity, effect)
+            free = None if effect.free is None else tuple(sorted({*effect.free, *(one.free or ())}))
+            values = one.values.copy()
+            values[effect.amounts] = here.amounts[np.searchsorted(here.columns, places)] * self._units[places]
+            found[effect.identity] = replace(effect, free=free).with_values(values)
+        return [cause.freeing(cause.free) for cause in found.values()]
+
+
+def _usual(effects: Sequence[Effect]) -> FloatArray:
+    """Return the usual sizes of the amounts of effects (p,)."""
+    return np.array([effect.parameters[k].usual for effect in effects for k in effect.amounts])
+
+
+def _columns(fit: Fit, effects: Sequence[Effect]) -> Iterator[FloatArray]:
+    """Yield the weighted derivatives (n, 3, p) by the amounts of each effect."""
+    key, columns = None, np.empty(0)
+    for effect in effects:
+        if effect.key != key:
+            key, columns = effect.key, fit.weighted(fit.run.columns(effect))
+        yield columns[:, :, effect.amounts]
+
+
+def _parts(effect: Effect) -> list[tuple[object, ...]]:
+    """Return the groups in which one number of an effect may come: its shifts or its turns, and all of it."""
+    if not effect.kind.in_parts:
+        return []
+    unit = effect.parameters[effect.amounts[0]].name.rpartition("_")[2]
+    return [(effect.key, unit), (effect.key,)]
+
+
+def _volume(spent: FloatArray) -> float:
+    """Return what integrating over the scales costs beyond taking the best, from the data spent on each (4,) [nats]."""
+    return float(0.5 * np.log1p(2.0 * spent * SPREAD**2).sum())
+
+
+def _in_groups(
+    matrix: FloatArray, vector: FloatArray, groups: Sequence[NDArray[np.intp]]
+) -> tuple[FloatArray, FloatArray]:
+    """Return half of v' M⁻¹ v and of ln |M| for the part M, v of a matrix (p, p) and a vector (p,) in each group."""
+    sizes, squares, volumes = np.array([len(group) for group in groups]), *np.empty((2, len(groups)))
+    for size in np.unique(sizes).tolist():
+        some = np.flatnonzero(sizes == size)
+        places = np.stack([groups[k] for k in some.tolist()])
+        if size == 1:
+            alone = matrix.diagonal()[places[:, 0]]
+            squares[some], volumes[some] = 0.5 * np.square(vector[places[:, 0]]) / alone, 0.5 * np.log(alone)
+            continue
+        matrices, vectors = matrix[places[:, :, None], places[:, None, :]], vector[places]
+        squares[some] = 0.5 * (vectors * np.linalg.solve(matrices, vectors[:, :, None])[:, :, 0]).sum(axis=1)
+        volumes[some] = 0.5 * np.linalg.slogdet(matrices)[1]
+    return squares, volumes
+
+
+def _without(chosen: tuple[int, ...], group: Sequence[int]) -> tuple[int, ...]:
+    return tuple(k for k in chosen if k not in group)
+
+
+def _better(tried: Sequence[Together], here: Together) -> Together | None:
+    best = max(tried, key=lambda one: one.worth, default=None)
+    return best if best is not None and best.worth > here.worth + STILL else None
