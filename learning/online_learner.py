@@ -184,7 +184,7 @@ class OnlineLearner:
             regime, claims = self._regimes.present, self._regimes.claims
             if regime is None or claims.belief is None or not self._solving.works_on(regime.task_number):
                 return None
-            seen, _ = regime.memory.some(regime.memory.count, LOOKED_BACK)
+            seen, *_ = regime.memory.some(regime.memory.count, LOOKED_BACK)
             q, x, _ = regime.memory.since(self._solving.fed - LOOKED_BACK, LOOKED_BACK)  # pairs that the solver knows
             return LearnerEvidence(
                 nominal=self.nominal,
@@ -433,7 +433,7 @@ class OnlineLearner:
             cov = regime.memory.cov_since(solving.fed, FEED_PAIRS)
             turns = regime.memory.turns_since(solving.fed, FEED_PAIRS)
         if len(q):
-            solving.feed(fed, q, x, cov, turns if np.isfinite(turns).any() else None)
+            solving.feed(q, x, fed, cov, turns if np.isfinite(turns).any() else None)
         if asking:
             solving.ask()
         return asking or len(q) > 0

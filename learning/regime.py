@@ -288,10 +288,12 @@ class Regime:
     def take(self, solved: Solved, model: LearntModel, fed: int) -> None:
         """Store a solution of this regime's task, for one of the models; the solver has `fed` pairs."""
         self.models.take(solved.name, model)
-        q, x = self.memory.some(fed, LOOKED_BACK)
+        q, x, cov = self.memory.some(fed, LOOKED_BACK)
         neighbours = follow_a_path(self.models.prior, q)
-        errors = x - model.predict(q)
-        self._claims.solution_taken(solved.name, errors, solved.belief, solved.wide, neighbours=neighbours)
+        errors, variances = x - model.predict(q), cov.diagonal(axis1=1, axis2=2)
+        self._claims.solution_taken(
+            solved.name, errors, solved.belief, solved.wide, neighbours=neighbours, variances=variances
+        )
         self._judge_late(solved.name, model, solved.pairs, fed)
         self._choose()
         if self.monitor.wants_reference and solved.pairs == fed:

@@ -97,16 +97,16 @@ class PairMemory:
         q, x, _ = self.since(0)
         return q, x
 
-    def some(self, end: int, limit: int) -> tuple[FloatArray, FloatArray]:
-        """Return at most `limit` of the kept pairs before the one numbered `end`, in order: q (n, d), x (n, 3).
+    def some(self, end: int, limit: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return at most `limit` of the kept pairs before the one numbered `end`, in order, as `append` takes them.
 
         They come in evenly spread runs of `RUN` neighbours, which show the errors that neighbours on a path share.
         """
         kept = max(end - self._oldest, 0)
-        if kept <= limit:
-            return self._numbered(np.arange(self._oldest, end))
         begins = np.linspace(self._oldest, end - RUN, max(limit // RUN, 1)).astype(np.intp)
-        return self._numbered((begins[:, None] + np.arange(min(RUN, limit))).ravel())
+        runs = (begins[:, None] + np.arange(min(RUN, limit))).ravel()
+        numbers = np.arange(self._oldest, end) if kept <= limit else runs
+        return *self._numbered(numbers), self._cov[numbers % len(self._q)]
 
     def at(self, places: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return the kept pairs at places 0 (the oldest) ... len − 1: q (n, d), x (n, 3)."""

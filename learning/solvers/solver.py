@@ -194,7 +194,7 @@ class DirectSolver:
             yield from self._solved_of_some(task)
         self._solved_at = self._pairs
         wide = fitted_belief(self._before, self._q, self._x, self._cov)
-        made = _ways_made(wide, task)
+        made = _ways_made(wide, task, self._q)
         residual_due = self._pairs >= GROWTH * self._residual_at
         turns = self._orientations if self._orientations is not None and self._orientations.due else None
         rigid = _solved_chain(task, self._pairs, wide, made)
@@ -219,7 +219,7 @@ class DirectSolver:
         if some >= _Settings.fewest_first:
             wide = fitted_belief(self._before, *self._first(some))
             pairs = self._pairs - len(self._q) + some
-            yield replace(_solved_chain(task, pairs, wide, _ways_made(wide, task)), last=False)
+            yield replace(_solved_chain(task, pairs, wide, _ways_made(wide, task, self._q[:some])), last=False)
 
     def _solve_exact(self, task: Task, learner: ExactLearner, *, last: bool) -> Solved:
         """Solve least squares around the rigid chain.
@@ -265,8 +265,8 @@ class DirectSolver:
         return self._folded_residual
 
 
-def _ways_made(wide: ChainBelief, task: Task) -> list[Tolerances]:
-    return [] if task.tolerances is None else workmanship(wide, task.tolerances)
+def _ways_made(wide: ChainBelief, task: Task, q: FloatArray) -> list[Tolerances]:
+    return [] if task.tolerances is None else workmanship(wide, task.tolerances, q)
 
 
 def _solved_chain(task: Task, pairs: int, wide: ChainBelief, made: Sequence[Tolerances]) -> Solved:
@@ -378,7 +378,7 @@ class SolverClient:
         return True
 
     def feed(
-        self, fed: int, q: FloatArray, x: FloatArray, cov: FloatArray | None = None, turns: FloatArray | None = None
+        self, q: FloatArray, x: FloatArray, fed: int, cov: FloatArray | None = None, turns: FloatArray | None = None
     ) -> None:
         """Send pairs as `Solver.learn` takes them; with them the solver has `fed` of the task's."""
         self._solver.learn(q, x, cov, turns)
