@@ -20,7 +20,13 @@ _MOST_ERRORS = 500
 _ALIKE = 1e-6
 
 
-def error_covariances(errors: FloatArray, stated: FloatArray, readings: FloatArray) -> FloatArray | None:
+def tells_directions(stated: FloatArray) -> bool:
+    """Return True if any of the stated covariances (n, 3, 3), NaN where there is none, is anisotropic."""
+    values = np.linalg.eigvalsh(stated[~np.isnan(stated).any(axis=(1, 2))])
+    return bool((values[:, 2] - values[:, 0] > _ALIKE * values[:, 2]).any())
+
+
+def error_covariances(errors: FloatArray, stated: FloatArray, readings: FloatArray) -> FloatArray:
     """Estimate the covariances (n, 3, 3) [m²] of errors, whose stated ones may be wrong in size and in shape.
 
     Each is a C + c D + r J Jᵀ + b 1, with the shares a, c, r, b ≥ 0 of all that make the errors most probable: D is the
@@ -29,19 +35,11 @@ def error_covariances(errors: FloatArray, stated: FloatArray, readings: FloatArr
 
     Args:
         errors: of a model's predictions (n, 3) [m].
-        stated: covariances of the measured positions (n, 3, 3) [m²], NaN where none is stated.
+        stated: covariances of the measured positions (n, 3, 3) [m²], NaN where none is stated; one at least is.
         readings: J, derivatives of the positions by the joints (n, 3, d) [m/rad].
-
-    Returns:
-        None if nothing tells directions apart: each stated covariance is isotropic.
     """
-    missing = np.isnan(stated)
-    if missing.all():
-        return None
-    stated = np.where(missing, np.eye(3) * float(np.nanmean(stated.diagonal(axis1=1, axis2=2))), stated)
+    stated = np.where(np.isnan(stated), np.eye(3) * float(np.nanmean(stated.diagonal(axis1=1, axis2=2))), stated)
     values, axes = np.linalg.eigh(stated)
-    if (values[:, 2] - values[:, 0] <= _ALIKE * values[:, 2]).all():
-        return None
     least_sure = axes[:, :, 2] * np.sqrt(values[:, 2:])
     parts = np.stack(
         [

@@ -430,8 +430,9 @@ class OnlineLearner:
                     return True
                 regime.ask()
             q, x, fed = regime.memory.since(solving.fed, FEED_PAIRS)
-            cov = regime.memory.cov_since(solving.fed, FEED_PAIRS)
-            turns = regime.memory.turns_since(solving.fed, FEED_PAIRS)
+            cov, turns = (
+                each(solving.fed, FEED_PAIRS) for each in (regime.memory.cov_since, regime.memory.turns_since)
+            )
         if len(q):
             solving.feed(q, x, fed, cov, turns if np.isfinite(turns).any() else None)
         if asking:

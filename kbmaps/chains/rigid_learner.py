@@ -23,13 +23,13 @@ from kbmaps.chains.parameters import (
     parse_tolerances,
 )
 from kbmaps.chains.report import ChainReport, Scatter, chain_report
-from kbmaps.chains.rigid_fit import RigidFit, fit_chain
+from kbmaps.chains.rigid_fit import RigidFit, fit_chain, rough_fit
 from kbmaps.errors import DegenerateDataError, ModelFormatError, NonFiniteError, SettingError, ShapeError
 from kbmaps.model import Estimate, Model, near_data, widest
 from kbmaps.packed import complete, named, pack, restoring, unpack
 from kbmaps.pairs import Pairs, checked_pairs, of_covariances, stored_pairs, with_units
 from kbmaps.robust import claimed_sigma, student
-from kbmaps.variance_components import error_covariances, inverse_roots
+from kbmaps.variance_components import error_covariances, inverse_roots, tells_directions
 
 
 class _Settings:
@@ -273,18 +273,19 @@ class RigidLearner(Model):
         Raises:
             ShapeError: they are of other pairs.
         """
-        told, fit = numbers("stated", stated), self._fitted()
+        told = numbers("stated", stated)
         if told.shape != (self.pairs, 3, 3):
             raise ShapeError("stated", f"({self.pairs}, 3, 3)", told.shape)
-        if fit is None:
+        if not tells_directions(told):
             return
-        x, jacobian = self._parameters.linearised(fit.belief.mean, self._q)
+        alike = Pairs(self._q, self._x, np.ones(self.pairs), False, None, self._common)
+        change, errors = rough_fit(self._prior, alike, self._start())
+        _, jacobian = self._parameters.linearised(change, self._q)
         readings = jacobian[:, :, self._parameters.zeros][:, :, ~self.nominal.prismatic]
-        found = error_covariances(self._x - x - self._common @ fit.common, told, readings)
-        if found is not None:
-            self._sigma = np.full(self.pairs, np.nan)
-            self._shape = math.sqrt(float(np.trace(found, axis1=1, axis2=2).mean()) / 3.0) * inverse_roots(found)
-            self._take(fit_chain(self._prior, self.data, fit.belief.mean, near=True))
+        found = error_covariances(errors, told, readings)
+        self._sigma = np.full(self.pairs, np.nan)
+        self._shape = math.sqrt(float(np.trace(found, axis1=1, axis2=2).mean()) / 3.0) * inverse_roots(found)
+        self._take(fit_chain(self._prior, self.data, change, near=True))
 
     def predict(self, q: ArrayLike) -> FloatArray:
         angles = rows_or_vector("q", q, self.joints)

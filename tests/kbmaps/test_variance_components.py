@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kbmaps.arrays import FloatArray
-from kbmaps.variance_components import error_covariances
+from kbmaps.variance_components import error_covariances, tells_directions
 
 PAIRS = 400
 
@@ -35,7 +35,6 @@ def with_depth(camera: FloatArray, factor: float) -> FloatArray:
 def test_the_stated_shape_is_corrected_by_the_errors(factor: float, reading: float, size: float) -> None:
     errors, whole, camera, readings = drawn(np.random.default_rng(0), 8.0, reading)
     found = error_covariances(errors, size * with_depth(camera, factor), readings)
-    assert found is not None
     mismatch = np.linalg.eigvals(np.linalg.solve(whole, found)).real
     assert 0.75 < np.median(mismatch) < 1.3
     assert np.sqrt(np.square(np.log(mismatch)).mean()) < 0.35
@@ -45,7 +44,6 @@ def test_outliers_do_not_change_it() -> None:
     errors, whole, camera, readings = drawn(np.random.default_rng(1), 8.0, 0.0)
     errors[::20] *= 100.0
     found = error_covariances(errors, camera, readings)
-    assert found is not None
     assert np.median(np.linalg.eigvals(np.linalg.solve(whole, found)).real) < 1.5
 
 
@@ -53,12 +51,10 @@ def test_outliers_do_not_change_it() -> None:
     "stated", [np.full((PAIRS, 3, 3), np.nan), np.zeros((PAIRS, 3, 3)), np.tile(np.eye(3), (PAIRS, 1, 1))]
 )
 def test_nothing_stated_or_the_same_in_all_directions_says_nothing(stated: FloatArray) -> None:
-    errors, _, _, readings = drawn(np.random.default_rng(2), 8.0, 0.0)
-    assert error_covariances(errors, stated, readings) is None
+    assert not tells_directions(np.broadcast_to(stated, (PAIRS, 3, 3)))
 
 
 def test_errors_of_rounding_alone_have_covariances() -> None:
     _, _, camera, readings = drawn(np.random.default_rng(3), 8.0, 0.0)
     found = error_covariances(np.zeros((PAIRS, 3)), camera, readings)
-    assert found is not None
     assert (np.linalg.eigvalsh(found) > 0.0).all()
