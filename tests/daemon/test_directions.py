@@ -11,7 +11,7 @@ from guided_arm import JOINTS, built_chain, make_pair, near, new_learning, nomin
 from bodyschema.interfaces.records import FloatArray, frozen_array
 from bodyschema.learning.online_learner import OnlineLearner
 from bodyschema.learning.solvers.solver import DirectSolver, Task, fitted_belief, fitted_residual
-from kbmaps import ChainTolerances, RigidChain
+from kbmaps import ChainTolerances, ResidualLearner, RigidChain, RigidLearner
 
 NOMINAL = nominal_model()
 BELIEF = NOMINAL.belief(NOMINAL.chain, ChainTolerances(axes=0.05, points=0.015, zeros=0.05, tool=0.03))
@@ -178,3 +178,14 @@ def test_a_checkpoint_without_covariances_is_read(taught) -> None:
     while again.work():
         pass
     assert "cov" not in again.state().arrays
+
+
+@pytest.mark.parametrize("kind", [RigidLearner, ResidualLearner])
+def test_weights_are_stored_with_a_model(kind: type[RigidLearner | ResidualLearner]) -> None:
+    seen = Seen(7, ONE_CAMERA)
+    learner = kind(BELIEF.parameters.reference, ChainTolerances(), BELIEF)
+    learner.learn(seen.q, seen.x)
+    learner.weigh(seen.cov)
+    again = kind.from_bytes(learner.to_bytes())
+    np.testing.assert_allclose(again.predict(seen.test), learner.predict(seen.test), atol=1e-7)
+    np.testing.assert_allclose(again.estimate(seen.test).sigma, learner.estimate(seen.test).sigma, rtol=1e-2)
