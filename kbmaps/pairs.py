@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import BoolArray, FloatArray, numbers, rows, rows_or_vector
+from kbmaps.arrays import BoolArray, FloatArray, IntArray, numbers, rows, rows_or_vector
 from kbmaps.errors import ModelFormatError, NonFiniteError, SettingError, ShapeError
 from kbmaps.packed import restoring
 
@@ -23,7 +22,7 @@ class Pairs:
     x: FloatArray
     unit: FloatArray  # 1-sigma (n,) of each coordinate [m] up to a common factor; the geometric mean of all directions
     known: bool  # whether that factor is 1; otherwise it has to be estimated
-    # (n, 3, 3) of determinant 1: what makes an error as large in all directions; None where it is
+    # (n, 3, 3): what makes an error as large in all directions; None where it is. Of determinant 1 if `known`
     shape: FloatArray | None = None
     # (n, 3, k) [m], the errors that k unknowns shared by all pairs bring at 1 sigma of each; None: none
     common: FloatArray | None = None
@@ -31,8 +30,8 @@ class Pairs:
     def __len__(self) -> int:
         return len(self.q)
 
-    def chosen(self, mask: BoolArray) -> Pairs:
-        """Return the pairs selected by the mask (n,), in the same units."""
+    def chosen(self, mask: BoolArray | IntArray) -> Pairs:
+        """Return the pairs selected by the mask (n,), or at these places, in the same units."""
         shape, common = (None if each is None else each[mask] for each in (self.shape, self.common))
         return Pairs(self.q[mask], self.x[mask], self.unit[mask], self.known, shape, common)
 
@@ -116,9 +115,3 @@ def of_covariances(covariances: ArrayLike, pairs: int) -> tuple[FloatArray, Floa
         raise SettingError("every covariance must be symmetric and positive definite") from error
     sigma = np.cbrt(np.diagonal(roots, axis1=1, axis2=2).prod(axis=1))
     return sigma, sigma[:, None, None] * np.linalg.inv(roots)
-
-
-def runs(told: BoolArray) -> list[slice]:
-    """Return runs of pairs that all have a sigma, or all lack one (n,), so that each can be learnt in one call."""
-    ends = [0, *(np.flatnonzero(told[1:] != told[:-1]) + 1).tolist(), len(told)]
-    return [slice(start, end) for start, end in itertools.pairwise(ends)] if len(told) else []

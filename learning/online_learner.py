@@ -184,7 +184,7 @@ class OnlineLearner:
             regime, claims = self._regimes.present, self._regimes.claims
             if regime is None or claims.belief is None or not self._solving.works_on(regime.task_number):
                 return None
-            seen, _ = regime.memory.some(regime.memory.count, LOOKED_BACK)
+            seen, *_ = regime.memory.some(regime.memory.count, LOOKED_BACK)
             q, x, _ = regime.memory.since(self._solving.fed - LOOKED_BACK, LOOKED_BACK)  # pairs that the solver knows
             return LearnerEvidence(
                 nominal=self.nominal,
@@ -224,7 +224,8 @@ class OnlineLearner:
             self._newest_utc = pair.utc
             regime = self._regimes.present
             if regime is None:
-                self._regimes.waiting.append(pair.q[None], pair.x[None], None if pair.R is None else pair.R[None])
+                turn = None if pair.R is None else pair.R[None]
+                self._regimes.waiting.append(pair.q[None], pair.x[None], pair.cov[None], turn)
             elif self._together_s == 0.0:
                 self._judged(regime, [pair], np.array([not regime.learn(pair)]))
             else:
@@ -398,8 +399,8 @@ class OnlineLearner:
             if not self._regimes.fitting.due(memory.count):
                 return False
             count, fitting = memory.count, copy.copy(self._regimes.fitting)
-            q, x = memory.all()
-        fit = fitting.fit(q, x)
+            (q, x), cov = memory.all(), memory.cov_since(0)
+        fit = fitting.fit(q, x, cov)
         with self._lock:
             self._judge()
             if memory is self._regimes.memory:  # else another regime has begun
@@ -429,9 +430,11 @@ class OnlineLearner:
                     return True
                 regime.ask()
             q, x, fed = regime.memory.since(solving.fed, FEED_PAIRS)
-            turns = regime.memory.turns_since(solving.fed, FEED_PAIRS)
+            cov, turns = (
+                each(solving.fed, FEED_PAIRS) for each in (regime.memory.cov_since, regime.memory.turns_since)
+            )
         if len(q):
-            solving.feed(q, x, fed, turns if np.isfinite(turns).any() else None)
+            solving.feed(q, x, fed, cov, turns if np.isfinite(turns).any() else None)
         if asking:
             solving.ask()
         return asking or len(q) > 0

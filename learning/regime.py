@@ -211,27 +211,30 @@ class Regime:
         turns = np.array([NO_TURN if pair.R is None else pair.R for pair in pairs]) if turned else None
         for pair in turned:
             self._learn_turn(pair.q, pair.R, pair.cov_R)
-        self._keep(q, x, turns)
+        self._keep(q, x, np.array([pair.cov for pair in pairs]), turns)
         self._replays_due += self._replays_per_pair * len(pairs)
 
-    def learn_waiting(self, q: FloatArray, x: FloatArray, turns: FloatArray, belief: ChainBelief) -> None:
+    def learn_waiting(
+        self, q: FloatArray, x: FloatArray, cov: FloatArray, turns: FloatArray, belief: ChainBelief
+    ) -> None:
         """Learn pairs, q (n, d) and x (n, 3), that waited for the prior: each once, in their order.
 
         Args:
             q: joint values (n, d).
             x: positions (n, 3).
+            cov: their covariances (n, 3, 3) [m²], NaN where a pair has none.
             turns: their orientations, quaternions (n, 4), NaN where a pair has none.
             belief: posterior of the chain from them.
         """
         self._claims.fitted(belief)
         variances = np.full((1, 3), belief.noise**2)
-        for row_q, row_x, turn in zip(q, x, turns, strict=True):
+        for row_q, row_x, row_cov, turn in zip(q, x, cov, turns, strict=True):
             predicted = self.models.predict(INSTANT, row_q)
             predictions = self.models.predictions(row_q[None], predicted[None])
             self._claims.predicted(QueryPoints(row_q[None]), row_x[None], predictions, variances)
             self.models.learn(row_q, row_x - predicted, np.inf)
             self._learn_turn(row_q, turn)
-            self._keep(row_q[None], row_x[None], turn[None])
+            self._keep(row_q[None], row_x[None], row_cov[None], turn[None])
         self._choose()
         self._replays_due += self._replays_per_pair * len(q)
 
@@ -257,12 +260,12 @@ class Regime:
 
         They may still belong to the old tool.
         """
-        (q, x), turns = self.memory.all(), self.memory.turns_since(0)
+        (q, x), cov, turns = self.memory.all(), self.memory.cov_since(0), self.memory.turns_since(0)
         belongs = sound(np.linalg.norm(x - prior.predict(q), axis=1), self._claims.noise_m)
         if belongs.all():
             return 0
         self.memory.clear()
-        self.memory.append(q[belongs], x[belongs], turns[belongs])
+        self.memory.append(q[belongs], x[belongs], cov[belongs], turns[belongs])
         self._order.restart()
         self._claims.forget_contest()
         self.task_number = next(self._task_numbers)
@@ -285,10 +288,12 @@ class Regime:
     def take(self, solved: Solved, model: LearntModel, fed: int) -> None:
         """Store a solution of this regime's task, for one of the models; the solver has `fed` pairs."""
         self.models.take(solved.name, model)
-        q, x = self.memory.some(fed, LOOKED_BACK)
+        q, x, cov = self.memory.some(fed, LOOKED_BACK)
         neighbours = follow_a_path(self.models.prior, q)
-        errors = x - model.predict(q)
-        self._claims.solution_taken(solved.name, errors, solved.belief, solved.wide, neighbours=neighbours)
+        errors, variances = x - model.predict(q), cov.diagonal(axis1=1, axis2=2)
+        self._claims.solution_taken(
+            solved.name, errors, solved.belief, solved.wide, neighbours=neighbours, variances=variances
+        )
         self._judge_late(solved.name, model, solved.pairs, fed)
         self._choose()
         if self.monitor.wants_reference and solved.pairs == fed:
@@ -335,7 +340,7 @@ class Regime:
         """Resume from a state of a regime with this prior and arm."""
         nets = {name.removeprefix(NET): net for name, net in arrays.items() if name.startswith(NET)}
         self.models.restore(nets, self._claims.residual)
-        self.memory.restore(arrays["q"], arrays["x"], header.kept_of, arrays.get("turns"))
+        self.memory.restore(arrays["q"], arrays["x"], header.kept_of, arrays.get("cov"), arrays.get("turns"))
         if header.orientation is not None:
             self.orientations.restore(header.orientation)
         self.gate.restore(arrays["doubted_q"], arrays["doubted_x"], header.doubted_in_a_row)
@@ -360,8 +365,10 @@ class Regime:
         if turn is not None and np.isfinite(turn).all():
             self.orientations.learn(q, turn, cov, self._claims.support)
 
-    def _keep(self, q: FloatArray, x: FloatArray, turns: FloatArray | None = None) -> None:
-        self.memory.append(q, x, turns)
+    def _keep(
+        self, q: FloatArray, x: FloatArray, cov: FloatArray | None = None, turns: FloatArray | None = None
+    ) -> None:
+        self.memory.append(q, x, cov, turns)
         self._claims.learnt(q)
 
     @property

@@ -21,7 +21,7 @@ from bodyschema.learning.nominal import PAIRS_TO_REFIT, NominalModel, chain_tole
 from bodyschema.learning.regime import Regime
 from bodyschema.learning.replay_memory import PairMemory
 from bodyschema.learning.solvers.solver import fitted_belief
-from bodyschema.learning.state import NET, Counters, Curve, LearningHeader, LearningState, StateError
+from bodyschema.learning.state import NET, PAIRS, Counters, Curve, LearningHeader, LearningState, StateError
 from bodyschema.learning.uncertainty import UncertaintyTracker
 from kbmaps import ChainBelief, ChainTolerances, DegenerateDataError, Explanation, KBMap, RigidChain
 
@@ -75,7 +75,7 @@ class Fitting:
         """Stop fitting. `hand`: a chain that gives the orientation of the hand."""
         self._before, self.chain, self.due_at, self.is_first = None, hand, None, False
 
-    def fit(self, q: FloatArray, x: FloatArray) -> Fit | None:
+    def fit(self, q: FloatArray, x: FloatArray, cov: FloatArray) -> Fit | None:
         """Return the prior that fits pairs q (n, d) [rad] and x (n, 3) [m] best; None if they do not determine it.
 
         With an unknown frame, that is the most probable chain. A frame alone, fitted to an inaccurate nominal chain,
@@ -87,7 +87,7 @@ class Fitting:
             placed = self._nominal.placed(q, x)
         except DegenerateDataError:
             return None
-        belief = fitted_belief(self._nominal.belief(placed, self._tolerances), q, x)
+        belief = fitted_belief(self._nominal.belief(placed, self._tolerances), q, x, cov)
         return Fit(belief.chain.to_kbmap(self._nominal.bases), placed, belief)
 
     def done(self, pairs: int, fit: Fit | None) -> None:
@@ -171,7 +171,7 @@ class Regimes:
         regimes.claims.restore(header.claims, arrays)
         regimes.change = header.change
         if header.belief is None:
-            regimes.waiting.restore(arrays["q"], arrays["x"], header.kept_of, arrays.get("turns"))
+            regimes.waiting.restore(arrays["q"], arrays["x"], header.kept_of, arrays.get("cov"), arrays.get("turns"))
         else:
             arm = KnownArm.from_bytes(header.belief, regimes._tolerances, header.residual)
             regimes.present = regimes._regime(KBMap(nominal.bases, arrays[NET + PRIOR]), arm)
@@ -193,9 +193,9 @@ class Regimes:
             change=self.change,
         )
         arrays = self.claims.arrays() | self.fitting.arrays() | {"q": q, "x": x}
-        turns = self.memory.turns_since(0)
-        if np.isfinite(turns).any():
-            arrays["turns"] = turns
+        for name, some in (("cov", self.memory.cov_since(0)), ("turns", self.memory.turns_since(0))):
+            if np.isfinite(some).any():
+                arrays[name] = some
         if self.present is not None:
             arrays |= self.present.store(header)
         return LearningState(header, arrays)
@@ -209,7 +209,7 @@ class Regimes:
         """Return the state as if the pairs from number `first` of the current regime had not come."""
         state = self.state(counters, curve)
         kept = self.memory.place_of(first)
-        arrays = {name: each[:kept] if name in ("q", "x", "turns") else each for name, each in state.arrays.items()}
+        arrays = {name: each[:kept] if name in PAIRS else each for name, each in state.arrays.items()}
         if "doubted_q" in arrays:
             arrays |= {name: arrays[name][:0] for name in ("doubted_q", "doubted_x")}
         state.header.doubted_in_a_row, state.header.kept_of = 0, min(first, self.memory.count)
@@ -247,7 +247,8 @@ class Regimes:
         q, x = noticed.q[noticed.first :], noticed.x[noticed.first :]
         origin = Origin(noticed, regime.arm)
         found = origin.explain(q, x)
-        if not origin.is_better(found, q, x):
+        cov = noticed.cov[noticed.first :]
+        if not origin.is_better(found, q, x, cov):
             regime.monitor.refute()
             return False
         self._look_at = int(LOOK_AGAIN * len(q)) + 1
@@ -261,7 +262,8 @@ class Regimes:
             kinds=_described(found),
             moved_m=found[0].moved_m,
         )
-        self._begin_adapted(regime, origin.adapt(found, q, x), q, x, noticed.turns[noticed.first :])
+        turns = noticed.turns[noticed.first :]
+        self._begin_adapted(regime, origin.adapt(found, q, x, cov), q, x, cov, turns)
         self._origin = origin
         return True
 
@@ -280,19 +282,22 @@ class Regimes:
         named = self.change.named
         other = named is not None and (was is None or (was.name, was.joint) != (named.name, named.joint))
         if other and self.memory.complete:
-            self._begin_adapted(self.present, origin.adapt(found, q, x), q, x, self.memory.turns_since(0))
+            cov, turns = self.memory.cov_since(0), self.memory.turns_since(0)
+            self._begin_adapted(self.present, origin.adapt(found, q, x, cov), q, x, cov, turns)
         self._look_at = int(LOOK_AGAIN * len(q)) + 1
         if len(q) > NAMED_WITHIN:
             self._origin = None
         return other
 
-    def _begin_adapted(self, regime: Regime, adapted: Adapted, q: FloatArray, x: FloatArray, turns: FloatArray) -> None:
+    def _begin_adapted(
+        self, regime: Regime, adapted: Adapted, q: FloatArray, x: FloatArray, cov: FloatArray, turns: FloatArray
+    ) -> None:
         """Begin the regime that keeps everything except the changed part, with pairs q (n, d), x (n, 3) since then."""
         belongs = sound(np.linalg.norm(x - adapted.prior.predict(q), axis=1), self.claims.noise_m)
         self.fitting.rest(adapted.belief.chain)
         self.claims.change_tool(max(math.sqrt(3.0) * adapted.belief.noise, self.claims.noise_m), regime.answering)
         self.present = self._regime(adapted.prior, adapted.arm)
-        self.present.learn_waiting(q[belongs], x[belongs], turns[belongs], adapted.belief)
+        self.present.learn_waiting(q[belongs], x[belongs], cov[belongs], turns[belongs], adapted.belief)
 
     def fitted(self, fit: Fit | None, pairs: int) -> int:
         """Continue from a fit to the first `pairs` pairs; return the number of new outliers."""
@@ -308,11 +313,11 @@ class Regimes:
 
     def _begin_first(self, fit: Fit, belief: ChainBelief) -> int:
         """Learn the pairs that waited for the frame, except those that the fit contradicts."""
-        (q, x), turns = self.waiting.all(), self.waiting.turns_since(0)
+        (q, x), cov, turns = self.waiting.all(), self.waiting.cov_since(0), self.waiting.turns_since(0)
         belongs = sound(np.linalg.norm(x - fit.prior.predict(q), axis=1), self.claims.noise_m)
         self.waiting.clear()
         self.present = self._regime(fit.prior, self._drawn(fit.chain))
-        self.present.learn_waiting(q[belongs], x[belongs], turns[belongs], belief)
+        self.present.learn_waiting(q[belongs], x[belongs], cov[belongs], turns[belongs], belief)
         return int((~belongs).sum())
 
     def _next(self, regime: Regime, expected_m: float, first_fit: int = PAIRS_TO_REFIT) -> Regime:

@@ -19,6 +19,7 @@ class PairMemory:
     def __init__(self, joints: int, capacity: int) -> None:
         self._q = np.empty((capacity, joints))
         self._x = np.empty((capacity, 3))
+        self._cov = np.full((capacity, 3, 3), np.nan)
         self._turns = np.full((capacity, 4), np.nan)
         self._count = self._first = 0
 
@@ -35,16 +36,20 @@ class PairMemory:
     def __len__(self) -> int:
         return self._count - self._oldest
 
-    def append(self, q: FloatArray, x: FloatArray, turns: FloatArray | None = None) -> None:
+    def append(
+        self, q: FloatArray, x: FloatArray, cov: FloatArray | None = None, turns: FloatArray | None = None
+    ) -> None:
         """Keep pairs, q (n, d) and x (n, 3); drop the oldest to make room.
 
         Args:
             q: joint values (n, d).
             x: positions (n, 3).
-            turns: their orientations, quaternions (n, 4), NaN where a pair has none; None: none has any.
+            cov: their covariances (n, 3, 3) [m²], NaN where a pair has none; None: none has any.
+            turns: their orientations, quaternions (n, 4), likewise.
         """
         places = np.arange(self._count, self._count + len(q)) % len(self._q)
         self._q[places], self._x[places] = q, x
+        self._cov[places] = np.nan if cov is None else cov
         self._turns[places] = np.nan if turns is None else turns
         self._count += len(q)
 
@@ -56,10 +61,17 @@ class PairMemory:
         """Return the number of kept pairs older than the one numbered `count` (from 0)."""
         return min(max(count - self._oldest, 0), len(self))
 
-    def restore(self, q: FloatArray, x: FloatArray, count: int, turns: FloatArray | None = None) -> None:
-        """Hold the pairs q (n, d), x (n, 3), with `turns` as in `turns_since`: the newest of `count`."""
+    def restore(
+        self,
+        q: FloatArray,
+        x: FloatArray,
+        count: int,
+        cov: FloatArray | None = None,
+        turns: FloatArray | None = None,
+    ) -> None:
+        """Hold the newest of `count` pairs, as `append` takes them."""
         self._count = self._first = count - len(q)
-        self.append(q, x, turns)
+        self.append(q, x, cov, turns)
 
     def since(self, count: int, limit: int | None = None) -> tuple[FloatArray, FloatArray, int]:
         """Return the kept pairs from number `count` (from 0) on: q (n, d), x (n, 3), and the count after them."""
@@ -67,27 +79,34 @@ class PairMemory:
         end = self._count if limit is None else min(self._count, begin + limit)
         return *self._numbered(np.arange(begin, end)), end
 
+    def cov_since(self, count: int, limit: int | None = None) -> FloatArray:
+        """Return covariances (n, 3, 3) [m²] of the pairs of `since`: NaN where a pair has none."""
+        return self._cov[self._places_since(count, limit)]
+
     def turns_since(self, count: int, limit: int | None = None) -> FloatArray:
         """Return orientations (n, 4) of the pairs of `since`: quaternions x, y, z, w, NaN where a pair has none."""
+        return self._turns[self._places_since(count, limit)]
+
+    def _places_since(self, count: int, limit: int | None) -> IntArray:
         begin = max(count, self._oldest)
         end = self._count if limit is None else min(self._count, begin + limit)
-        return self._turns[np.arange(begin, end) % len(self._turns)]
+        return np.arange(begin, end) % len(self._q)
 
     def all(self) -> tuple[FloatArray, FloatArray]:
         """Return all kept pairs in order: q (n, d), x (n, 3)."""
         q, x, _ = self.since(0)
         return q, x
 
-    def some(self, end: int, limit: int) -> tuple[FloatArray, FloatArray]:
-        """Return at most `limit` of the kept pairs before the one numbered `end`, in order: q (n, d), x (n, 3).
+    def some(self, end: int, limit: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return at most `limit` of the kept pairs before the one numbered `end`, in order, as `append` takes them.
 
         They come in evenly spread runs of `RUN` neighbours, which show the errors that neighbours on a path share.
         """
         kept = max(end - self._oldest, 0)
-        if kept <= limit:
-            return self._numbered(np.arange(self._oldest, end))
         begins = np.linspace(self._oldest, end - RUN, max(limit // RUN, 1)).astype(np.intp)
-        return self._numbered((begins[:, None] + np.arange(min(RUN, limit))).ravel())
+        runs = (begins[:, None] + np.arange(min(RUN, limit))).ravel()
+        numbers = np.arange(self._oldest, end) if kept <= limit else runs
+        return *self._numbered(numbers), self._cov[numbers % len(self._q)]
 
     def at(self, places: IntArray) -> tuple[FloatArray, FloatArray]:
         """Return the kept pairs at places 0 (the oldest) ... len − 1: q (n, d), x (n, 3)."""

@@ -20,6 +20,8 @@ from bodyschema.learning.uncertainty import UncertaintyState
 BEFORE = "before/"
 # Prefix of stored nets.
 NET = "net_"
+# Arrays with a row for each kept pair.
+PAIRS = ("q", "x", "cov", "turns")
 
 
 # of the learning curve

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.model_bank import INSTANT, PRIOR, RESIDUAL, RIGID, SOLVED, TRUSTED
@@ -279,6 +280,7 @@ class UncertaintyTracker:
         wide: ChainBelief | None = None,
         *,
         neighbours: bool,
+        variances: FloatArray | None = None,
     ) -> None:
         """Record a solution that answers for this model from now on.
 
@@ -288,6 +290,7 @@ class UncertaintyTracker:
             belief: new posterior of the arm; None: unchanged.
             wide: of a chain, the same without the selection of narrower tolerances.
             neighbours: True if these pairs follow a path.
+            variances: of these measurements (n, 3) [m²], NaN where unknown; None: as usual.
         """
         self.errors.setdefault(name, ErrorMemory(self._expected_m))
         self._solved[name] = self._asked
@@ -295,7 +298,8 @@ class UncertaintyTracker:
             self.residual = belief
         elif belief is not None:
             self.belief, self.wide = belief, wide or belief
-        noise = self.errors[PRIOR].noise_variance
+        noise = np.broadcast_to(self.errors[PRIOR].noise_variance, errors.shape)
+        noise = noise if variances is None else np.where(np.isfinite(variances), variances, noise)
         before = self._misfits_before.get(name, self._misfits_before.get(RIGID, np.zeros(3)))
         scatter = 0.0 if belief is None else belief.noise
         self._misfits[name] = model_discrepancy(errors, noise, before, neighbours=neighbours, scatter=scatter)
@@ -417,12 +421,15 @@ def model_discrepancy(
 
     Args:
         errors: measured minus solved (n, 3) [m], in the pairs' order.
-        noise_variance: of the measurements (3,) [m²].
+        noise_variance: of the measurements (n, 3), or (3,) of all [m²].
         before: discrepancy of the same arm with another tool (3,) [m].
         neighbours: True if the pairs follow a path.
         scatter: 1-sigma of a coordinate around the solution [m], corrected for its degrees of freedom; 0 if unknown.
     """
-    errors = _without_outliers(errors, scatter) if scatter > 0.0 else errors
+    noise = np.broadcast_to(noise_variance, errors.shape)
+    if scatter > 0.0:
+        near = _near(errors, scatter)
+        errors, noise = errors[near], noise[near]
     n = len(errors)
     if neighbours and n > 1:
         variance = (errors[1:] * errors[:-1]).mean(axis=0)
@@ -430,14 +437,14 @@ def model_discrepancy(
     else:
         square = np.square(errors).mean(axis=0)
         taken = max(scatter**2 / max(float(square.mean()), 1e-300), 1.0)
-        variance = taken * square - noise_variance
-        chance = noise_variance * math.sqrt(2.0 * taken / n)
+        variance = taken * square - noise.mean(axis=0)
+        chance = np.sqrt(2.0 * taken * np.square(noise).mean(axis=0) / n)
     seen = np.where(variance > CLEARLY * chance, variance, 0.0)
     missing = max(WARM - n, 0.0)
     return np.sqrt((n * seen + missing * np.square(before)) / max(n, WARM))
 
 
-def _without_outliers(errors: FloatArray, scatter: float) -> FloatArray:
-    """Return the errors that the fit has not left out; all if these are the minority: then the fit is off."""
+def _near(errors: FloatArray, scatter: float) -> NDArray[np.bool_]:
+    """Return True for errors that the fit has not left out; for all if these are the minority: then the fit is off."""
     near = np.linalg.norm(errors, axis=1) <= OUTLIER_SIGMAS * scatter
-    return errors[near] if near.mean() > 0.5 else errors
+    return near if near.mean() > 0.5 else np.ones_like(near)

@@ -77,10 +77,12 @@ class PooledSolver:
         self.clear()
         self._orders.append(lambda: self._process.start(task, self._robot))
 
-    def learn(self, q: FloatArray, x: FloatArray, turns: FloatArray | None = None) -> None:
-        """Queue more pairs, q (n, d) [rad], x (n, 3) [m] and orientations (n, 4), NaN where a pair has none."""
+    def learn(
+        self, q: FloatArray, x: FloatArray, cov: FloatArray | None = None, turns: FloatArray | None = None
+    ) -> None:
+        """Queue more pairs, as `Solver` takes them."""
         self._new += len(q)
-        self._orders.append(lambda: self._process.learn(q, x, turns, self._robot))
+        self._orders.append(lambda: self._process.learn(q, x, cov, turns, self._robot))
 
     def solve(self) -> None:
         """Request the solution for all pairs so far, for this robot's next turn."""

@@ -50,11 +50,12 @@ class Start(msgspec.Struct, frozen=True, tag="start"):
 
 
 class Learn(msgspec.Struct, frozen=True, tag="learn"):
-    """Pairs: q (n, joints), x (n, 3) and orientations (n, 4) as little-endian float64."""
+    """Pairs: q (n, joints), x (n, 3), cov (n, 3, 3) and orientations (n, 4) as little-endian float64."""
 
     joints: int
     q: bytes
     x: bytes
+    cov: bytes | None = None
     turns: bytes | None = None
     robot: int = 0
 
@@ -130,10 +131,17 @@ class SolverProcess:
                 os.set_blocking(self._child.stdin.fileno(), False)
         self._send(Start(_fields(task), robot))
 
-    def learn(self, q: FloatArray, x: FloatArray, turns: FloatArray | None = None, robot: int = 0) -> None:
-        """Send more pairs, q (n, d) [rad], x (n, 3) [m] and orientations (n, 4), NaN where a pair has none."""
-        told = None if turns is None else turns.astype("<f8").tobytes()
-        self._send(Learn(q.shape[1], q.astype("<f8").tobytes(), x.astype("<f8").tobytes(), told, robot))
+    def learn(
+        self,
+        q: FloatArray,
+        x: FloatArray,
+        cov: FloatArray | None = None,
+        turns: FloatArray | None = None,
+        robot: int = 0,
+    ) -> None:
+        """Send more pairs, as `Solver` takes them."""
+        parts = [None if each is None else each.astype("<f8").tobytes() for each in (cov, turns)]
+        self._send(Learn(q.shape[1], q.astype("<f8").tobytes(), x.astype("<f8").tobytes(), *parts, robot=robot))
 
     def solve(self, robot: int = 0) -> None:
         """Request the solution for all pairs so far."""
@@ -236,6 +244,7 @@ def serve(orders: IO[bytes], solutions: IO[bytes]) -> None:
             solver.learn(
                 np.frombuffer(order.q, dtype="<f8").reshape(-1, order.joints),
                 np.frombuffer(order.x, dtype="<f8").reshape(-1, 3),
+                None if order.cov is None else np.frombuffer(order.cov, dtype="<f8").reshape(-1, 3, 3),
                 None if order.turns is None else np.frombuffer(order.turns, dtype="<f8").reshape(-1, 4),
             )
         else:

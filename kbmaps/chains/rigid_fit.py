@@ -185,6 +185,13 @@ def fit_chain(
     return _polish(fitter, noise)
 
 
+def rough_fit(prior: ChainBelief, pairs: Pairs, start: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return a robust change (size,) within about a sigma of the fit, and its residuals (n, 3), whitened [m]."""
+    fitter = _Fitter(prior, pairs, start)
+    _anneal(fitter)
+    return fitter.point.change, fitter.point.residuals
+
+
 def folded(prior: ChainBelief, pairs: Pairs, change: FloatArray, noise: float) -> ChainBelief:
     """Return the posterior after inlier pairs, linearised at a change (size,).
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Self
 
 import numpy as np
@@ -22,12 +23,13 @@ from kbmaps.chains.parameters import (
     parse_tolerances,
 )
 from kbmaps.chains.report import ChainReport, Scatter, chain_report
-from kbmaps.chains.rigid_fit import RigidFit, fit_chain
+from kbmaps.chains.rigid_fit import RigidFit, fit_chain, rough_fit
 from kbmaps.errors import DegenerateDataError, ModelFormatError, NonFiniteError, SettingError, ShapeError
 from kbmaps.model import Estimate, Model, near_data, widest
 from kbmaps.packed import complete, named, pack, restoring, unpack
 from kbmaps.pairs import Pairs, checked_pairs, of_covariances, stored_pairs, with_units
 from kbmaps.robust import claimed_sigma, student
+from kbmaps.variance_components import error_covariances, inverse_roots, tells_directions
 
 
 class _Settings:
@@ -260,6 +262,31 @@ class RigidLearner(Model):
         )
         self._fit = None
 
+    def weigh(self, stated: ArrayLike) -> None:
+        """Weigh each direction of the learnt pairs by what is stated of it, as far as the residuals confirm it.
+
+        The noise is estimated as if none had been given. Where every stated covariance is isotropic, nothing changes.
+
+        Args:
+            stated: covariances (n, 3, 3) [m²] of the learnt positions; NaN where a pair has none.
+
+        Raises:
+            ShapeError: they are of other pairs.
+        """
+        told = numbers("stated", stated)
+        if told.shape != (self.pairs, 3, 3):
+            raise ShapeError("stated", f"({self.pairs}, 3, 3)", told.shape)
+        if not tells_directions(told):
+            return
+        alike = Pairs(self._q, self._x, np.ones(self.pairs), False, None, self._common)
+        change, errors = rough_fit(self._prior, alike, self._start())
+        _, jacobian = self._parameters.linearised(change, self._q)
+        readings = jacobian[:, :, self._parameters.zeros][:, :, ~self.nominal.prismatic]
+        found = error_covariances(errors, told, readings)
+        self._sigma = np.full(self.pairs, np.nan)
+        self._shape = math.sqrt(float(np.trace(found, axis1=1, axis2=2).mean()) / 3.0) * inverse_roots(found)
+        self._take(fit_chain(self._prior, self.data, change, near=True))
+
     def predict(self, q: ArrayLike) -> FloatArray:
         angles = rows_or_vector("q", q, self.joints)
         return self._parameters.positions(self.belief.mean, angles)
@@ -274,7 +301,7 @@ class RigidLearner(Model):
         x, variance = self.belief.predict_with_variance(np.atleast_2d(angles))
         if fit is None:
             return Estimate(x, np.sqrt(variance), np.zeros(len(x), dtype=np.bool_)).like(angles)
-        sigma = claimed_sigma(variance, self._units(), fit.noise, fit.freedom)
+        sigma = claimed_sigma(variance, self.data, fit.noise, fit.freedom)
         return Estimate(x, sigma, near_data(variance, self._widest)).like(angles)
 
     def report(self) -> ChainReport:
@@ -286,7 +313,7 @@ class RigidLearner(Model):
         fit = self._fitted()
         if fit is None:
             raise DegenerateDataError("there is nothing to report before the first pair was learnt")
-        pairs, scatter = self._units(), self._scatter(fit)
+        pairs, scatter = self.data, self._scatter(fit)
         widening = 1.0 if pairs.known else student(fit.freedom)
         return chain_report(
             self._parameters,
@@ -300,7 +327,7 @@ class RigidLearner(Model):
         )
 
     def _scatter(self, fit: RigidFit) -> Scatter:
-        pairs = self._units()
+        pairs = self.data
         unit = math.sqrt(float(np.square(pairs.unit).mean()))
         noise, misfit = (unit, fit.noise) if pairs.known else (unit * fit.noise, 1.0)
         return Scatter(noise, misfit, fit.freedom)
@@ -312,18 +339,29 @@ class RigidLearner(Model):
         return (after > _Settings.hardly_narrower * before) & (before * lever > noise)
 
     def to_bytes(self) -> bytes:
-        arrays = chain_arrays(self.nominal) | {
-            "q": self._q,
-            "x": self._x,
-            "sigma": self._sigma,
-        }
-        if self._shaped:
-            arrays["shape"] = self._shape
+        arrays = chain_arrays(self.nominal) | self.stored()
         if self._common.any():
             arrays["common"] = self._common
         if self._told_prior:
             arrays |= {"prior_mean": self._prior.mean, "prior_root": self._prior.root}
         return pack(_KIND, {"tolerances": describe_tolerances(self._tolerances)}, arrays)
+
+    def stored(self) -> dict[str, FloatArray]:
+        """Return the arrays that `restore` takes."""
+        arrays = {"q": self._q, "x": self._x, "sigma": self._sigma}
+        return arrays | {"shape": self._shape} if self._shaped else arrays
+
+    def restore(self, arrays: Mapping[str, FloatArray]) -> None:
+        """Resume with stored pairs.
+
+        Raises:
+            ModelFormatError: they are missing, or not pairs.
+        """
+        self._q, self._x, self._sigma = stored_pairs(arrays, self.joints)
+        shape = arrays.get("shape", np.broadcast_to(np.eye(3), (self.pairs, 3, 3)))
+        if shape.shape != (self.pairs, 3, 3) or not np.isfinite(shape).all():
+            raise ModelFormatError(f"no shapes of {self.pairs} pairs' errors: {shape.shape}")
+        self._shape, self._common = shape, np.empty((self.pairs, 3, 0))
 
     @classmethod
     def from_bytes(cls, data: bytes) -> Self:
@@ -336,17 +374,16 @@ class RigidLearner(Model):
             if "prior_mean" in arrays:
                 prior = ChainBelief(ChainParameters(chain), arrays["prior_mean"], arrays["prior_root"])
             learner = cls(chain, tolerances, prior)
-            learner._q, learner._x, learner._sigma = stored_pairs(arrays, learner.joints)
-            shape = arrays.get("shape", np.broadcast_to(np.eye(3), (learner.pairs, 3, 3)))
-            if shape.shape != (learner.pairs, 3, 3) or not np.isfinite(shape).all():
-                raise ModelFormatError(f"no shapes of {learner.pairs} pairs' errors: {shape.shape}")
+            learner.restore(arrays)
             common = arrays.get("common", np.empty((learner.pairs, 3, 0)))
             if common.ndim != 3 or common.shape[:2] != learner._x.shape or not np.isfinite(common).all():
                 raise ModelFormatError(f"no common errors of {learner.pairs} pairs: {common.shape}")
-            learner._shape, learner._common = shape, common
+            learner._common = common
         return learner
 
-    def _units(self) -> Pairs:
+    @property
+    def data(self) -> Pairs:
+        """Learnt pairs, with their weights."""
         return with_units(self._q, self._x, self._sigma, self._shape if self._shaped else None, self._common)
 
     @property
@@ -356,11 +393,12 @@ class RigidLearner(Model):
 
     def _fitted(self) -> RigidFit | None:
         if self._fit is None and self.pairs:
-            fit = fit_chain(self._prior, self._units(), self._start())
-            _, variance = fit.belief.predict_with_variance(self._q[fit.inliers])
-            self._widest = widest(variance)
-            self._fit = fit
+            self._take(fit_chain(self._prior, self.data, self._start()))
         return self._fit
+
+    def _take(self, fit: RigidFit) -> None:
+        _, variance = fit.belief.predict_with_variance(self._q[fit.inliers])
+        self._fit, self._widest = fit, widest(variance)
 
     def _deviations(self, fit: RigidFit, pairs: Pairs) -> FloatArray:
         good = np.flatnonzero(fit.inliers)

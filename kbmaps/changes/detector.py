@@ -13,8 +13,9 @@ from kbmaps.arrays import FloatArray, IntArray
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.changes.bends import MOST_PAIRS, NOTHING_SEEN, log_evidence_of_bends, log_ratios_if_it_bends
 from kbmaps.changes.kinds import JOINT, SIZES, ChangeKind, change_kinds, log_ratios
-from kbmaps.changes.white_noise import SharedNoise, inverse_roots
+from kbmaps.changes.white_noise import SharedNoise
 from kbmaps.robust import CLIPPED_SIGMAS
+from kbmaps.variance_components import inverse_roots
 
 
 class _Settings:

@@ -185,7 +185,7 @@ class _Fitter:
     def _model(self, groups: Sequence[str], ask_correlation: bool) -> GroupedModel:
         """Return the linear model around the current weights; those of the group "" are steps, the others' whole."""
         x = self._features.positions(self.chain, self.weights, self._pairs.q)
-        residuals = (self._pairs.x - x) / self._pairs.unit[:, None]
+        residuals = self._pairs.whitened(self._pairs.x - x) / self._pairs.unit[:, None]
         self._judge_pairs(residuals)
         rows = np.flatnonzero(self.inliers)
         if self._on_path:
@@ -245,8 +245,8 @@ class _Fitter:
         design = np.concatenate(
             [known[:, :, self._free] @ self._root, *(point.groups[group] for group in groups)], axis=2
         )
-        unit = self._pairs.unit[run, None]
-        return design / unit[:, :, None], target / unit
+        some = self._pairs.chosen(run)
+        return some.whitened(design) / some.unit[:, None, None], some.whitened(target) / some.unit[:, None]
 
     def _before_step(self, groups: Iterable[str]) -> FloatArray:
         """Return the weights before the step."""

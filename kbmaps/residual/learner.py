@@ -22,7 +22,6 @@ from kbmaps.chains.parameters import (
 from kbmaps.chains.rigid_learner import RigidLearner
 from kbmaps.model import Estimate, Model, near_data, widest
 from kbmaps.packed import complete, named, pack, restoring, unpack
-from kbmaps.pairs import checked_pairs, runs, stored_pairs, with_units
 from kbmaps.residual.features import ResidualScaling
 from kbmaps.residual.fit import ResidualFit, fit_residual
 from kbmaps.residual.model import ResidualModel
@@ -58,8 +57,6 @@ class ResidualLearner(Model):
         self._belief = None if isinstance(prior, ResidualModel) else prior
         belief = prior.belief if isinstance(prior, ResidualModel) else prior
         self._rigid = RigidLearner(nominal, tolerances, belief)
-        self._q, self._x = np.empty((0, nominal.joints)), np.empty((0, 3))
-        self._sigma = np.empty(0)
         self._model: ResidualModel | None = None
         self._fit: ResidualFit | None = None
         self._widest = 0.0
@@ -70,7 +67,7 @@ class ResidualLearner(Model):
 
     @property
     def pairs(self) -> int:
-        return len(self._q)
+        return self._rigid.pairs
 
     @property
     def rigid(self) -> RigidLearner:
@@ -97,7 +94,9 @@ class ResidualLearner(Model):
         fit = self._fitted()
         if fit is None:
             return {}
-        return {group: effect for group, effect in self.model.effects(self._q).items() if group in fit.groups}
+        return {
+            group: effect for group, effect in self.model.effects(self._rigid.data.q).items() if group in fit.groups
+        }
 
     @property
     def inliers(self) -> BoolArray:
@@ -106,11 +105,12 @@ class ResidualLearner(Model):
         return self._rigid.inliers if fit is None else fit.inliers.copy()
 
     def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
-        angles, positions, sigmas = checked_pairs(q, x, sigma, self.joints)
         self._rigid.learn(q, x, sigma)
-        self._q = np.concatenate([self._q, angles])
-        self._x = np.concatenate([self._x, positions])
-        self._sigma = np.concatenate([self._sigma, sigmas])
+        self._model = self._fit = None
+
+    def weigh(self, stated: ArrayLike) -> None:
+        """Weigh each direction of the learnt pairs by what is stated of it, as `RigidLearner.weigh` does."""
+        self._rigid.weigh(stated)
         self._model = self._fit = None
 
     def predict(self, q: ArrayLike) -> FloatArray:
@@ -128,11 +128,11 @@ class ResidualLearner(Model):
         x, variance = self.model.predict_with_variance(np.atleast_2d(angles))
         if fit is None:
             return Estimate(x, np.sqrt(variance), np.zeros(len(x), dtype=np.bool_)).like(angles)
-        sigma = claimed_sigma(variance, with_units(self._q, self._x, self._sigma), fit.noise, fit.freedom)
+        sigma = claimed_sigma(variance, self._rigid.data, fit.noise, fit.freedom)
         return Estimate(x, sigma, near_data(variance, self._widest)).like(angles)
 
     def to_bytes(self) -> bytes:
-        arrays = chain_arrays(self._rigid.nominal) | {"q": self._q, "x": self._x, "sigma": self._sigma}
+        arrays = chain_arrays(self._rigid.nominal) | self._rigid.stored()
         prior, belief = self._prior, self._belief
         known = {"model": prior.to_bytes().hex()} if prior else belief and {"belief": belief.to_bytes().hex()}
         return pack(_KIND, {"tolerances": describe_tolerances(self._rigid.tolerances), "prior": known}, arrays)
@@ -142,13 +142,10 @@ class ResidualLearner(Model):
         fields, arrays = unpack(data, _KIND)
         with restoring("a rigid chain with residual"):
             named(fields, "the fields", ("tolerances", "prior"))
-            complete(arrays, (*CHAIN, "q", "x", "sigma"))
+            complete(arrays, (*CHAIN, "q", "x", "sigma"), ("shape",))
             nominal, tolerances = chain_from_arrays(arrays), parse_tolerances(fields["tolerances"])
             learner = cls(nominal, tolerances, _stored_prior(fields["prior"]))
-            q, x, sigma = stored_pairs(arrays, learner.joints)
-            told = ~np.isnan(sigma)
-            for run in runs(told):
-                learner.learn(q[run], x[run], sigma[run] if told[run.start] else None)
+            learner._rigid.restore(arrays)
         return learner
 
     @property
@@ -164,11 +161,11 @@ class ResidualLearner(Model):
     def _fitted(self) -> ResidualFit | None:
         """Return the fit; None without pairs, or if they support nothing but the rigid chain."""
         if self._model is None and self.pairs:
-            pairs = with_units(self._q, self._x, self._sigma)
+            pairs = self._rigid.data
             before = self._prior
             if before is None or not before.weights:
                 load = None if before is None else before.features.scaling.load
-                scaling = replace(ResidualScaling.of(self._q, self._x), load=load)
+                scaling = replace(ResidualScaling.of(pairs.q, pairs.x), load=load)
                 before = ResidualModel.of_belief(self._rigid.prior, scaling, 0.0 if before is None else before.noise)
             # A noise that was not given must be visible in the rigid chain's residuals; otherwise anything explains
             # them.
@@ -176,7 +173,7 @@ class ResidualLearner(Model):
                 self._fit = fit_residual(before, pairs, self._rigid.change)
             self._model = self._rigid_model(before) if self._fit is None else self._fit.model
             if self._fit is not None:
-                _, variance = self._model.predict_with_variance(self._q[self._fit.inliers])
+                _, variance = self._model.predict_with_variance(pairs.q[self._fit.inliers])
                 self._widest = widest(variance)
         return self._fit
 

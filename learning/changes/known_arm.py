@@ -101,10 +101,10 @@ class Origin:
     def __init__(self, noticed: DetectedChange, arm: KnownArm) -> None:
         self._noticed, self._reference = noticed, noticed.reference
         quiet = [k for k in range(min(noticed.earliest, noticed.first)) if noticed.kept[k]]
-        q, x = noticed.q[quiet], noticed.x[quiet]
+        q, x, cov = noticed.q[quiet], noticed.x[quiet], noticed.cov[quiet]
         wide = self._reference.wide
         if len(quiet) >= _Settings.fewest_before:
-            wide = fitted_belief(wide, q, self._of_chain(q, x))
+            wide = fitted_belief(wide, q, self._of_chain(q, x), cov)
         self._before = arm.updated(wide, self._reference.residual)
 
     def explain(self, q: FloatArray, x: FloatArray) -> list[Explanation]:
@@ -119,21 +119,26 @@ class Origin:
         kinds = (*noticed.kinds, any_change(belief.parameters))
         return explanations(belief, kinds, q, self._of_chain(q, x), noticed.noise_m, noticed.shared)
 
-    def adapt(self, found: Sequence[Explanation], q: FloatArray, x: FloatArray) -> Adapted:
+    def adapt(
+        self, found: Sequence[Explanation], q: FloatArray, x: FloatArray, cov: FloatArray | None = None
+    ) -> Adapted:
         """Widen what may have changed, and relearn it from the pairs since, q (n, d) [rad] and x (n, 3) [m].
 
         Args:
             found: probability of each kind of change, the most probable first.
             q: joint values since the change.
             x: positions since the change.
+            cov: their covariances (n, 3, 3) [m²], NaN where a pair has none; None where no pair has any.
         """
         arm = self._forgetful(found)
-        belief = fitted_belief(arm.chain, q, self._of_chain(q, x))
+        belief = fitted_belief(arm.chain, q, self._of_chain(q, x), cov)
         bases, known = self._reference.map.bases, self._reference.belief.chain
         net = self._reference.map.net[:3] + belief.chain.to_kbmap(bases).net - known.to_kbmap(bases).net
         return Adapted(KBMap(bases, net), arm, belief)
 
-    def is_better(self, found: Sequence[Explanation], q: FloatArray, x: FloatArray) -> bool:
+    def is_better(
+        self, found: Sequence[Explanation], q: FloatArray, x: FloatArray, cov: FloatArray | None = None
+    ) -> bool:
         """Return True if an adapted model predicts held-out pairs since the change better than the old one.
 
         Runs of q (n, d) [rad] and x (n, 3) [m], n at least 2, are left out in turn.
@@ -144,7 +149,7 @@ class Origin:
         new = np.empty(len(q))
         for left_out in np.array_split(np.arange(len(q)), min(_Settings.folds, len(q))):
             others = np.setdiff1d(np.arange(len(q)), left_out)
-            belief = fitted_belief(arm.chain, q[others], y[others])
+            belief = fitted_belief(arm.chain, q[others], y[others], None if cov is None else cov[others])
             new[left_out] = np.minimum(np.linalg.norm(y[left_out] - belief.predict(q[left_out]), axis=1), limit)
         return float(np.square(new).sum()) < float(np.square(old).sum())
 

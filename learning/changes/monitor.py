@@ -15,7 +15,7 @@ from bodyschema.learning.model_bank import LearntModel
 from bodyschema.learning.uncertainty import PredictiveUncertainty
 from kbmaps import ChainBelief, ChangeDetector, ChangeKind, ChangeScore, KBMap, ResidualModel, SharedNoise, WhiteNoise
 from kbmaps.changes.detector import MOST_SURPRISES
-from kbmaps.changes.white_noise import inverse_roots
+from kbmaps.variance_components import inverse_roots
 
 
 class _Settings:
@@ -119,6 +119,7 @@ class DetectedChange:
         seqs: sequence numbers of the monitored pairs (n,).
         kept: True for each of them (n,) that was learnt, not an outlier.
         q, x: the monitored pairs, (n, d) [rad] and (n, 3) [m].
+        cov: their covariances (n, 3, 3) [m²], as claimed.
         turns: their orientations, quaternions (n, 4), NaN where a pair has none.
     """
 
@@ -133,6 +134,7 @@ class DetectedChange:
     kept: tuple[bool, ...]
     q: FloatArray
     x: FloatArray
+    cov: FloatArray
     turns: FloatArray
 
 
@@ -289,8 +291,7 @@ class ChangeMonitor:
             latest,
             tuple(each.seq for each in pairs),
             tuple(each.kept for each in pairs),
-            np.array([each.q for each in pairs]),
-            np.array([each.x for each in pairs]),
+            *_stacked(pairs),
             np.array([each.turn for each in pairs]),
         )
 

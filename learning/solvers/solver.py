@@ -113,13 +113,16 @@ class Solver(Protocol):
         """Forget all pairs and begin a new task."""
         ...
 
-    def learn(self, q: FloatArray, x: FloatArray, turns: FloatArray | None = None) -> None:
+    def learn(
+        self, q: FloatArray, x: FloatArray, cov: FloatArray | None = None, turns: FloatArray | None = None
+    ) -> None:
         """Add pairs, q (n, d) [rad] and x (n, 3) [m].
 
         Args:
             q: joint values.
             x: positions.
-            turns: their orientations, quaternions (n, 4), NaN where a pair has none; None where no pair has any.
+            cov: their covariances (n, 3, 3) [m²], NaN where a pair has none; None where no pair has any.
+            turns: their orientations, quaternions (n, 4), likewise.
         """
         ...
 
@@ -146,7 +149,7 @@ class DirectSolver:
         self._precision: float | None = None
         self._tuned_at = self._pairs = 0
         self._solved: list[Solved] = []
-        self._q = self._x = np.empty((0, 0))
+        self._q = self._x = self._cov = np.empty((0, 0))
 
     def start(self, task: Task) -> None:
         """Forget all pairs and begin a new task."""
@@ -157,21 +160,24 @@ class DirectSolver:
         self._exact = ExactLearner(task.prior, memory=within) if small else None
         self._orientations = OrientationSolver(task.prior.bases, with_map=small)
         self._precision, self._tuned_at, self._residual_at, self._pairs, self._solved = None, 0, 0, 0, []
-        self._q, self._x = np.empty((0, task.prior.joints)), np.empty((0, 3))
+        self._q, self._x, self._cov = np.empty((0, task.prior.joints)), np.empty((0, 3)), np.empty((0, 3, 3))
 
-    def learn(self, q: FloatArray, x: FloatArray, turns: FloatArray | None = None) -> None:
-        """Add pairs, q (n, d) [rad], x (n, 3) [m] and orientations (n, 4), NaN where a pair has none."""
+    def learn(
+        self, q: FloatArray, x: FloatArray, cov: FloatArray | None = None, turns: FloatArray | None = None
+    ) -> None:
+        """Add pairs, as `Solver` does."""
         if self._orientations is not None and turns is not None:
             self._orientations.learn(q, x, turns)
         if self._exact is not None:
             self._exact.learn(q, x)
         self._pairs += len(q)
         self._q, self._x = np.vstack([self._q, q]), np.vstack([self._x, x])
+        self._cov = np.concatenate([self._cov, np.full((len(q), 3, 3), np.nan) if cov is None else cov])
         while len(self._q) > KEPT:
-            self._folded = fitted_belief(self._before, self._q[:FOLDED], self._x[:FOLDED])
-            before = self._residual_before
-            self._folded_residual = fitted_residual(before, self._q[:FOLDED], self._x[:FOLDED]) or before
-            self._q, self._x = self._q[FOLDED:], self._x[FOLDED:]
+            oldest, before = self._first(FOLDED), self._residual_before
+            self._folded = fitted_belief(self._before, *oldest)
+            self._folded_residual = fitted_residual(before, *oldest) or before
+            self._q, self._x, self._cov = self._q[FOLDED:], self._x[FOLDED:], self._cov[FOLDED:]
 
     def solve(self) -> None:
         """Solve for all models."""
@@ -187,8 +193,8 @@ class DirectSolver:
         if self._pairs >= _Settings.first_growth * self._solved_at:
             yield from self._solved_of_some(task)
         self._solved_at = self._pairs
-        wide = fitted_belief(self._before, self._q, self._x)
-        made = _ways_made(wide, task)
+        wide = fitted_belief(self._before, self._q, self._x, self._cov)
+        made = _ways_made(wide, task, self._q)
         residual_due = self._pairs >= GROWTH * self._residual_at
         turns = self._orientations if self._orientations is not None and self._orientations.due else None
         rigid = _solved_chain(task, self._pairs, wide, made)
@@ -201,7 +207,7 @@ class DirectSolver:
             self._residual_at = self._pairs
             before = self._residual_before
             before = _as_made(before, task, made) if isinstance(before, ChainBelief) else before
-            residual = fitted_residual(before, self._q, self._x)
+            residual = fitted_residual(before, self._q, self._x, self._cov)
             name = RESIDUAL if residual else ""
             yield Solved(task.number, self._pairs, name, residual, residual, last=turns is None)
         if turns is not None and isinstance(rigid.belief, ChainBelief):
@@ -211,9 +217,9 @@ class DirectSolver:
         """Yield the chain fitted to the first pairs only, so that the remaining pairs can test it."""
         some = int(len(self._q) * _Settings.first_share)
         if some >= _Settings.fewest_first:
-            wide = fitted_belief(self._before, self._q[:some], self._x[:some])
+            wide = fitted_belief(self._before, *self._first(some))
             pairs = self._pairs - len(self._q) + some
-            yield replace(_solved_chain(task, pairs, wide, _ways_made(wide, task)), last=False)
+            yield replace(_solved_chain(task, pairs, wide, _ways_made(wide, task, self._q[:some])), last=False)
 
     def _solve_exact(self, task: Task, learner: ExactLearner, *, last: bool) -> Solved:
         """Solve least squares around the rigid chain.
@@ -234,6 +240,9 @@ class DirectSolver:
 
     def _sought_precision(self, prior: KBMap) -> float | Literal["evidence"]:
         return blockwise_precision(prior, self._q, self._x) if follow_a_path(prior, self._q) else "evidence"
+
+    def _first(self, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        return self._q[:count], self._x[:count], self._cov[:count]
 
     @property
     def _started(self) -> Task:
@@ -256,8 +265,8 @@ class DirectSolver:
         return self._folded_residual
 
 
-def _ways_made(wide: ChainBelief, task: Task) -> list[Tolerances]:
-    return [] if task.tolerances is None else workmanship(wide, task.tolerances)
+def _ways_made(wide: ChainBelief, task: Task, q: FloatArray) -> list[Tolerances]:
+    return [] if task.tolerances is None else workmanship(wide, task.tolerances, q)
 
 
 def _solved_chain(task: Task, pairs: int, wide: ChainBelief, made: Sequence[Tolerances]) -> Solved:
@@ -270,43 +279,54 @@ def _as_made(belief: ChainBelief, task: Task, made: Sequence[Tolerances]) -> Cha
     return belief if task.tolerances is None or not made else best_tolerances(belief, task.tolerances, made)
 
 
-def fitted_belief(prior: ChainBelief, q: FloatArray, x: FloatArray) -> ChainBelief:
-    """Return the posterior of a chain after pairs q (n, d) [rad] and x (n, 3) [m] along a path.
+def fitted_belief(prior: ChainBelief, q: FloatArray, x: FloatArray, cov: FloatArray | None = None) -> ChainBelief:
+    """Return the posterior of a chain after pairs along a path.
 
     Neighbours share part of their errors; as many as share them count as one.
+
+    Args:
+        prior: before these pairs.
+        q: joint values (n, d) [rad].
+        x: positions (n, 3) [m].
+        cov: their covariances (n, 3, 3) [m²], NaN where a pair has none; None where no pair has any.
     """
-    q, x = _spread(q, x)
+    chosen = evenly_spread(len(q), _Settings.fitted)
+    q, x = q[chosen], x[chosen]
     learner = RigidLearner(prior.parameters.reference, ChainTolerances(), prior)
     learner.learn(q, x)
-    inliers = learner.inliers
-    shared = shared_by(x[inliers] - learner.predict(q[inliers]))
+    if cov is not None:
+        learner.weigh(cov[chosen])
+    inliers, data = learner.inliers, learner.data
+    shared = shared_by(data.whitened(x - learner.predict(q))[inliers])
     if shared < _Settings.shared:
         return learner.belief
     again = RigidLearner(prior.parameters.reference, ChainTolerances(), prior)
-    again.learn(q[inliers], x[inliers], learner.scatter.noise * math.sqrt(shared))
+    noise = learner.scatter.noise * math.sqrt(shared)
+    if data.shape is None:
+        again.learn(q[inliers], x[inliers], noise)
+    else:
+        again.learn(q[inliers], x[inliers], cov=noise**2 * np.linalg.inv(data.shape.mT @ data.shape)[inliers])
     return replace(again.belief, noise=learner.belief.noise)
 
 
-def fitted_residual(prior: ChainBelief | ResidualModel, q: FloatArray, x: FloatArray) -> ResidualModel | None:
-    """Return the posterior of a non-rigid arm after pairs q (n, d) [rad] and x (n, 3) [m] along a path.
+def fitted_residual(
+    prior: ChainBelief | ResidualModel, q: FloatArray, x: FloatArray, cov: FloatArray | None = None
+) -> ResidualModel | None:
+    """Return the posterior of a non-rigid arm after pairs along a path; arguments as in `fitted_belief`.
 
     None if it was lost in rounding: the other models keep answering.
     """
-    q, x = _spread(q, x)
+    chosen = evenly_spread(len(q), _Settings.fitted)
     parameters = prior.parameters if isinstance(prior, ChainBelief) else prior.features.parameters
     learner = ResidualLearner(parameters.reference, ChainTolerances(), prior)
-    learner.learn(q, x)
+    learner.learn(q[chosen], x[chosen])
     try:
+        if cov is not None:
+            learner.weigh(cov[chosen])
         return learner.model
     except (np.linalg.LinAlgError, NonFiniteError) as error:
         log.warning("the chain with residual has no solution for %d pairs: %s", len(q), error)
         return None
-
-
-def _spread(q: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return at most `fitted` of the pairs, evenly spread."""
-    chosen = evenly_spread(len(q), _Settings.fitted)
-    return q[chosen], x[chosen]
 
 
 class SolverClient:
@@ -357,16 +377,11 @@ class SolverClient:
         self._task = task.number
         return True
 
-    def feed(self, q: FloatArray, x: FloatArray, fed: int, turns: FloatArray | None = None) -> None:
-        """Send pairs, q (n, d) [rad] and x (n, 3) [m]; with them the solver has `fed`.
-
-        Args:
-            q: joint values.
-            x: positions.
-            fed: number of the task's pairs that the solver then has.
-            turns: their orientations, quaternions (n, 4), NaN where a pair has none; None where no pair has any.
-        """
-        self._solver.learn(q, x, turns)
+    def feed(
+        self, q: FloatArray, x: FloatArray, fed: int, cov: FloatArray | None = None, turns: FloatArray | None = None
+    ) -> None:
+        """Send pairs as `Solver.learn` takes them; with them the solver has `fed` of the task's."""
+        self._solver.learn(q, x, cov, turns)
         self.fed = fed
 
     def ask(self) -> None:

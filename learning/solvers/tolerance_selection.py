@@ -11,9 +11,13 @@ from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray
 from kbmaps import ChainBelief, ChainTolerances
+from kbmaps.arrays import evenly_spread
+from kbmaps.robust import ROUNDING_M
 
 # Candidate tilts of an axis [rad] and shifts [m], 1-sigma, from a milled arm to a kit.
 WORKMANSHIP = ((0.0003, 0.0001), (0.001, 0.0005), (0.003, 0.001), (0.01, 0.003), (0.03, 0.01), (0.06, 0.03))
+# Pairs at which candidates are compared with the posterior, evenly spread.
+FOLLOWED = 100
 # Less probable tolerances are not considered.
 LEAST_SHARE = 0.01
 # Narrower tolerances are kept unless wider ones are more probable by more than the inverse of this.
@@ -33,7 +37,7 @@ class Tolerances:
     share: float
 
 
-def workmanship(belief: ChainBelief, tolerances: ChainTolerances) -> list[Tolerances]:
+def workmanship(belief: ChainBelief, tolerances: ChainTolerances, q: FloatArray) -> list[Tolerances]:
     """Return the probable tolerances of the arm, from the evidence of its pairs.
 
     MacKay 1992, "Bayesian interpolation". The initial tolerances allow for an arm made by hand. Where the nominal chain
@@ -43,14 +47,41 @@ def workmanship(belief: ChainBelief, tolerances: ChainTolerances) -> list[Tolera
     Args:
         belief: posterior of the chain.
         tolerances: those of its prior.
+        q: configurations (n, d) [rad] of its pairs, or some of them.
 
     Returns:
         The probable candidates, the narrowest last.
     """
+    q = q[evenly_spread(len(q), FOLLOWED)]
     candidates = [tolerances, *(each for made in reversed(WORKMANSHIP) for each in _narrower(tolerances, *made))]
-    kept, shares = probable(np.array([belief.tightened(tolerances, each)[1] for each in candidates]))
+    narrowed = [belief.tightened(tolerances, each) for each in candidates]
+    lost = _lost_in_the_curve(belief, [found for found, _ in narrowed], q)
+    kept, shares = probable(np.array([evidence for _, evidence in narrowed]) - lost)
     made = {int(k): Tolerances(candidates[k], float(share)) for k, share in zip(kept, shares, strict=True)}
     return [made[k] for k in sorted(made)]
+
+
+def _lost_in_the_curve(belief: ChainBelief, narrowed: Sequence[ChainBelief], q: FloatArray) -> FloatArray:
+    """Return the evidence [nats] that narrower posteriors (m,) lose as positions are not linear in the parameters.
+
+    A narrower prior moves what the pairs leave open, along a tangent. Where the pairs are precise, the positions at
+    the end of the tangent do not fit them. The loss is that of the evidence's variational lower bound: half the growth
+    of the expected sum of squares. That is counted in units of the posterior's covariance at the pairs, of which the k
+    parameters have k in all (our derivation, from the trace identity Σ tr(J C Jᵀ) / σ² = k).
+    """
+    x, jacobian = belief.parameters.linearised(belief.mean, q)
+    spread = jacobian @ belief.root
+    roots = np.linalg.cholesky(spread @ spread.mT + ROUNDING_M**2 * np.eye(3))
+
+    def square(columns: FloatArray) -> float:
+        return float(np.square(np.linalg.solve(roots, columns)).sum(axis=2).mean())
+
+    grown = list[float]()
+    for each in narrowed:
+        there, turned = each.parameters.linearised(each.mean, q)
+        apart = there - x - jacobian @ (each.mean - belief.mean)
+        grown.append(square(apart[..., None]) + square(turned @ each.root) - square(jacobian @ each.root))
+    return 0.5 * belief.root.any(axis=1).sum() * np.maximum(grown, 0.0)
 
 
 def probable(evidence: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:

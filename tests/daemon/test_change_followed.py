@@ -170,7 +170,8 @@ def test_a_model_that_predicts_new_pairs_no_better_does_not_take_the_old_one_s_p
     reference = Reference(kbmap, kbmap, belief, belief, None, PredictiveUncertainty(np.zeros(3)), 500, q, x, variance)
     kinds, turns = change_kinds(parameters, 1.0), np.full((20, 4), np.nan)
     seqs, kept = tuple(range(1, 21)), (True,) * 20
-    noticed = DetectedChange(reference, kinds, SIGMA, 1.0, 0, 0, 0, seqs, kept, q, x, turns)
+    cov = np.full((20, 3, 3), np.nan)
+    noticed = DetectedChange(reference, kinds, SIGMA, 1.0, 0, 0, 0, seqs, kept, q, x, cov, turns)
     origin = Origin(noticed, KnownArm(belief, tolerances))
     assert origin.is_better(origin.explain(q, x), q, x) == (moved_m > 0.0)
 

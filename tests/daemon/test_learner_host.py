@@ -188,7 +188,7 @@ class ScriptedProcess:
     def start(self, task: Task, robot: int) -> None:
         self.told.append(("start", robot))
 
-    def learn(self, q: object, x: object, turns: object, robot: int) -> None:
+    def learn(self, q: object, x: object, cov: object, turns: object, robot: int) -> None:
         self.told.append(("learn", robot))
 
     def solve(self, robot: int) -> None:

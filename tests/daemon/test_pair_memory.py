@@ -13,12 +13,12 @@ def filled(pairs: int, capacity: int) -> PairMemory:
 
 
 def test_those_looked_back_at_are_all_while_they_are_few() -> None:
-    q, _ = filled(80, 1000).some(70, 100)
+    q, *_ = filled(80, 1000).some(70, 100)
     np.testing.assert_array_equal(q[:, 0], np.arange(70))
 
 
 def test_those_looked_back_at_are_runs_of_neighbours_from_first_to_last() -> None:
-    q, _ = filled(5000, 4000).some(4500, 100)
+    q, *_ = filled(5000, 4000).some(4500, 100)
     runs = q[:, 0].reshape(-1, RUN)
     assert (runs[0, 0], runs[-1, -1]) == (1000, 4499)
     np.testing.assert_array_equal(np.diff(runs, axis=1), 1)

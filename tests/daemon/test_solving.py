@@ -30,7 +30,9 @@ class ScriptedSolver:
     def start(self, task: Task) -> None:
         self.told.append(("start", task.number))
 
-    def learn(self, q: FloatArray, x: FloatArray, turns: FloatArray | None = None) -> None:
+    def learn(
+        self, q: FloatArray, x: FloatArray, cov: FloatArray | None = None, turns: FloatArray | None = None
+    ) -> None:
         self.told.append(("learn", len(q)))
 
     def solve(self) -> None:

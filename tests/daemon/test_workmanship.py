@@ -10,9 +10,10 @@ from guided_arm import Scene, nominal_model
 
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.model_bank import RIGID
+from bodyschema.learning.nominal import chain_tolerances
 from bodyschema.learning.regimes import Regimes
-from bodyschema.learning.solvers.solver import Solved
-from bodyschema.learning.solvers.tolerance_selection import Tolerances, best_tolerances
+from bodyschema.learning.solvers.solver import Solved, fitted_belief
+from bodyschema.learning.solvers.tolerance_selection import Tolerances, best_tolerances, workmanship
 from kbmaps import ChainTolerances, RigidLearner
 
 NOMINAL, SCENE = nominal_model(), Scene.draw(0, 40)
@@ -44,3 +45,22 @@ def test_pairs_with_another_tool_are_added_to_what_is_believed_of_any_workmanshi
     assert eras.present is not None
     axes = slice(0, wide.parameters.zeros.start)
     np.testing.assert_allclose(eras.present.arm.chain.covariance[axes, axes], wide.covariance[axes, axes], atol=1e-12)
+
+
+def test_narrow_tolerances_do_not_move_a_chain_that_precise_pairs_determine() -> None:
+    """Along a tangent, the unknown pose and marker are moved farther than positions are linear in them."""
+    nominal = nominal_model(pose_known=False, marker_known=False)
+    tolerances = nominal.tolerances(chain_tolerances(LearnerConfig()))
+    off = list[float]()
+    for seed in range(6):
+        scene = Scene.draw(seed, 400)
+        q = np.random.default_rng(seed).uniform(-1.0, 1.0, scene.q.shape)
+        x = scene.chain.positions(q) + 1e-5 * np.random.default_rng(seed).normal(size=(len(q), 3))
+        wide = fitted_belief(nominal.belief(nominal.placed(q, x), chain_tolerances(LearnerConfig())), q, x)
+        made = best_tolerances(wide, tolerances, workmanship(wide, tolerances, q))
+        apart = made.predict(q) - scene.chain.positions(q)
+        off.append(float(np.sqrt(np.square(apart).sum(axis=1).mean())))
+        np.testing.assert_allclose(
+            made.predict_with_variance(q)[1].mean(), wide.predict_with_variance(q)[1].mean(), rtol=0.5
+        )
+    assert max(off) < 1e-5

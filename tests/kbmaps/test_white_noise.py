@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from kbmaps import WhiteNoise
-from kbmaps.changes.white_noise import inverse_roots
+from kbmaps.variance_components import inverse_roots
 
 PAIRS, JOINTS = 1500, 4
 TICK = 2.0 * np.pi / 4096
