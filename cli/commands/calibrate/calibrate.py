@@ -277,7 +277,7 @@ class _Rows:
         rows = self.recording
         require_units(self.robot, rows, self.source)
         sigma_m = told_sigma(rows) or sigma_m
-        return plausibility(self.robot, rows.q, rows.x, sigma_m=sigma_m, orientation=rows.orientation)
+        return plausibility(self.robot, rows.q, rows.x, t=rows.t, sigma_m=sigma_m, orientation=rows.orientation)
 
 
 def _common_errors(config: Config, source: Path, taken: SourceOptions) -> tuple[CommonErrors | None, list[str]]:
