@@ -222,6 +222,26 @@ def test_pairs_of_all_poses_show_all_numbers_and_how_well_the_arm_is_made() -> N
     assert 0.3 < report.axes_deg / np.degrees(0.003) < 3.4  # one step of the choices
 
 
+def moving(late_s: float) -> CalibrationReport:
+    """Return the report on an arm that moves in two runs, its positions stamped `late_s` late."""
+    arm = planted(3)
+    t = np.concatenate([np.arange(0.0, 10.0, 0.1), 100.0 + np.arange(0.0, 10.0, 0.1)])
+    middle, swing = (arm.robot.lower + arm.robot.upper) / 2.0, (arm.robot.upper - arm.robot.lower) / 6.0
+    q, measured = (middle + swing * np.sin(np.outer(at, [0.3, 0.5, 0.7, 1.1])) for at in (t, t - late_s))
+    x = arm.parameters.positions(arm.change, measured) + SIGMA_M * np.random.default_rng(4).normal(size=(len(t), 3))
+    recording = Recording(joints=arm.robot.joints, q=q, x=x, t=t, segment=np.repeat([0, 1], 100))
+    return report_on(dataclasses.replace(arm, recording=recording))
+
+
+def test_positions_stamped_late_or_early_are_doubted() -> None:
+    assert "stamped too late" in (moving(0.01).doubt or "")
+    assert "stamped too early" in (moving(-0.01).doubt or "")
+
+
+def test_positions_stamped_in_time_are_not_doubted() -> None:
+    assert moving(0.0).doubt is None
+
+
 def test_residuals_that_the_told_noise_does_not_explain_are_said() -> None:
     assert "residuals are 3.0 times what the noise explains" in said(planted(1), misfit=3.0)
 
