@@ -410,15 +410,27 @@ def test_force_writes_what_is_refused(pairs_file, tmp_path, capsys) -> None:
     assert (tmp_path / "calibrated" / "robot.toml").exists()
 
 
-def test_a_zero_far_beyond_its_tolerance_is_not_written(pairs_file, tmp_path) -> None:
+def write_with_a_zero_far_off(file: Path) -> None:
     arm = planted(1)
     change = arm.change.copy()
     change[arm.parameters.zeros] += [0.0, np.radians(25.0), 0.0, 0.0]
     q = arm.recording.q
-    Recording(arm.robot.joints, q, arm.parameters.positions(change, q)).write_csv(pairs_file)
+    Recording(arm.robot.joints, q, arm.parameters.positions(change, q)).write_csv(file)
+
+
+def test_a_zero_far_beyond_its_tolerance_is_not_written(pairs_file, tmp_path) -> None:
+    write_with_a_zero_far_off(pairs_file)
     with pytest.raises(CalibrationError, match=r"nothing was written. .* zero of shoulder_pitch comes out .* --force"):
         called(pairs_file, "--out", tmp_path / "calibrated")
     assert not (tmp_path / "calibrated").exists()
+
+
+def test_a_pose_that_is_not_written_is_not_printed_for_ros(pairs_file, capsys) -> None:
+    called(pairs_file)
+    assert "static_transform_publisher" in capsys.readouterr().out
+    write_with_a_zero_far_off(pairs_file)
+    called(pairs_file)
+    assert "static_transform_publisher" not in capsys.readouterr().out
 
 
 def test_a_zero_as_far_off_as_was_told_is_written(pairs_file, tmp_path) -> None:

@@ -344,4 +344,6 @@ def _show(report: CalibrationReport, lines: list[str], written: list[str]) -> No
     from bodyschema.robot.hand_eye import in_shell_lines
 
     Console(highlight=False).print(view(report))
-    say(*(["", *lines] if lines else []), f"\nIn ROS 2:\n{in_shell_lines(report.hand_eye)}", *written)
+    trusted = written or (report.beyond is None and report.other_tool_from is None)
+    for_ros = [f"\nIn ROS 2:\n{in_shell_lines(report.hand_eye)}"] if trusted else []
+    say(*(["", *lines] if lines else []), *for_ros, *written)
