@@ -169,8 +169,8 @@ class _Check:
             f"the pairs are hardly of this robot: {self._nominal_arm_misses()}, and with joints exchanged, counting "
             f"the other way or a quarter turn off still by {mm(after)}",
             "Is the recording or the URDF of another robot, is the camera on the hand and the marker in the room, are "
-            "the time stamps late (--marker-delay-ms), or is more than one thing wrong with the columns? Where the "
-            f"positions are that noisy, say so with --sigma-mm{doubted}",
+            "the time stamps late (`bodyschema diagnose --force` measures it), or is more than one thing wrong with "
+            f"the columns? Where the positions are that noisy, say so with --sigma-mm{doubted}",
             better=self._before / (THRESHOLDS.right * self.spread),
         )
 

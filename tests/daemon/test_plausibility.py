@@ -399,7 +399,7 @@ def test_few_rows_of_another_robot_are_refused() -> None:
     found = replace(right, x=np.random.default_rng(1).permutation(right.x)).seen()
     assert "hardly of this robot" in (found.refusal or "")
     assert "is the camera on the hand" in found.remedy
-    assert "--marker-delay-ms" in found.remedy
+    assert "diagnose --force" in found.remedy
 
 
 def with_markers(turns: np.ndarray, places: np.ndarray, noise: float = 0.0005) -> Pairs:
@@ -466,7 +466,7 @@ def test_positions_of_another_robot_are_refused_without_a_name() -> None:
     found = replace(right, x=np.random.default_rng(1).permutation(right.x)).seen()
     assert "hardly of this robot" in (found.refusal or "")
     assert "is the camera on the hand" in found.remedy
-    assert "--marker-delay-ms" in found.remedy
+    assert "diagnose --force" in found.remedy
     assert not found.misread
 
 
