@@ -242,6 +242,14 @@ def test_positions_stamped_in_time_are_not_doubted() -> None:
     assert moving(0.0).doubt is None
 
 
+@pytest.mark.parametrize(("sigma", "doubted"), [(1e-6, True), (1e-4, False)])
+def test_positions_that_follow_from_the_joints_are_doubted(sigma: float, doubted: bool) -> None:
+    arm = planted(3)
+    x = arm.robot.chain.positions(arm.recording.q) + sigma * np.random.default_rng(4).normal(size=(100, 3))
+    report = report_on(dataclasses.replace(arm, recording=dataclasses.replace(arm.recording, x=x)))
+    assert ("computed from the joints" in (report.doubt or "")) == doubted
+
+
 def test_residuals_that_the_told_noise_does_not_explain_are_said() -> None:
     assert "residuals are 3.0 times what the noise explains" in said(planted(1), misfit=3.0)
 
