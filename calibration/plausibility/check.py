@@ -57,6 +57,7 @@ def plausibility(
     q: FloatArray,
     x: FloatArray,
     *,
+    t: FloatArray | None = None,
     chain: RigidChain | None = None,
     sigma_m: float | None = None,
     orientation: FloatArray | None = None,
@@ -66,6 +67,7 @@ def plausibility(
     Args:
         q: joint values (n, d) [rad, m].
         x: positions (n, 3) [m].
+        t: times (n,) [s] if known.
         chain: the nominal chain if it is not the robot's.
         sigma_m: 1-sigma of a coordinate [m] if known.
         orientation: of the marker, quaternions x, y, z, w (n, 4), if known.
@@ -78,7 +80,7 @@ def plausibility(
     search = ReadingSearch(chain, q[rows], x[rows], exact_m, robot.camera.pose_known)
     noise = 0.0 if sigma_m is None else _SETTINGS.noises * sigma_m
     check = _Check(robot, search, *search.verdict(), spread, noise)
-    found = check.rows_and_size(q, x)
+    found = check.rows_and_size(q, x, t)
     if found.refusal is None:
         columns = check.columns(None if orientation is None else orientation[rows])
         found = replace(columns, warnings=(*found.warnings, *columns.warnings))
@@ -97,18 +99,18 @@ class _Check:
     spread: float  # of the positions [m]
     noise: float  # largest distance that the known noise explains [m]
 
-    def rows_and_size(self, q: FloatArray, x: FloatArray) -> Plausibility:
-        """Return what is wrong with the rows or the size of all pairs q (n, d) [rad, m] and x (n, 3) [m]."""
+    def rows_and_size(self, q: FloatArray, x: FloatArray, t: FloatArray | None) -> Plausibility:
+        """Return what is wrong with the rows or the size of all pairs q (n, d) [rad, m], x (n, 3) [m] and t (n,)."""
         search, best = self.search, self.search.fits[self.best].error
         placed = self._is_nameable(self.as_it_is) or self._is_nameable(self.best)
         if not placed or many_apart(search, THRESHOLDS.named * self.spread):
-            shifted = all_shifted(search, q, x)
+            shifted = all_shifted(search, q, x, t)
             if shifted is not None:
                 return shifted
         if not (self._fits_clearly_better and self._is_nameable(self.best)):
             fits = self._before < THRESHOLDS.named * self.spread
             wrong = (partly_carried(search, self.robot.joints) if fits else None) or partly_shifted(
-                search, q, x, fits=fits
+                search, q, x, t, fits=fits
             )
             if wrong is None and self._before > _SETTINGS.of_one_marker * self.spread:
                 wrong = several_markers(search, self._before)
@@ -166,8 +168,9 @@ class _Check:
         return Plausibility(
             f"the pairs are hardly of this robot: {self._nominal_arm_misses()}, and with joints exchanged, counting "
             f"the other way or a quarter turn off still by {mm(after)}",
-            "Is the recording of another robot, or the URDF of another one, or is more than one thing wrong with the "
-            f"columns? Where the positions are that noisy, say so with --sigma-mm{doubted}",
+            "Is the recording or the URDF of another robot, is the camera on the hand and the marker in the room, are "
+            "the time stamps late (`bodyschema diagnose --force` measures it), or is more than one thing wrong with "
+            f"the columns? Where the positions are that noisy, say so with --sigma-mm{doubted}",
             better=self._before / (THRESHOLDS.right * self.spread),
         )
 

@@ -61,12 +61,12 @@ def few_outliers(search: ReadingSearch, before: float) -> str:
     return ""
 
 
-def all_shifted(search: ReadingSearch, q: FloatArray, x: FloatArray) -> Plausibility | None:
+def all_shifted(search: ReadingSearch, q: FloatArray, x: FloatArray, t: FloatArray | None) -> Plausibility | None:
     """Return a refusal if each position belongs to the angles of a row nearby; else None.
 
     Args:
         search: the search over other readings, which found none.
-        q, x: all pairs (n, d) [rad, m] and (n, 3) [m].
+        q, x, t: all pairs (n, d) [rad, m] and (n, 3) [m], and their times (n,) [s] if known.
     """
     shifts, rows = _rows_nearby(len(q))
     if not place_an_arm(len(rows), search.chain.joints):
@@ -82,7 +82,7 @@ def all_shifted(search: ReadingSearch, q: FloatArray, x: FloatArray) -> Plausibi
     return Plausibility(
         f"it seems that angles and positions are shifted against each other: with the angles of {row}, the pairs fit "
         f"to {mm(after)}, and as they are to {mm(before)}",
-        remedy,
+        _or_late(remedy, shift, t),
         misread=True,
         better=before / after,
     )
@@ -94,12 +94,14 @@ def many_apart(search: ReadingSearch, far: float) -> bool:
     return bool((apart > far).mean() > _SETTINGS.shifted)
 
 
-def partly_shifted(search: ReadingSearch, q: FloatArray, x: FloatArray, *, fits: bool) -> Plausibility | None:
+def partly_shifted(
+    search: ReadingSearch, q: FloatArray, x: FloatArray, t: FloatArray | None, *, fits: bool
+) -> Plausibility | None:
     """Return a refusal if in many rows, and not in most, angles or positions belong to a row nearby; else None.
 
     Args:
         search: the search over other readings.
-        q, x: all pairs (n, d) [rad, m] and (n, 3) [m].
+        q, x, t: all pairs (n, d) [rad, m] and (n, 3) [m], and their times (n,) [s] if known.
         fits: the pairs place the arm. Else every row may be wrong, and the arm is also placed by shifted rows.
     """
     if len(q) < FEWEST_ROWS:
@@ -115,8 +117,10 @@ def partly_shifted(search: ReadingSearch, q: FloatArray, x: FloatArray, *, fits:
     angles, positions = shares.max(axis=1)
     if max(angles, positions) < _SETTINGS.shifted:
         return None
-    row, remedy = _moved(shifts[int(shares[0].argmax())])
-    fit, remedy = f"these fit the angles of {row}", f"In these rows: {remedy[0].lower()}{remedy[1:]}"
+    shift = shifts[int(shares[0].argmax())]
+    row, remedy = _moved(shift)
+    fit = f"these fit the angles of {row}"
+    remedy = _or_late(f"In these rows: {remedy[0].lower()}{remedy[1:]}", shift, t)
     if positions > THRESHOLDS.much_better * angles:
         fit = f"their angles fit the positions of {_moved(shifts[int(shares[1].argmax())])[0]}"
         remedy = "Join the two logs by time, not by row: rows hold the angles of others"
@@ -169,4 +173,15 @@ def _moved(shift: int) -> tuple[str, str]:
         f"{rows} {where}",
         f"Move the columns of the joints by {rows} {'up' if shift > 0 else 'down'}, or the positions the other way; or "
         "join the two logs by time, not by row",
+    )
+
+
+def _or_late(remedy: str, shift: int, t: FloatArray | None) -> str:
+    """Return the remedy, and before it the delay that explains the shift where the rows have times (n,) [s]."""
+    if t is None:
+        return remedy
+    late_ms = -1e3 * shift * float(np.median(np.diff(t)))
+    return (
+        f"Of a bag or a dataset, add {late_ms:.0f} to --marker-delay-ms; of another recording, "
+        f"{remedy[0].lower()}{remedy[1:]}"
     )

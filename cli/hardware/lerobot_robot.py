@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+
 from bodyschema.cli.hardware.robot_template import Seen, guess_of, key_name, quoted, robot_toml
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.wiring.servos import KnownModel, Servos, known_models, require_servos
@@ -143,12 +145,17 @@ def _servos(arm: LeRobotArm, tree: UrdfTree, calibrations: Calibrations, file: P
                 remedy="Give the calibration of this kind of arm",
             )
         direction = -1 if arm.make == "feetech" and motor.drive_mode else 1
-        middle = (joint.lower + joint.upper) / 2
-        middle = 0.0 if abs(middle) < MIDDLE_WITHIN_RAD else middle
+        middle = _middle_rad(joint.lower, joint.upper)
         zero = motor.middle - direction * middle / RAD_PER_TICK
         zero = zero if middle == 0.0 else round(zero)
         found.append(LeRobotServo(name, motor.id, arm.models[name], direction, zero, middle))
     return found
+
+
+def _middle_rad(lower: float, upper: float) -> float:
+    """Return the angle of a joint with these limits where LeRobot reads 0° [rad]."""
+    middle = (lower + upper) / 2
+    return 0.0 if abs(middle) < MIDDLE_WITHIN_RAD else middle
 
 
 def _servo_tables(arm: LeRobotArm, servos: Sequence[LeRobotServo], calibration: Path, port: str) -> str:
@@ -188,6 +195,7 @@ class CorrectedCalibration:
     file: Path  # LeRobot's
     motors: Calibrations  # all motors as they would be written
     changes: tuple[Correction, ...]  # what is put into which motor
+    warnings: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, config: Config, file: Path, offsets_rad: Mapping[str, float]) -> CorrectedCalibration:
@@ -199,7 +207,8 @@ class CorrectedCalibration:
         servos = joint_servos(require_servos(config))
         motors = read_calibration(file, [servo.joint for servo in servos])
         changes = tuple(corrections(motors, servos, offsets_rad))
-        return cls(file, motors | {change.motor: change.after for change in changes}, changes)
+        after = motors | {change.motor: change.after for change in changes}
+        return cls(file, after, changes, _other_zeros(config, servos, motors, file))
 
     def already(self, recording: Path | None) -> list[str]:
         """Return what to say where the offsets of this recording are in the file already; else nothing."""
@@ -243,6 +252,27 @@ class CorrectedCalibration:
         return noted.decode(errors="surrogateescape")
 
 
+def _other_zeros(config: Config, servos: Sequence[JointServo], motors: Calibrations, file: Path) -> tuple[str, ...]:
+    """Return a warning if robot.toml was not written from this calibration, by the zeros of its servos."""
+    limits = dict(zip(config.robot.joints, zip(config.robot.lower, config.robot.upper, strict=True), strict=True))
+    read = [
+        (servo.joint, float(servo.angles(np.array(motors[servo.joint].middle))), _middle_rad(*limits[servo.joint]))
+        for servo in servos
+        if servo.joint in limits
+    ]
+    other = [
+        f"{joint} reads {math.degrees(angle):.1f}° and not {math.degrees(middle):.1f}°"
+        for joint, angle, middle in read
+        if abs(angle - middle) > RAD_PER_TICK
+    ]
+    if not other:
+        return ()
+    return (
+        f"{config.file.name} has other zeros than {file.name}: in the middle of its range {', '.join(other)}. If the "
+        "arm was calibrated again, or this is another arm's file, write robot.toml again: `bodyschema init --lerobot`.",
+    )
+
+
 def _digest(recording: Path | None) -> str | None:
     """Return the SHA-256 of a recording in one file; None of any other."""
     if recording is None or not recording.is_file():
@@ -273,7 +303,7 @@ def difference(corrected: CorrectedCalibration) -> list[str]:
         f"  (readings {math.degrees(change.offset_rad):+.3f}°)"
         for change in changes
     ]
-    return [*lines, _of_ranges(changes)]
+    return [*lines, _of_ranges(changes), *corrected.warnings]
 
 
 def after_writing(backup: Path) -> str:

@@ -207,6 +207,7 @@ def run(config: Config, source: Source, asked: Asked, tell: Tell, *, force: bool
         robot,
         recording.q,
         recording.x,
+        t=recording.t,
         chain=chain,
         sigma_m=told_sigma(recording),
         orientation=recording.orientation,

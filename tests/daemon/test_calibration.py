@@ -222,6 +222,34 @@ def test_pairs_of_all_poses_show_all_numbers_and_how_well_the_arm_is_made() -> N
     assert 0.3 < report.axes_deg / np.degrees(0.003) < 3.4  # one step of the choices
 
 
+def moving(late_s: float) -> CalibrationReport:
+    """Return the report on an arm that moves in two runs, its positions stamped `late_s` late."""
+    arm = planted(3)
+    t = np.concatenate([np.arange(0.0, 10.0, 0.1), 100.0 + np.arange(0.0, 10.0, 0.1)])
+    middle, swing = (arm.robot.lower + arm.robot.upper) / 2.0, (arm.robot.upper - arm.robot.lower) / 6.0
+    q, measured = (middle + swing * np.sin(np.outer(at, [0.3, 0.5, 0.7, 1.1])) for at in (t, t - late_s))
+    x = arm.parameters.positions(arm.change, measured) + SIGMA_M * np.random.default_rng(4).normal(size=(len(t), 3))
+    recording = Recording(joints=arm.robot.joints, q=q, x=x, t=t, segment=np.repeat([0, 1], 100))
+    return report_on(dataclasses.replace(arm, recording=recording))
+
+
+def test_positions_stamped_late_or_early_are_doubted() -> None:
+    assert "stamped too late" in (moving(0.01).doubt or "")
+    assert "stamped too early" in (moving(-0.01).doubt or "")
+
+
+def test_positions_stamped_in_time_are_not_doubted() -> None:
+    assert moving(0.0).doubt is None
+
+
+@pytest.mark.parametrize(("sigma", "doubted"), [(1e-6, True), (1e-4, False)])
+def test_positions_that_follow_from_the_joints_are_doubted(sigma: float, doubted: bool) -> None:
+    arm = planted(3)
+    x = arm.robot.chain.positions(arm.recording.q) + sigma * np.random.default_rng(4).normal(size=(100, 3))
+    report = report_on(dataclasses.replace(arm, recording=dataclasses.replace(arm.recording, x=x)))
+    assert ("computed from the joints" in (report.doubt or "")) == doubted
+
+
 def test_residuals_that_the_told_noise_does_not_explain_are_said() -> None:
     assert "residuals are 3.0 times what the noise explains" in said(planted(1), misfit=3.0)
 
@@ -390,15 +418,27 @@ def test_force_writes_what_is_refused(pairs_file, tmp_path, capsys) -> None:
     assert (tmp_path / "calibrated" / "robot.toml").exists()
 
 
-def test_a_zero_far_beyond_its_tolerance_is_not_written(pairs_file, tmp_path) -> None:
+def write_with_a_zero_far_off(file: Path) -> None:
     arm = planted(1)
     change = arm.change.copy()
     change[arm.parameters.zeros] += [0.0, np.radians(25.0), 0.0, 0.0]
     q = arm.recording.q
-    Recording(arm.robot.joints, q, arm.parameters.positions(change, q)).write_csv(pairs_file)
+    Recording(arm.robot.joints, q, arm.parameters.positions(change, q)).write_csv(file)
+
+
+def test_a_zero_far_beyond_its_tolerance_is_not_written(pairs_file, tmp_path) -> None:
+    write_with_a_zero_far_off(pairs_file)
     with pytest.raises(CalibrationError, match=r"nothing was written. .* zero of shoulder_pitch comes out .* --force"):
         called(pairs_file, "--out", tmp_path / "calibrated")
     assert not (tmp_path / "calibrated").exists()
+
+
+def test_a_pose_that_is_not_written_is_not_printed_for_ros(pairs_file, capsys) -> None:
+    called(pairs_file)
+    assert "static_transform_publisher" in capsys.readouterr().out
+    write_with_a_zero_far_off(pairs_file)
+    called(pairs_file)
+    assert "static_transform_publisher" not in capsys.readouterr().out
 
 
 def test_a_zero_as_far_off_as_was_told_is_written(pairs_file, tmp_path) -> None:

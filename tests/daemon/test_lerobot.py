@@ -200,6 +200,14 @@ def test_calibrate_shows_the_difference_and_writes_nothing(tmp_path, capsys) -> 
     assert mine.read_bytes() == (SO101 / "follower.json").read_bytes()
 
 
+@pytest.mark.parametrize(("arm", "warned"), [("follower", False), ("leader", True)])
+def test_a_calibration_with_other_zeros_is_told(arm, warned, tmp_path, capsys) -> None:
+    planted(tmp_path / "r.csv", robot_of("follower", tmp_path / "robot.toml"))
+    calibrate(tmp_path / "r.csv", "--lerobot", SO101 / f"{arm}.json")
+    said = capsys.readouterr().out
+    assert ("robot.toml has other zeros than leader.json: in the middle of its range shoulder_pan" in said) == warned
+
+
 @pytest.mark.parametrize("command", ["calibrate", "diagnose"])
 def test_a_wrong_calibration_is_told_before_the_recording_is_read(command, tmp_path) -> None:
     robot_of("follower", tmp_path / "robot.toml")

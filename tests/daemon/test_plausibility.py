@@ -57,9 +57,11 @@ class Pairs:
     pose_known: bool = False
     marker_known: bool = False
 
-    def seen(self, rows: int | None = None, orientation: np.ndarray | None = None) -> Plausibility:
+    def seen(
+        self, rows: int | None = None, orientation: np.ndarray | None = None, t: np.ndarray | None = None
+    ) -> Plausibility:
         known = robot(self.q.shape[1], pose_known=self.pose_known, marker_known=self.marker_known)
-        return plausibility(known, self.q[:rows], self.x[:rows], orientation=orientation)
+        return plausibility(known, self.q[:rows], self.x[:rows], t=t, orientation=orientation)
 
     def read(self, reading: Reading) -> Pairs:
         """Apply `reading` to this recording's columns."""
@@ -345,6 +347,15 @@ def test_a_shift_of_few_rows_is_refused() -> None:
     assert "with the angles of 1 row later" in (found.refusal or "")
 
 
+def test_positions_of_timed_rows_are_stamped_late_or_early() -> None:
+    right, t = pairs(joints=4, count=32), np.arange(30) / 30.0
+    late = replace(right, q=right.q[2:], x=right.x[:-2]).seen(t=t)
+    assert "with the angles of 2 rows earlier" in (late.refusal or "")
+    assert late.remedy.startswith("Of a bag or a dataset, add 67 to --marker-delay-ms")
+    early = replace(right, q=right.q[:-2], x=right.x[2:]).seen(t=t)
+    assert early.remedy.startswith("Of a bag or a dataset, add -67 to --marker-delay-ms")
+
+
 def test_a_shift_of_a_cycle_of_poses_is_named() -> None:
     """The positions of three of four poses in turn fit the angles of three others."""
     rng = np.random.default_rng(1)
@@ -387,6 +398,8 @@ def test_few_rows_of_another_robot_are_refused() -> None:
     right = pairs(joints=4, count=30)
     found = replace(right, x=np.random.default_rng(1).permutation(right.x)).seen()
     assert "hardly of this robot" in (found.refusal or "")
+    assert "is the camera on the hand" in found.remedy
+    assert "diagnose --force" in found.remedy
 
 
 def with_markers(turns: np.ndarray, places: np.ndarray, noise: float = 0.0005) -> Pairs:
@@ -452,6 +465,8 @@ def test_positions_of_another_robot_are_refused_without_a_name() -> None:
     right = pairs(joints=4)
     found = replace(right, x=np.random.default_rng(1).permutation(right.x)).seen()
     assert "hardly of this robot" in (found.refusal or "")
+    assert "is the camera on the hand" in found.remedy
+    assert "diagnose --force" in found.remedy
     assert not found.misread
 
 

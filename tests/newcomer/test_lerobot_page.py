@@ -13,14 +13,15 @@ from typed_pages import DOCS, TypedPage, command_of, commands_of, expected_mm
 
 from bodyschema.daemon.config import Config
 from bodyschema.robot.lerobot import read_calibration
+from bodyschema.robot.urdf import chain_between
 
 PAGE = (DOCS / "lerobot.md").read_text(encoding="utf-8")
 SO101 = DOCS.parent / "examples" / "so101"
 ROWS = 300
 TRUST, AGAIN = (f"bodyschema calibrate {name}.csv --trust-urdf" for name in ("so101", "again"))
-INIT, SIMULATE, EXPORT, DIFFERENCE, WRITE, SIMULATE_AGAIN = (
+INIT, SIMULATE, EXPORT, DIFFERENCE, WRITE, SIMULATE_AGAIN, CORRECT_URDF = (
     next(command for command in commands_of(PAGE) if re.search(word, command))
-    for word in ("init", "simulate", "--markers", r"\.json$", r"\.json --write", "mended.toml")
+    for word in ("init", "simulate", "--markers", r"\.json$", r"\.json --write", "mended.toml", "--out calibrated")
 )
 
 
@@ -66,6 +67,23 @@ def test_without_an_arm_every_number_is_the_page_s(page: TypedPage) -> None:
     after = expected_mm(page.type(AGAIN))
     assert after == expected_mm(page.shown(AGAIN))
     assert after[0] < before[0] / 2
+
+
+def hand(robot: str, q: np.ndarray) -> np.ndarray:
+    """Return where the URDF of a robot.toml has gripper_frame_link in base_link (n, 3) [m]."""
+    found, ends = Config.load(Path(robot), {}).robot, {"start": "base_link", "end": "gripper_frame_link"}
+    chain = chain_between(found.tree, found.joints, {}, **ends, T_start_camera=np.eye(4), marker_xyz=np.zeros(3))
+    return chain.positions(q)
+
+
+def test_the_corrected_urdf_takes_the_worn_arm_s_readings(page: TypedPage) -> None:
+    page.type(INIT)
+    page.type(SIMULATE)
+    page.type(CORRECT_URDF)
+    q = np.random.default_rng(0).uniform(-0.8, 0.8, (100, 5))
+    true = hand("robot.toml", q + np.array([0.0, 0.0436, -0.0524, 0.0262, 0.0]))
+    off = np.linalg.norm(hand("calibrated/robot.toml", q) - true, axis=1)
+    assert off.max() < 3e-4
 
 
 def offsets(text: str) -> list[int]:

@@ -277,7 +277,7 @@ class _Rows:
         rows = self.recording
         require_units(self.robot, rows, self.source)
         sigma_m = told_sigma(rows) or sigma_m
-        return plausibility(self.robot, rows.q, rows.x, sigma_m=sigma_m, orientation=rows.orientation)
+        return plausibility(self.robot, rows.q, rows.x, t=rows.t, sigma_m=sigma_m, orientation=rows.orientation)
 
 
 def _common_errors(config: Config, source: Path, taken: SourceOptions) -> tuple[CommonErrors | None, list[str]]:
@@ -344,4 +344,6 @@ def _show(report: CalibrationReport, lines: list[str], written: list[str]) -> No
     from bodyschema.robot.hand_eye import in_shell_lines
 
     Console(highlight=False).print(view(report))
-    say(*(["", *lines] if lines else []), f"\nIn ROS 2:\n{in_shell_lines(report.hand_eye)}", *written)
+    trusted = written or (report.beyond is None and report.other_tool_from is None)
+    for_ros = [f"\nIn ROS 2:\n{in_shell_lines(report.hand_eye)}"] if trusted else []
+    say(*(["", *lines] if lines else []), *for_ros, *written)

@@ -89,6 +89,7 @@ def replay(
         config.robot,
         rows.q,
         rows.x,
+        t=rows.t,
         chain=chain,
         sigma_m=told_sigma(rows) or sigma_m,
         orientation=rows.orientation,
