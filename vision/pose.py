@@ -112,6 +112,36 @@ class PoseEstimator:
         cov = np.linalg.inv(full.T @ full)
         return float((cov @ full.T @ there.residuals)[6]), math.sqrt(cov[6, 6])
 
+    def bent(self, pose: Pose, heights: FloatArray) -> Pose:
+        """Return the pose of a plate that may be bent, and claims that contain what cannot be told from a bend.
+
+        One more Gauss-Newton step with its bends free, each with its second moment by what the residuals show.
+
+        Args:
+            pose: that of a flat plate.
+            heights: each bend's heights (k, m) [m] at the points, as every eye sees them all.
+        """
+        there = self._linearised(pose.rotation, pose.x)
+        if there is None:
+            return pose
+        bends = [self._raised(eye, pose)[..., None] * heights[:, None] for eye in self._eyes]
+        raised = self._whitened([each.reshape(-1, heights.shape[1]) for each in bends])
+        full = np.column_stack([there.jacobian, raised])
+        cov = np.linalg.inv(full.T @ full)
+        amounts = (cov @ full.T @ there.residuals)[6:]
+        full[:, 6:] *= np.sqrt(amounts**2 + np.diag(cov)[6:])
+        cov = np.asarray(np.linalg.inv(full.T @ full + np.diag([0.0] * 6 + [1.0] * len(amounts))), np.float64)
+        change = cov @ full.T @ there.residuals
+        left = there.residuals - full @ change
+        turn = np.asarray(cv2.Rodrigues(change[:3])[0], np.float64)
+        squares = float(left @ left + change[6:] @ change[6:])
+        return Pose(turn @ pose.rotation, pose.x + change[3:6], cov[:6, :6], squares)
+
+    def _raised(self, eye: Sighting, pose: Pose) -> FloatArray:
+        """Return the derivative of an eye's pixels by the height of its points along the body's z (k, 2)."""
+        points = eye.points @ pose.rotation.T + self._in_eye(pose.x, eye)
+        return projection_slopes(self._calibration.focal_px, points) @ pose.rotation[:, 2]
+
     def _moved(self, eye: Sighting, pose: Pose) -> FloatArray:
         """Return the derivative of an eye's pixels by the body's size (k, 2)."""
         arms = eye.points @ pose.rotation.T

@@ -25,7 +25,7 @@ from bodyschema.vision.images import check_calibration, check_images
 from bodyschema.vision.pose import Pose, PoseEstimator, Sighting, angle_between, first_pose, fitted_motion, mirrored
 from bodyschema.vision.triangulate import triangulate
 
-from .body import TagBody
+from .body import TagBody, bends
 from .chessboard import ChessboardFinder
 from .config import TagConfig
 from .finder import Seen, TagFinder
@@ -77,6 +77,7 @@ class TagTracker:
         check_calibration(calibration)
         self.calibration, self.body, self.config = calibration, body, config or TagConfig()
         self._finder = finder or TagFinder(self.config, body.corners)
+        self._bends = None if finder is None else bends(body.corners[0])
         self._whole = (0, 0, *calibration.image_size_px)
         self._is_known, self._readout_s, self._t_sigma = not readout_sigma_s, readout_s or readout_sigma_s, 0.0
         self._last: tuple[float, list[dict[int, FloatArray]], FloatArray] | None = None
@@ -231,6 +232,8 @@ class TagTracker:
         for rotation, x in self._starts(seen):
             for turn in (rotation, self._mirrored(rotation, x, seen)):
                 pose = estimator.refine(turn, x)
+                if pose is not None and self._bends is not None:
+                    pose = estimator.bent(pose, self._bends)
                 if pose is not None and all(
                     angle_between(pose.rotation, other.rotation) > _Settings.two_poses_rad for other in poses
                 ):
