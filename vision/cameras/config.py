@@ -22,7 +22,6 @@ Side = Annotated[int, Meta(ge=16, le=LARGEST_SIDE_PX)]
 LAYOUTS = ("one", "two", "side_by_side", "realsense", "images", "videos")
 # Latency uncertainty of an uncalibrated camera [s]: exposure, readout and transfer of a webcam.
 UNKNOWN_LATENCY_SIGMA_S = 0.015
-USUAL_FPS = 30.0
 ENUMERATED = re.compile(r"\d+|/dev/video\d+")
 
 
@@ -41,7 +40,7 @@ class UvcSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     """
 
     image_size_px: tuple[Side, Side]
-    fps: Positive = USUAL_FPS
+    fps: Positive = 30.0
     fourcc: Literal["MJPG", "YUYV"] = "MJPG"
     buffers: Annotated[int, Meta(ge=1, le=10)] = 1
     exposure_s: Positive | None = None
@@ -103,7 +102,7 @@ class RealsenseConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
 
     serial: str | None = None
     image_size_px: tuple[Side, Side] = (848, 480)
-    fps: Positive = USUAL_FPS
+    fps: Positive = 30.0
     exposure_s: Positive | None = None
     gain: NonNegative | None = None
     emitter: bool = False
@@ -213,7 +212,7 @@ class CamerasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         """The readout of the rows and the RMS of what it may be besides [s]: one that is not known is uniform."""
         if self.readout_s is not None:
             return self.readout_s, 0.0
-        return 0.0, 1.0 / (self.layout.fps or USUAL_FPS) / math.sqrt(3.0)
+        return 0.0, 1.0 / (self.layout.fps or 30.0) / math.sqrt(3.0)
 
     def check(self, file: Path, text: str, table: tuple[str, ...] = ("vision", "cameras")) -> None:
         """Raise ConfigError if there is not exactly one layout, or if it is incomplete; `table` is where it stands."""

@@ -104,7 +104,8 @@ class ChessboardFinder:
         contrast = levels[inner][~dark[inner]].mean() - levels[inner][dark[inner]].mean()
         if contrast < self._config.min_contrast:
             return Reason.LOW_CONTRAST
+        # A margin has 0 of the contrast, another row of squares all of it: 0.3 to 0.85 change no outcome of the tests.
         for side in (np.s_[0, 1:-1], np.s_[-1, 1:-1], np.s_[1:-1, 0], np.s_[1:-1, -1]):
-            if levels[side][~dark[side]].min() - levels[side][dark[side]].max() > 0.5 * contrast:  # half-way
+            if levels[side][~dark[side]].min() - levels[side][dark[side]].max() > 0.5 * contrast:
                 return self._other("more")
         return None

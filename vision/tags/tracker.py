@@ -77,7 +77,7 @@ class TagTracker:
         check_calibration(calibration)
         self.calibration, self.body, self.config = calibration, body, config or TagConfig()
         self._finder = finder or TagFinder(self.config, body.corners)
-        self._bends = None if finder is None else bends(body.corners[0])
+        self._bends = bends(body.corners[0]) if isinstance(finder, ChessboardFinder) else None
         self._whole = (0, 0, *calibration.image_size_px)
         self._is_known, self._readout_s, self._t_sigma = not readout_sigma_s, readout_s or readout_sigma_s, 0.0
         self._last: tuple[float, list[dict[int, FloatArray]], FloatArray] | None = None
