@@ -54,11 +54,17 @@ def test_the_tables_of_a_printed_cube_are_those_of_its_size_on_paper(tmp_path, c
 
 @pytest.mark.parametrize(
     ("ids", "said"),
-    [("5", "both rulers: each is 50 mm."), ("0-5", "both rulers: 160 mm below, 110 mm beside the tags.")],
+    [("5", "both rulers: each is 50 mm."), ("0-5", "both rulers: 160 mm below the picture, 110 mm beside it.")],
 )
 def test_what_to_measure_on_the_print_is_said(ids, said, tmp_path, capsys) -> None:
     called("marker", "print", "--ids", ids, "--out", tmp_path / "tags.svg")
     assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("shape", ["tags", "plate", "cube", "board", "chessboard"])
+def test_each_shape_is_printed_without_further_options(shape, tmp_path) -> None:
+    called("marker", "print", "--shape", shape, "--out", tmp_path / "page.svg")
+    assert (tmp_path / "page.svg").stat().st_size > 0
 
 
 def test_single_tags_have_the_table_of_the_first(tmp_path, capsys) -> None:

@@ -52,11 +52,21 @@ def print_tags(
     ] = None,
     family: Family = "apriltag_36h11",
     side_mm: Annotated[
-        float,
-        Parameter(help="Side of a tag's black square, or of a chessboard's [mm].", validator=Number(gte=5, lte=500)),
-    ] = 40.0,
-    columns: Annotated[int, Parameter(help="Of a plate, or a board.", validator=Number(gte=1, lte=20))] = 2,
-    rows: Annotated[int, Parameter(help="Of a plate, or a board.", validator=Number(gte=1, lte=20))] = 1,
+        float | None,
+        Parameter(
+            help="Side of a tag's black square, or of a chessboard's [mm]. Default 40, of boards 20 and 30.",
+            validator=Number(gte=5, lte=500),
+            show_default=False,
+        ),
+    ] = None,
+    columns: Annotated[
+        int | None,
+        Parameter(help="Of a plate (default 2), or a board (8).", validator=Number(gte=1, lte=20), show_default=False),
+    ] = None,
+    rows: Annotated[
+        int | None,
+        Parameter(help="Of a plate (default 1), or a board (5).", validator=Number(gte=1, lte=20), show_default=False),
+    ] = None,
     fold_deg: Annotated[
         float, Parameter(help="By how much each column of a plate is folded away from the one before [°].")
     ] = 0.0,
@@ -83,10 +93,13 @@ def print_tags(
     """
     from bodyschema.cli.cameras.tag_pages import Tags, as_printed, face_mm, tables, write_tags
 
-    drawn = Tags(shape, ids, family, side_mm, columns, rows, fold_deg)
+    usual_mm, *usual = {"board": (20.0, 8, 5), "chessboard": (30.0, 8, 5)}.get(shape, (40.0, 2, 1))
+    drawn = Tags(shape, ids, family, side_mm or usual_mm, columns or usual[0], rows or usual[1], fold_deg)
     across, upright = write_tags(drawn, paper, out)
     tags = drawn if ruler_mm is None else as_printed(drawn, across, ruler_mm)
-    rulers = f"each is {across:g} mm" if across == upright else f"{across:g} mm below, {upright:g} mm beside the tags"
+    rulers = (
+        f"each is {across:g} mm" if across == upright else f"{across:g} mm below the picture, {upright:g} mm beside it"
+    )
     said = f"{out} written. Print it at 100 %, then measure both rulers: {rulers}."
     if drawn.body is not None:
         said += f" Each {'square' if shape == 'board' else 'face'} is {face_mm(tags):.1f} mm wide."
