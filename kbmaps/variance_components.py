@@ -38,9 +38,9 @@ def error_covariances(errors: FloatArray, stated: FloatArray, readings: FloatArr
         stated: covariances of the measured positions (n, 3, 3) [m²], NaN or 0 where none is stated; one at least is.
         readings: J, derivatives of the positions by the joints (n, 3, d) [m/rad].
     """
-    told = ~np.isnan(stated).any(axis=(1, 2)) & stated.any(axis=(1, 2))
-    typical = float(stated[told].diagonal(axis1=1, axis2=2).mean())
-    stated = np.where(told[:, None, None], stated, np.eye(3) * typical)
+    variances = np.trace(stated, axis1=1, axis2=2) / 3.0
+    told = variances > 0.0
+    stated = np.where(told[:, None, None], stated, np.eye(3) * float(variances[told].mean()))
     values, axes = np.linalg.eigh(stated)
     least_sure = axes[:, :, 2] * np.sqrt(values[:, 2:])
     parts = np.stack(
