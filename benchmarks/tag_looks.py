@@ -30,6 +30,13 @@ from bodyschema.vision.tags.tracker import TagTracker
 
 READOUT_S, SWING_HZ, SIDE_M = 0.02, 0.7, 0.05
 TAG = TagConfig(side_m=SIDE_M)
+# What the tracker is given: the readout, and the RMS of one that is not known at 30 frames a second.
+TOLD = {
+    "0": (0.0, 0.0),
+    "as it is": (READOUT_S, 0.0),
+    "1.3 times": (1.3 * READOUT_S, 0.0),
+    "not known": (0.0, 1.0 / 30.0 / 3.0**0.5),
+}
 # Luminance of red, green and blue stripes is left of a pixel's middle by this share of it.
 LEFT = 0.062
 
@@ -78,7 +85,7 @@ def moving(tags: int, eyes: int) -> None:
     camera = VGA if eyes == 2 else replace(VGA, baseline_m=0.0)
     look = Look(samples=6, noise_sd=2.0, blur_px=0.6, wall=0.5)
     for speed, spin_deg in ((0.02, 3.0), (0.05, 6.0), (0.1, 12.0), (0.3, 30.0)):
-        rng, judged = np.random.default_rng(7), {told: Judged() for told in (0.0, READOUT_S, 1.3 * READOUT_S)}
+        rng, judged = np.random.default_rng(7), {told: Judged() for told in TOLD}
         for _ in range(tags):
             z = rng.uniform(0.45, 0.7)
             x0 = np.array([rng.uniform(-0.05, 0.15) * z, rng.uniform(-0.22, 0.22) * z, z])
@@ -90,7 +97,7 @@ def moving(tags: int, eyes: int) -> None:
                 swung = (np.sin(omega * t + phase) - np.sin(phase)) / omega  # noqa: B023
                 return Rotation.from_rotvec(w * swung) * R0, x0 + v * swung  # noqa: B023
 
-            trackers = {told: TagTracker(camera, TagBody.single(TAG), TAG, readout_s=told) for told in judged}
+            trackers = {told: TagTracker(camera, TagBody.single(TAG), TAG, None, *TOLD[told]) for told in judged}
             for t in (0.0, 1.0 / 30.0):
                 (rotation, x), now = at(t), READOUT_S * np.cos(omega * t + phase)
                 sheet = Sheet(0, rotation.as_matrix(), x, SIDE_M, moved_m=tuple(now * v), turned_rad=tuple(now * w))
@@ -101,7 +108,7 @@ def moving(tags: int, eyes: int) -> None:
                     if t > 0.0:
                         judged[told].add(found, *at(t + late_s))
         for told, each in judged.items():
-            print(f"{speed:g} m/s {spin_deg:g} °/s, readout_s = {told:g}: {each}", flush=True)
+            print(f"{speed:g} m/s {spin_deg:g} °/s, readout {told}: {each}", flush=True)
 
 
 def display(tags: int) -> None:

@@ -115,6 +115,11 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return self.chessboard
 
     @property
+    def readout(self) -> tuple[float, float]:
+        """The cameras' readout of the rows and what is not known of it, as they have it; images of none are global."""
+        return (0.0, 0.0) if self.cameras is None else self.cameras.readout
+
+    @property
     def size_sigma(self) -> float:
         """Relative 1-sigma of the size of tags or a chessboard."""
         if self.marker == "chessboard":

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -25,12 +25,14 @@ class Sighting:
         pixels: image coordinates (k, 2) [px].
         cov_px: covariance (2k, 2k) [px²] of u and v of the first, then of the second point ...
         right: True for the right eye.
+        shared_px: 1-sigma (k, 2), or (1, 2), [px] of an error that the points of all sightings have in common.
     """
 
     points: FloatArray
     pixels: FloatArray
     cov_px: FloatArray
     right: bool
+    shared_px: FloatArray = field(default_factory=lambda: np.zeros((1, 2)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +77,10 @@ class PoseEstimator:
         self._calibration = calibration
         self._eyes = [_all_of(sightings, right) for right in (False, True) if any(s.right == right for s in sightings)]
         self._roots = [whitening(eye.cov_px, calibration.pixel_sigma) for eye in self._eyes]
+        whitened = [root @ eye.shared_px.ravel() for eye, root in zip(self._eyes, self._roots, strict=True)]
+        self._shared = np.concatenate(whitened)
+        square = 1.0 + float(self._shared @ self._shared)
+        self._shrink = 1.0 / (square + math.sqrt(square))
 
     def refine(self, rotation: FloatArray, x: FloatArray) -> Pose | None:
         """Return the least-squares pose near a first one; None if the body is not in front of the eyes.
@@ -101,12 +107,40 @@ class PoseEstimator:
         there = self._linearised(pose.rotation, pose.x)
         if there is None:
             return math.inf, 0.0
-        grown = np.concatenate(
-            [root @ self._moved(eye, pose).ravel() for eye, root in zip(self._eyes, self._roots, strict=True)]
-        )
+        grown = self._whitened([self._moved(eye, pose).ravel() for eye in self._eyes])
         full = np.column_stack([there.jacobian, grown])
         cov = np.linalg.inv(full.T @ full)
         return float((cov @ full.T @ there.residuals)[6]), math.sqrt(cov[6, 6])
+
+    def bent(self, pose: Pose, heights: FloatArray) -> Pose:
+        """Return the pose of a plate that may be bent, and claims that contain what cannot be told from a bend.
+
+        One more Gauss-Newton step with its bends free, each with its second moment by what the residuals show.
+
+        Args:
+            pose: that of a flat plate.
+            heights: each bend's heights (k, m) [m] at the points, as every eye sees them all.
+        """
+        there = self._linearised(pose.rotation, pose.x)
+        if there is None:
+            return pose
+        bends = [self._raised(eye, pose)[..., None] * heights[:, None] for eye in self._eyes]
+        raised = self._whitened([each.reshape(-1, heights.shape[1]) for each in bends])
+        full = np.column_stack([there.jacobian, raised])
+        cov = np.linalg.inv(full.T @ full)
+        amounts = (cov @ full.T @ there.residuals)[6:]
+        full[:, 6:] *= np.sqrt(amounts**2 + np.diag(cov)[6:])
+        cov = np.asarray(np.linalg.inv(full.T @ full + np.diag([0.0] * 6 + [1.0] * len(amounts))), np.float64)
+        change = cov @ full.T @ there.residuals
+        left = there.residuals - full @ change
+        turn = np.asarray(cv2.Rodrigues(change[:3])[0], np.float64)
+        squares = float(left @ left + change[6:] @ change[6:])
+        return Pose(turn @ pose.rotation, pose.x + change[3:6], cov[:6, :6], squares)
+
+    def _raised(self, eye: Sighting, pose: Pose) -> FloatArray:
+        """Return the derivative of an eye's pixels by the height of its points along the body's z (k, 2)."""
+        points = eye.points @ pose.rotation.T + self._in_eye(pose.x, eye)
+        return projection_slopes(self._calibration.focal_px, points) @ pose.rotation[:, 2]
 
     def _moved(self, eye: Sighting, pose: Pose) -> FloatArray:
         """Return the derivative of an eye's pixels by the body's size (k, 2)."""
@@ -120,7 +154,7 @@ class PoseEstimator:
 
     def _linearised(self, rotation: FloatArray, x: FloatArray) -> _Linearised | None:
         residuals, jacobians = [], []
-        for eye, root in zip(self._eyes, self._roots, strict=True):
+        for eye in self._eyes:
             arms = eye.points @ rotation.T
             points = arms + self._in_eye(x, eye)
             if (points[:, 2] <= 0.0).any():
@@ -128,16 +162,22 @@ class PoseEstimator:
             projection = projection_slopes(self._calibration.focal_px, points)
             by_turn = projection @ turned(arms)
             seen = self._calibration.focal_px * points[:, :2] / points[:, 2:] + self._calibration.principal_point_px
-            residuals.append(root @ (eye.pixels - seen).ravel())
-            jacobians.append(root @ np.concatenate([by_turn, projection], axis=2).reshape(-1, 6))
-        return _Linearised(rotation, x, np.concatenate(residuals), np.concatenate(jacobians))
+            residuals.append((eye.pixels - seen).ravel())
+            jacobians.append(np.concatenate([by_turn, projection], axis=2).reshape(-1, 6))
+        return _Linearised(rotation, x, self._whitened(residuals), self._whitened(jacobians))
+
+    def _whitened(self, eyes: Sequence[FloatArray]) -> FloatArray:
+        """Return all eyes' values with independent errors of sigma 1: by C^-1/2 of C = 1 + what they share."""
+        values = np.concatenate([root @ each for root, each in zip(self._roots, eyes, strict=True)])
+        return values - np.multiply.outer(self._shrink * self._shared, self._shared @ values)
 
 
 def _all_of(sightings: Sequence[Sighting], right: bool) -> Sighting:
     """Return one eye's sighting of all points."""
     seen = [sighting for sighting in sightings if sighting.right == right]
     points, pixels = np.concatenate([s.points for s in seen]), np.concatenate([s.pixels for s in seen])
-    return Sighting(points, pixels, np.asarray(block_diag(*(s.cov_px for s in seen))), right)
+    shared = np.concatenate([np.broadcast_to(s.shared_px, s.pixels.shape) for s in seen])
+    return Sighting(points, pixels, np.asarray(block_diag(*(s.cov_px for s in seen))), right, shared)
 
 
 def projection_slopes(focal_px: float, points: FloatArray) -> FloatArray:

@@ -41,10 +41,16 @@ class TrackedCamera:
     """A `MarkerSource`: opens and closes the camera, and tracks the marker in every frame."""
 
     def __init__(
-        self, camera: StereoCamera, tracker: MarkerTracker, annotator: Draws | None = None, readout_s: float = 0.0
+        self,
+        camera: StereoCamera,
+        tracker: MarkerTracker,
+        annotator: Draws | None = None,
+        readout_s: float = 0.0,
+        readout_sigma_s: float = 0.0,
     ) -> None:
-        """Track in images whose first and last rows are exposed `readout_s` [s] apart."""
-        self._camera, self._tracker, self._annotator, self._readout_s = camera, tracker, annotator, readout_s
+        """Track in images whose first and last rows are exposed `readout_s` ± `readout_sigma_s` [s] apart."""
+        self._camera, self._tracker, self._annotator = camera, tracker, annotator
+        self._readout_s, self._readout_sigma_s = readout_s, readout_sigma_s
         self._newest: tuple[StereoFrame, MarkerFix | MarkerMiss] | None = None
 
     def __enter__(self) -> Self:
@@ -82,5 +88,5 @@ class TrackedCamera:
             return seen
         calibration = self._camera.calibration
         row = float(calibration.project(seen.x)[1]) / calibration.image_size_px[1]
-        late_s = self._readout_s * (row - 0.5)
-        return replace(seen, t=seen.t + late_s, t_sigma=math.hypot(frame.t_sigma, seen.t_sigma))
+        late_s, late_sigma_s = self._readout_s * (row - 0.5), self._readout_sigma_s * (row - 0.5)
+        return replace(seen, t=seen.t + late_s, t_sigma=math.hypot(frame.t_sigma, seen.t_sigma, late_sigma_s))

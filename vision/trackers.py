@@ -28,8 +28,7 @@ def tracker_of(calibration: StereoCalibration, config: VisionConfig) -> MarkerTr
             from bodyschema.vision.tags.tracker import TagTracker
 
             board = ChessboardFinder(config.board, config.tag) if config.marker == "chessboard" else None
-            readout_s = 0.0 if config.cameras is None else config.cameras.readout_s
-            return TagTracker(calibration, TagBody.of(config), config.tag, board, readout_s)
+            return TagTracker(calibration, TagBody.of(config), config.tag, board, *config.readout)
         case "plugin":
             if config.plugin is None:
                 raise ConfigError('[vision] marker = "plugin" names none', remedy="Add [vision.plugin] with its name")

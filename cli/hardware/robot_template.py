@@ -139,6 +139,7 @@ _CAMERAS = """\
 [vision.cameras]
 {hidden}calibration = "cameras.toml"   # as `bodyschema calibrate cameras` writes it; else images are rectified
 # latency_s = 0.0                # as `bodyschema calibrate latency` says, with its latency_sigma_s
+# readout_s = 0.02               # from the first to the last row, 0 for a global shutter; else moving tags are unsure
 {devices}image_size_px = [640, 480]
 fps = 30.0
 # exposure_s = 0.005             # a short one: a moving ball blurs. Without a value the camera chooses.

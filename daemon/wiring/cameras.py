@@ -152,10 +152,11 @@ def tracked_images(config: Config, folder: Path) -> TrackedCamera:
 
 def _tracked(config: Config, **layout: VideosConfig | ImagesConfig) -> TrackedCamera:
     given = cameras_of(config)
-    cameras = CamerasConfig(calibration=None if given is None else given.calibration, **layout)  # pyright: ignore[reportArgumentType]
+    calibration, readout_s = (None, None) if given is None else (given.calibration, given.readout_s)
+    cameras = CamerasConfig(calibration=calibration, readout_s=readout_s, **layout)  # pyright: ignore[reportArgumentType]
     seen = seen_through(config, cameras)
     camera = camera_of(seen, open_eyes(seen, SystemClock()))
-    return TrackedCamera(camera, tracker_of(camera.calibration, seen.tables.vision), readout_s=cameras.readout_s)
+    return TrackedCamera(camera, tracker_of(camera.calibration, seen.tables.vision), None, *cameras.readout)
 
 
 def seen_through(config: Config, cameras: CamerasConfig) -> Config:

@@ -292,9 +292,8 @@ def _tracked(camera: StereoCamera, config: Config) -> TrackedCamera:
     from bodyschema.vision.trackers import tracker_of
 
     vision = config.tables.vision
-    readout_s = 0.0 if vision.cameras is None else vision.cameras.readout_s
     annotator = Annotator(camera.calibration, vision)
-    return TrackedCamera(camera, tracker_of(camera.calibration, vision), annotator, readout_s)
+    return TrackedCamera(camera, tracker_of(camera.calibration, vision), annotator, *vision.readout)
 
 
 def open_streams(config: Config, clock: Clock) -> list[MarkerStream]:

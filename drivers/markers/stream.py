@@ -352,6 +352,7 @@ class _Numbers:
     def __init__(self) -> None:
         self._newest: int | None = None
         self._lower = self._lost = 0
+        self._missing: deque[range] = deque(maxlen=100)  # bounds the time for each message
 
     def count(self, seq: int, unread: int) -> tuple[int, Fault | None]:
         """Return how many were lost before `seq`, and the fault if it is not a newer one.
@@ -362,16 +363,25 @@ class _Numbers:
         """
         before = self._newest
         if before is None or seq > before:
-            lost = 0 if before is None else max(seq - before - 1 - unread, 0)
+            first = seq if before is None else before + 1
+            lost = max(seq - first - unread, 0)
             self._newest, self._lower, self._lost = seq, 0, self._lost + lost
+            if lost:
+                self._missing.append(range(first, seq))
             return lost, None
+        gap = next((gap for gap in self._missing if seq in gap), None)
+        if gap is not None:
+            self._missing.remove(gap)
+            self._missing.extend(part for part in (range(gap.start, seq), range(seq + 1, gap.stop)) if part)
+            late = int(self._lost > 0)
+            self._lost -= late
+            return -late, Fault.OUT_OF_ORDER
         self._lower += seq < before
         if self._lower >= _Settings.restart:
             self._newest, self._lower = seq, 0
+            self._missing.clear()
             return 0, None
-        late = int(seq < before and self._lost > 0)
-        self._lost -= late
-        return -late, Fault.DUPLICATE if seq == before else Fault.OUT_OF_ORDER
+        return 0, Fault.DUPLICATE if seq == before else Fault.OUT_OF_ORDER
 
 
 READ_S = 2.5  # until the clock of the stamps is known to milliseconds

@@ -121,6 +121,16 @@ def test_restarted_sender_is_followed_again() -> None:
     assert len(sent.send(400, stamp=...)) > 390
 
 
+def test_burst_of_late_messages_is_no_restarted_sender() -> None:
+    sent = Sent()
+    sent.send(10, stamp=...)
+    sent.send(seq=20, stamp=...)
+    for seq in range(10, 18):
+        assert sent.send(seq=seq, stamp=...) == []
+    assert len(sent.send(seq=21, stamp=...)) == 1
+    assert {what: count for what, count in sent.counts.items() if count} == {"used": 12, "out_of_order": 8, "lost": 2}
+
+
 def test_marker_is_told_from_another_body() -> None:
     sent = faulty(body="tool")
     assert sent.send(5, body="table") == []

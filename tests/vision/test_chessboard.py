@@ -17,6 +17,8 @@ from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, StereoFrame
 from bodyschema.vision.cameras.annotate import Annotator
 from bodyschema.vision.config import VisionConfig
+from bodyschema.vision.pose import PoseEstimator, Sighting
+from bodyschema.vision.tags.body import TagBody, bends
 from bodyschema.vision.tags.config import ChessboardConfig
 from bodyschema.vision.trackers import tracker_of
 
@@ -85,6 +87,51 @@ def test_chessboard_is_as_sure_as_it_claims(eyes) -> None:
     assert len(within) >= 51  # from 45° on, squares of 16 px are too narrow for some
     assert 60.0 < once < 76.0
     assert twice > 90.0
+
+
+def curled(eyes: str, curl: float, frames: int = 12) -> tuple[FloatArray, FloatArray]:
+    """Return errors and claims (n, 6) of rendered boards that curl by `curl` [1/m] across their width."""
+    columns = np.arange(1, SQUARES[0]) - 0.5 * SQUARES[0]
+    raised = 0.5 * curl * float(np.square(SIDE_M * columns).mean())  # the plane nearest to the corners
+    rng, found = np.random.default_rng(5), []
+    for k in range(frames):
+        rotation = facing(float(rng.uniform(15.0, 40.0)), float(rng.uniform(0.0, 360.0)), (*rng.normal(size=2), 0.0))
+        frame = photographed(eyes, replace(shown(rotation), curl=curl), seed=k)
+        found.append(off(tracker_of(EYES[eyes], BOARD).track(frame), rotation, PLACE + raised * rotation[:, 2]))
+    errors, sigmas = zip(*found, strict=True)
+    return np.array(errors), np.array(sigmas)
+
+
+@pytest.mark.parametrize("eyes", EYES)
+def test_curled_chessboard_is_as_sure_as_a_flat_one(eyes) -> None:
+    errors, sigmas = curled(eyes, 4.0)
+    assert np.sqrt(np.square(errors / sigmas).mean(axis=0)).max() < 1.6
+    assert (np.median(sigmas, axis=0) < 2.0 * np.median(curled(eyes, 0.0)[1], axis=0)).all()
+
+
+@pytest.mark.parametrize("eyes", EYES)
+@pytest.mark.parametrize(
+    "bent", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.5, 0.7, 0.5)], ids=["curled", "twisted", "askew"]
+)
+def test_bent_plate_is_placed_as_well_as_a_flat_one(eyes, bent) -> None:
+    calibration, noise_px, rng = EYES[eyes], 0.03, np.random.default_rng(3)
+    corners = TagBody.chessboard(ChessboardConfig(columns=8, rows=5, square_m=0.02)).corners[0]
+    heights, off_flat, off_bent = bends(corners), [], []
+    for _ in range(40):
+        rotation = facing(float(rng.uniform(10.0, 45.0)), float(rng.uniform(0.0, 360.0)), (*rng.normal(size=2), 0.0))
+        seen = corners + 0.0004 * np.outer(heights @ bent, [0.0, 0.0, 1.0])
+        px = np.array([calibration.project(p) for p in seen @ rotation.T + PLACE]).reshape(-1, 2, 2)
+        px += noise_px * rng.normal(size=px.shape)
+        cov = noise_px**2 * np.eye(2 * len(corners))
+        sightings = [Sighting(corners, px[:, eye], cov, right=bool(eye)) for eye in range(len(calibration.eyes_m))]
+        estimator = PoseEstimator(calibration, sightings)
+        flat = estimator.refine(rotation, PLACE)
+        assert flat is not None
+        for pose, errors in ((flat, off_flat), (estimator.bent(flat, heights), off_bent)):
+            turn = Rotation.from_matrix(pose.rotation @ rotation.T).as_rotvec()
+            errors.append(np.concatenate([turn, pose.x - PLACE]) / np.sqrt(np.diag(pose.cov)))
+    assert np.sqrt(np.square(off_flat).mean(axis=0)).max() > 3.0
+    assert 0.6 < (np.abs(off_bent) < 1.0).mean() < 0.8
 
 
 @pytest.mark.parametrize("squares", [(8, 5), (7, 5), (8, 4), (9, 6)], ids=str)

@@ -83,6 +83,15 @@ def test_the_ball_is_followed_episode_by_episode(version: str, config: Config, t
     np.testing.assert_allclose(track.x[:, 2], wanted[:, 2], rtol=0.03)
 
 
+def test_readout_of_the_configured_camera_holds_for_its_videos(tmp_path: Path) -> None:
+    cameras = '[vision.cameras]\nreadout_s = 0.02\n[vision.cameras.one]\ndevice = "usb"\nimage_size_px = [320, 240]\n'
+    config = Config.load(write_small_arm(tmp_path, CAMERA_TABLE + cameras), {})
+    track = markers_in_video(config, dataset(tmp_path / "data", "v2.1"), CAMERA)
+    rows = SMALL.project(track.x[6])[1] / 240.0  # the second episode's ball is 12 pixels below the middle
+    assert track.t[6] == pytest.approx(0.02 * (rows - 0.5), abs=1e-6)
+    assert track.t[6] > 0.0005
+
+
 def test_a_camera_that_is_not_there_is_named(config: Config, tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match=f"no video observation.images.top.*It has {CAMERA}"):
         markers_in_video(config, dataset(tmp_path / "data", "v2.1"), "observation.images.top")

@@ -11,10 +11,13 @@ from scipy.spatial.transform import Rotation
 from tag_renderer import Sheet, photograph
 
 from bodyschema.interfaces.camera import StereoCalibration
-from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss, StereoFrame
+from bodyschema.interfaces.records import FloatArray, ImageArray, MarkerFix, MarkerMiss, StereoFrame
 from bodyschema.vision.cameras.config import CamerasConfig, OneConfig
 from bodyschema.vision.config import VisionConfig
+from bodyschema.vision.tags.body import TagBody
 from bodyschema.vision.tags.config import TagConfig
+from bodyschema.vision.tags.image import TagImage
+from bodyschema.vision.tags.tracker import TagTracker
 from bodyschema.vision.tracked_camera import TrackedCamera
 from bodyschema.vision.trackers import tracker_of
 
@@ -25,7 +28,7 @@ FACING = Rotation.from_euler("x", 25.0, degrees=True) * Rotation.from_matrix(np.
 EYES = {"one": replace(SMALL, baseline_m=0.0), "two": SMALL}
 
 
-def vision(readout_s: float) -> VisionConfig:
+def vision(readout_s: float | None) -> VisionConfig:
     cameras = CamerasConfig(one=OneConfig(device="webcam", image_size_px=(320, 240)), readout_s=readout_s)
     return VisionConfig(marker="tag", tag=TagConfig(side_m=0.03), cameras=cameras)
 
@@ -62,19 +65,22 @@ class Camera:
         return self._frames.pop(0) if self._frames else None
 
 
-def both_fixes(eyes: str, readout_s: float) -> tuple[MarkerFix | MarkerMiss | None, MarkerFix | MarkerMiss | None]:
+def both_fixes(
+    eyes: str, readout_s: float | None
+) -> tuple[MarkerFix | MarkerMiss | None, MarkerFix | MarkerMiss | None]:
     """Return both fixes of the film."""
     config = vision(readout_s)
-    with TrackedCamera(Camera(EYES[eyes], film(eyes)), tracker_of(EYES[eyes], config), readout_s=readout_s) as source:
+    camera = Camera(EYES[eyes], film(eyes))
+    with TrackedCamera(camera, tracker_of(EYES[eyes], config), None, *config.readout) as source:
         return source.read(0.0), source.read(0.0)
 
 
-def sigmas_off(fix: MarkerFix | MarkerMiss | None) -> FloatArray:
-    """Return the errors of place and turn (6,) at the time that the fix states, in its sigmas."""
+def sigmas_off(fix: MarkerFix | MarkerMiss | None, true: tuple[Rotation, FloatArray] | None = None) -> FloatArray:
+    """Return the errors of place and turn (6,) in sigmas of the fix: at the time it states, or from a true pose."""
     assert isinstance(fix, MarkerFix), fix
     assert fix.R is not None
     assert fix.cov_R is not None
-    rotation, x = pose(fix.t)
+    rotation, x = true or pose(fix.t)
     turn = (Rotation.from_quat(fix.R) * rotation.inv()).as_rotvec()
     return np.array([*(fix.x - x), *turn]) / np.sqrt([*np.diag(fix.cov), *np.diag(fix.cov_R)])
 
@@ -84,8 +90,98 @@ def test_moving_tag_is_where_it_was_at_its_time(eyes) -> None:
     assert np.abs(sigmas_off(both_fixes(eyes, READOUT_S)[1])).max() < 4.5
 
 
-def test_unknown_readout_is_felt_by_a_moving_tag() -> None:
+def test_global_shutter_that_is_none_is_felt() -> None:
     assert np.abs(sigmas_off(both_fixes("one", 0.0)[1])).max() > 8.0
+
+
+@pytest.mark.parametrize("eyes", EYES)
+def test_moving_tag_allows_for_unknown_readout(eyes) -> None:
+    fix = both_fixes(eyes, None)[1]
+    assert isinstance(fix, MarkerFix)
+    row = SMALL.project(fix.x)[1] / SMALL.image_size_px[1]
+    assert np.abs(sigmas_off(fix, pose(fix.t + READOUT_S * (row - 0.5)))).max() < 3.0
+
+
+def test_unknown_readout_is_up_to_a_frame() -> None:
+    assert vision(None).readout == (0.0, pytest.approx(FRAME_S / 3.0**0.5))
+    assert vision(0.0).readout == VisionConfig().readout == (0.0, 0.0)
+    assert vision(READOUT_S).readout == (READOUT_S, 0.0)
+
+
+class Projected:
+    """A finder of one tag whose corners are projected at the times of their rows, with noise."""
+
+    def __init__(self, calibration: StereoCalibration, readout_s: float, rng: np.random.Generator) -> None:
+        self._calibration, self._readout_s, self._rng = calibration, readout_s, rng
+        self._start, self._axis = pose(0.0)[1], rng.normal(size=3)
+        self._velocity = (lambda v: v / np.linalg.norm(v))(rng.normal(size=3))
+        self.t, self.shown, self._speed, self._eye = 0.0, 0, 0.0, 0
+
+    def moving(self, speed: float) -> Projected:
+        self._speed = speed
+        return self
+
+    def pose(self, t: float) -> tuple[Rotation, FloatArray]:
+        return Rotation.from_rotvec(2.0 * self._speed * t * self._axis) * FACING, (
+            self._start + self._speed * t * self._velocity
+        )
+
+    def suspicion(self, grey: ImageArray) -> None: ...
+
+    def find(self, grey: ImageArray, region: object) -> dict[int, TagImage]:
+        corners, late_s = TagBody.single(TAG).corners[0], np.zeros(4)
+        seen = np.zeros((4, 4))
+        for _ in range(4):  # until each corner is where it is when its row is read
+            poses = [self.pose(self.t + late) for late in late_s]
+            points = [R.as_matrix() @ c + x for c, (R, x) in zip(corners, poses, strict=True)]
+            seen = np.array([self._calibration.project(p) for p in points])
+            late_s = self._readout_s * (seen[:, 1] / self._calibration.image_size_px[1] - 0.5)
+        px = seen[:, 2 * self._eye : 2 * self._eye + 2] + NOISE_PX * self._rng.normal(size=(4, 2))
+        self._eye = (self._eye + 1) % len(self._calibration.eyes_m)
+        return {self.shown: TagImage(self.shown, px, NOISE_PX**2 * np.eye(8))}
+
+
+TAG, NOISE_PX = TagConfig(side_m=0.05), 0.03
+
+
+def projected_fix(eyes: str, readout_s: float, speed: float, *told: float) -> tuple[MarkerFix, FloatArray]:
+    """Return the second fix of a tag that moves, and its errors in sigmas."""
+    finder = Projected(EYES[eyes], readout_s, np.random.default_rng(int(1e6 * readout_s))).moving(speed)
+    tracker = TagTracker(EYES[eyes], TagBody.single(TAG), TAG, finder, *told)  # pyright: ignore[reportArgumentType]
+    blank = np.zeros((*EYES[eyes].image_size_px[::-1], 3), np.uint8)
+    fix = None
+    for finder.t in (0.0, FRAME_S):
+        fix = tracker.track(StereoFrame(finder.t, blank, blank if eyes == "two" else None))
+    assert isinstance(fix, MarkerFix), fix
+    row = EYES[eyes].project(fix.x)[1] / EYES[eyes].image_size_px[1]
+    return fix, sigmas_off(fix, finder.pose(FRAME_S + readout_s * (row - 0.5)))
+
+
+@pytest.mark.parametrize("speed", [0.05, 0.1])
+@pytest.mark.parametrize("eyes", EYES)
+def test_sigma_covers_every_readout_of_unknown(eyes, speed) -> None:
+    off = np.array([projected_fix(eyes, s, speed, *vision(None).readout)[1] for s in np.linspace(0.0, FRAME_S, 60)])
+    assert 0.6 < (np.abs(off) < 1.0).mean() < 0.95
+    assert (np.abs(off) < 2.0).mean() > 0.9
+
+
+def test_tag_that_was_not_seen_before_is_unsure_of_its_time() -> None:
+    finder = Projected(EYES["one"], 0.0, np.random.default_rng(1))
+    body = TagBody({k: TagBody.single(TAG).corners[0] + np.array([0.06 * k, 0.0, 0.0]) for k in (0, 1)})
+    tracker = TagTracker(EYES["one"], body, TAG, finder, READOUT_S)  # pyright: ignore[reportArgumentType]
+    blank, sigmas = np.zeros((240, 320, 3), np.uint8), []
+    for finder.t, finder.shown in ((0.0, 0), (0.03, 0), (0.06, 1), (0.09, 1)):
+        fix = tracker.track(StereoFrame(finder.t, blank, None))
+        assert isinstance(fix, MarkerFix)
+        sigmas.append(fix.t_sigma)
+    assert sigmas == [READOUT_S, 0.0, READOUT_S, 0.0]
+
+
+@pytest.mark.parametrize("eyes", EYES)
+def test_unknown_readout_costs_nothing_at_rest(eyes) -> None:
+    a, b = (projected_fix(eyes, 0.0, 0.0, *vision(s).readout)[0] for s in (0.0, None))
+    assert np.abs(a.x - b.x).max() < 0.1 * np.sqrt(np.diag(a.cov)).max()
+    assert np.sqrt(np.diag(b.cov)) == pytest.approx(np.sqrt(np.diag(a.cov)), rel=0.05)
 
 
 def test_time_of_a_fix_is_that_of_its_row() -> None:
@@ -101,6 +197,16 @@ def test_first_frame_is_unsure_of_its_time() -> None:
     assert isinstance(first, MarkerFix)
     assert isinstance(second, MarkerFix)
     assert (first.t_sigma, second.t_sigma) == (READOUT_S, 0.0)
+
+
+def test_unknown_readout_makes_the_rows_time_unsure() -> None:
+    first, second = both_fixes("one", None)
+    assert isinstance(first, MarkerFix)
+    assert isinstance(second, MarkerFix)
+    row, sigma_s = SMALL.project(second.x)[1] / SMALL.image_size_px[1], FRAME_S / 3.0**0.5
+    assert second.t == FRAME_S
+    assert second.t_sigma == pytest.approx(sigma_s * abs(row - 0.5))
+    assert first.t_sigma >= sigma_s
 
 
 def test_tag_at_rest_is_not_moved() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 from typing import Annotated, Literal
@@ -154,13 +155,14 @@ class CamerasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
             images are assumed to be rectified, as [camera] describes.
         latency_s: time from mid-exposure to the time stamp [s]; `bodyschema calibrate latency` measures it.
         latency_sigma_s: its 1-sigma; without it 15 ms for devices, 0 for files.
-        readout_s: time from the first to the last row of a rolling shutter [s]; 0 is a global shutter.
+        readout_s: time from the first to the last row of a rolling shutter [s]; 0 is a global shutter. Without it
+            any from 0 to the time of a frame is allowed for: moving markers are measured with wider claims.
     """
 
     calibration: str | None = None
     latency_s: Annotated[float, Meta(ge=-1, le=1)] = 0.0
     latency_sigma_s: NonNegative | None = None
-    readout_s: Annotated[float, Meta(ge=0, le=0.1)] = 0.0
+    readout_s: Annotated[float, Meta(ge=0, le=0.1)] | None = None
     one: OneConfig | None = None
     two: TwoConfig | None = None
     side_by_side: SideBySideConfig | None = None
@@ -204,6 +206,13 @@ class CamerasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         if self.latency_sigma_s is not None:
             return self.latency_sigma_s
         return UNKNOWN_LATENCY_SIGMA_S if self.devices or self.realsense is not None else 0.0
+
+    @property
+    def readout(self) -> tuple[float, float]:
+        """The readout of the rows and the RMS of what it may be besides [s]: one that is not known is uniform."""
+        if self.readout_s is not None:
+            return self.readout_s, 0.0
+        return 0.0, 1.0 / (self.layout.fps or 30.0) / math.sqrt(3.0)
 
     def check(self, file: Path, text: str, table: tuple[str, ...] = ("vision", "cameras")) -> None:
         """Raise ConfigError if there is not exactly one layout, or if it is incomplete; `table` is where it stands."""

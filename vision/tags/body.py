@@ -80,6 +80,17 @@ class TagBody:
         return cls({placed.id: _placed(placed, tag.side_m) for placed in config.tags})
 
 
+def bends(corners: FloatArray) -> FloatArray:
+    """Return the heights (k, 3) of a plate's corners (k, 3) when it is bent along x, twisted, or bent along y.
+
+    Each is relative to the plane nearest to the corners, and of RMS 1.
+    """
+    x, y, _ = corners.T
+    flat, curved = np.stack([np.ones_like(x), x, y], axis=1), np.stack([x * x, x * y, y * y], axis=1)
+    heights = curved - flat @ np.linalg.lstsq(flat, curved, rcond=None)[0]
+    return heights / np.sqrt(np.square(heights).mean(axis=0))
+
+
 def _placed(placed: PlacedTag, side_m: float) -> FloatArray:
     turn = Rotation.from_euler("xyz", placed.rpy).as_matrix()
     return (placed.side_m or side_m) * TAG_CORNERS @ turn.T + np.array(placed.xyz)

@@ -7,7 +7,7 @@ is estimated from the edges themselves. The corners are the intersections of the
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
@@ -33,11 +33,13 @@ class TagImage:
         id: its number in the dictionary.
         corners_px: its corners (4, 2) [px]: top left, top right, bottom right, bottom left of the tag as printed.
         cov_px: covariance (8, 8) of u and v of the first, then of the second corner ... [px²].
+        skew_px: 1-sigma (4, 2) [px] of what the rows' unknown readout moves all corners of all tags by.
     """
 
     id: int
     corners_px: FloatArray
     cov_px: FloatArray
+    skew_px: FloatArray = field(default_factory=lambda: np.zeros((1, 2)))
 
 
 def measure_tag(grey: ImageArray, id: int, corners_px: FloatArray, config: TagConfig) -> TagImage | Reason:

@@ -25,7 +25,7 @@ from bodyschema.vision.images import check_calibration, check_images
 from bodyschema.vision.pose import Pose, PoseEstimator, Sighting, angle_between, first_pose, fitted_motion, mirrored
 from bodyschema.vision.triangulate import triangulate
 
-from .body import TagBody
+from .body import TagBody, bends
 from .chessboard import ChessboardFinder
 from .config import TagConfig
 from .finder import Seen, TagFinder
@@ -65,8 +65,11 @@ class TagTracker:
         config: TagConfig | None = None,
         finder: ChessboardFinder | None = None,
         readout_s: float = 0.0,
+        readout_sigma_s: float = 0.0,
     ) -> None:
         """Prepare for images of `calibration`, whose first and last rows are exposed `readout_s` [s] apart.
+
+        Where that is not known, `readout_s` is 0 and `readout_sigma_s` the RMS of what it may be.
 
         Raises:
             ConfigError: the calibration describes no cameras, or a tag's number is not in the dictionary.
@@ -74,8 +77,9 @@ class TagTracker:
         check_calibration(calibration)
         self.calibration, self.body, self.config = calibration, body, config or TagConfig()
         self._finder = finder or TagFinder(self.config, body.corners)
+        self._bends = bends(body.corners[0]) if isinstance(finder, ChessboardFinder) else None
         self._whole = (0, 0, *calibration.image_size_px)
-        self._readout_s, self._t_sigma = readout_s, 0.0
+        self._is_known, self._readout_s, self._t_sigma = not readout_sigma_s, readout_s or readout_sigma_s, 0.0
         self._last: tuple[float, list[dict[int, FloatArray]], FloatArray] | None = None
         self._seen: tuple[float, list[dict[int, FloatArray]]] = -math.inf, []  # with refused frames
         self._before = self._seen
@@ -139,20 +143,26 @@ class TagTracker:
         """Return the tags with their corners where they were when the rolling shutter read the marker's middle row.
 
         Each corner moves as it did since the last frame. Tags that were not seen there stay, and the time is uncertain.
+        Where the readout is not known, corners stay, and have as `skew_px` how far its 1-sigma would move them.
         """
         row_s = self._readout_s / self.calibration.image_size_px[1]
         middle = np.mean([tag.corners_px[:, 1].mean() for eye in seen for tag in eye.values()])
         last_t, last = self._before
         if not 0 < t - last_t <= LONGEST_PAUSE_S:
             last = []
-        moved, self._t_sigma = [], 0.0 if last else self._readout_s
+        moved, self._t_sigma = [], 0.0
         for eye, before in zip(seen, last or [{}] * len(seen), strict=True):
             tags = dict(eye)
+            if eye.keys() - before.keys():
+                self._t_sigma = self._readout_s
             for id in eye.keys() & before.keys():
                 px = eye[id].corners_px
                 since_s = t - last_t + row_s * (px[:, 1:] - before[id][:, 1:])
                 late_s = row_s * (px[:, 1:] - middle)
-                tags[id] = replace(eye[id], corners_px=px - late_s * (px - before[id]) / since_s)
+                skew_px = late_s * (px - before[id]) / since_s
+                tags[id] = (
+                    replace(eye[id], corners_px=px - skew_px) if self._is_known else replace(eye[id], skew_px=skew_px)
+                )
             moved.append(tags)
         return moved
 
@@ -190,7 +200,7 @@ class TagTracker:
 
     def _likely(self, t: float, seen: list[dict[int, TagImage]]) -> Pose | Reason:
         sightings = [
-            Sighting(self.body.corners[id], tag.corners_px, tag.cov_px, right=bool(eye))
+            Sighting(self.body.corners[id], tag.corners_px, tag.cov_px, bool(eye), tag.skew_px)
             for eye, tags in enumerate(seen)
             for id, tag in tags.items()
         ]
@@ -222,6 +232,8 @@ class TagTracker:
         for rotation, x in self._starts(seen):
             for turn in (rotation, self._mirrored(rotation, x, seen)):
                 pose = estimator.refine(turn, x)
+                if pose is not None and self._bends is not None:
+                    pose = estimator.bent(pose, self._bends)
                 if pose is not None and all(
                     angle_between(pose.rotation, other.rotation) > _Settings.two_poses_rad for other in poses
                 ):
