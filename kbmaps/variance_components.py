@@ -35,10 +35,12 @@ def error_covariances(errors: FloatArray, stated: FloatArray, readings: FloatArr
 
     Args:
         errors: of a model's predictions (n, 3) [m].
-        stated: covariances of the measured positions (n, 3, 3) [m²], NaN where none is stated; one at least is.
+        stated: covariances of the measured positions (n, 3, 3) [m²], NaN or 0 where none is stated; one at least is.
         readings: J, derivatives of the positions by the joints (n, 3, d) [m/rad].
     """
-    stated = np.where(np.isnan(stated), np.eye(3) * float(np.nanmean(stated.diagonal(axis1=1, axis2=2))), stated)
+    variances = np.trace(stated, axis1=1, axis2=2) / 3.0
+    told = variances > 0.0
+    stated = np.where(told[:, None, None], stated, np.eye(3) * float(variances[told].mean()))
     values, axes = np.linalg.eigh(stated)
     least_sure = axes[:, :, 2] * np.sqrt(values[:, 2:])
     parts = np.stack(
@@ -53,7 +55,7 @@ def error_covariances(errors: FloatArray, stated: FloatArray, readings: FloatArr
     parts = parts[:, parts.any(axis=(0, 2, 3))]
     some = evenly_spread(len(errors), _MOST_ERRORS)
     spread, units = in_typical_units(parts[some], errors[some])
-    shares, _ = most_probable_shares(spread, errors[some])
+    shares, _ = most_probable_shares(spread, errors[some], leave_out=True)
     return np.einsum("k,nkij->nij", shares * units, parts) + ROUNDING_M**2 * np.eye(3)
 
 
@@ -64,11 +66,11 @@ def in_typical_units(spread: FloatArray, off: FloatArray) -> tuple[FloatArray, F
     return spread * units[:, None, None], units
 
 
-def most_probable_shares(spread: FloatArray, off: FloatArray) -> tuple[FloatArray, float]:
+def most_probable_shares(spread: FloatArray, off: FloatArray, *, leave_out: bool = False) -> tuple[FloatArray, float]:
     """Return shares (k,) of covariances (n, k, 3, 3) in that of `off` (n, 3), and their log-likelihood [nats].
 
     By the MM algorithm of Zhou, Hu, Zhou and Lange (2019, "MM algorithms for variance components models"); far errors
-    are clipped.
+    are clipped, or left out: from one in sixteen on, clipped ones would make a part that explains them grow and grow.
     """
     n, k = spread.shape[:2]
     parts = np.ascontiguousarray(spread[:, :, _ROWS, _COLUMNS].transpose(1, 2, 0)).reshape(k, 6 * n)
@@ -77,12 +79,13 @@ def most_probable_shares(spread: FloatArray, off: FloatArray) -> tuple[FloatArra
         root = _inverse_root((shares @ parts).reshape(6, n))
         whitened = _turned(root, off.T)
         far = np.square(whitened).sum(axis=0)
+        near = far <= (max(CLIPPED_SIGMAS**2, float(np.median(far))) if leave_out else np.inf)
         likelihood = float(np.log(root[0] * root[2] * root[5]).sum())
         likelihood -= 0.5 * float(np.minimum(far, CLIPPED_SIGMAS**2).sum())
         whitened *= np.minimum(1.0, CLIPPED_SIGMAS / np.sqrt(np.maximum(far, 1e-300)))
-        x, y, z = _turned_back(root, whitened)
+        x, y, z = _turned_back(root, whitened * near)
         seen = parts @ np.concatenate([x * x, y * y, z * z, 2.0 * y * z, 2.0 * x * z, 2.0 * x * y])
-        expected = parts @ _inverse_of(root).ravel()
+        expected = parts @ (_inverse_of(root) * near).ravel()
         shares = np.maximum(shares * np.sqrt(seen / expected), _LEAST)
     return shares, likelihood
 

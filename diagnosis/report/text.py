@@ -224,7 +224,7 @@ def _instead(tolerances: Tolerances, seen_by: str) -> str:
     told = [f"{rival_named(rival, seen_by)} ({100.0 * rival.probability:.0f} %)" for rival in tolerances.rivals]
     if not told:
         return ""
-    return f" Instead of links as inexact as that there may be {' or '.join(told)}, and the others are more exact."
+    return f" Or the links are more exact than that, and there is {' or '.join(told)}."
 
 
 def to_do(diagnosis: DiagnosisFile, remedies: Sequence[str]) -> tuple[list[str], list[str]]:

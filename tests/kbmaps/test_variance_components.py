@@ -47,6 +47,21 @@ def test_outliers_do_not_change_it() -> None:
     assert np.median(np.linalg.eigvals(np.linalg.solve(whole, found)).real) < 1.5
 
 
+@pytest.mark.parametrize("one_in", [10, 5, 3])
+def test_many_outliers_of_the_depth_do_not_change_it(one_in: int) -> None:
+    errors, whole, camera, readings = drawn(np.random.default_rng(2), 8.0, 0.0)
+    errors[::one_in] += 400.0 * np.linalg.eigh(camera)[1][::one_in, :, 2]
+    found = error_covariances(errors, camera, readings)
+    assert np.linalg.eigvals(np.linalg.solve(whole, found)).real.max() < 2.0
+
+
+def test_a_covariance_of_zeros_counts_as_missing() -> None:
+    errors, _, camera, readings = drawn(np.random.default_rng(4), 8.0, 0.0)
+    third = np.arange(PAIRS)[:, None, None] % 3 == 0
+    zeros, missing = (error_covariances(errors, np.where(third, none, camera), readings) for none in (0.0, np.nan))
+    np.testing.assert_array_equal(zeros, missing)
+
+
 @pytest.mark.parametrize(
     "stated", [np.full((PAIRS, 3, 3), np.nan), np.zeros((PAIRS, 3, 3)), np.tile(np.eye(3), (PAIRS, 1, 1))]
 )
