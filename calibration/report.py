@@ -312,8 +312,8 @@ def _stamped_late(calibration: Calibration) -> list[str]:
     return [
         "The residuals follow the motion, as if the positions were stamped too "
         f"{'late' if late_ms > 0 else 'early'}, by {abs(late_ms):.0f} ms or more: `bodyschema diagnose` measures it, "
-        "and tells it from a joint that settles or has backlash. Of a bag or a dataset, add what it finds to --marker-delay-ms; of "
-        "cameras, type `bodyschema calibrate latency --write` and record again."
+        "and tells it from a joint that settles or has backlash. Of a bag or a dataset, add what it finds to "
+        "--marker-delay-ms; of cameras, type `bodyschema calibrate latency --write` and record again."
     ]
 
 

@@ -176,8 +176,10 @@ def test_each_command_says_what_it_needs_and_what_is_next(command, capsys) -> No
     # As in a process of its own: a summary given to the same page before would be shown in its place.
     sys.modules.pop(MODULES[command.split()[0]], None)
     command_line(command.split()[0])([*command.split(), "--help"], exit_on_error=False, result_action="return_value")
-    beginnings = [line.split(" ")[0] for line in capsys.readouterr().out.splitlines()]
+    page = capsys.readouterr().out
+    beginnings = [line.split(" ")[0] for line in page.splitlines()]
     assert ("Needs:" in beginnings, "Next:" in beginnings) == (True, True)
+    assert "--empty-" not in page
 
 
 def test_help_fits_a_terminal_of_80_columns(tmp_path) -> None:

@@ -118,7 +118,7 @@ def learn(
     ],
     at: Annotated[
         tuple[float, float] | None,
-        Parameter(help="Ball: column and row of a pixel in the middle of it, in the first image [px]."),
+        Parameter(help="Ball: column and row of a pixel in the middle of it, in the first image [px].", negative=""),
     ] = None,
     auto: Annotated[bool, flag("Ball: learn the colour of what moves; the camera stands still.")] = False,
     robot: RobotFile = HERE,

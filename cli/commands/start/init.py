@@ -52,7 +52,9 @@ def init(
     ] = None,
     chessboard: Annotated[
         tuple[int, int, float] | None,
-        Parameter(help="The marker is a plain chessboard: columns and rows of squares, side of a square [mm]."),
+        Parameter(
+            help="The marker is a plain chessboard: columns and rows of squares, side of a square [mm].", negative=""
+        ),
     ] = None,
     yes: Annotated[bool, flag("Do not ask: the joints of the URDF get the servos in the order of their IDs.")] = False,
     sim: Annotated[bool, flag("A whole example: the simulated upper body.")] = False,
