@@ -139,6 +139,8 @@ class Sets:
         known = {cause.identity for cause in fit.causes}
         # The moment of each was sought without the others, so it is right for one of them at most.
         self._begins = {k for k, one in enumerate(self.effects) if one.kind.begins and one.identity not in known}
+        # The camera's pose and the marker's place, which tolerances of the links beside them can follow.
+        self._poses = [k for k, one in enumerate(self.effects) if one.kind.rigid and not one.kind.at_joint]
 
     def climbed(self, starts: Iterable[tuple[int, ...]]) -> list[Together]:
         """Improve each start by single changes, and return the sets reached, without causes that cannot be.
@@ -161,7 +163,7 @@ class Sets:
         """Yield the starting sets: the fit's causes, none, all joint offsets, and all effects of each kind.
 
         Args:
-            links: also yield each cause that may have only some of its numbers, with all of them.
+            links: also yield each cause that may have only some of its numbers, with all of them, and each pose.
         """
         yield own
         yield ()
@@ -174,6 +176,7 @@ class Sets:
         yield from self.zeros_for_links(own)
         for key in dict.fromkeys(effect.key for effect in self.effects if effect.kind.in_parts and links):
             yield tuple(k for k, effect in enumerate(self.effects) if effect.key == key)
+        yield from ((k,) for k in self._poses if links)
 
     def zeros_for_links(self, own: tuple[int, ...]) -> list[tuple[int, ...]]:
         """Return the set with all joint offsets in the place of its links; an empty list if it has no links."""
@@ -229,14 +232,14 @@ class Sets:
         return _better(tried, here)
 
     def _with_smaller_tolerances(self, here: Together) -> Together | None:
-        """Add the shifts or the turns of a link, where tolerances are then so much smaller that it is more probable.
+        """Add a link's shifts or turns, or a pose, where tolerances are then so much smaller that it is more probable.
 
         Beside tolerances as large as the link's own error it seems to be worth nothing, however large they are.
         """
         if max(here.scales.lengths, here.scales.angles) <= 1.0:
             return None
         near = replace(here, scales=here.scales.no_larger)
-        added = [_without(group, here.chosen) for group in self._groups if len(group) > 1]
+        added = [_without(group, here.chosen) for group in self._groups if len(group) > 1 or group[0] in self._poses]
         return _better([self.of((*here.chosen, *group), near) for group in added if group], here)
 
     def with_one(self, here: Together) -> Iterator[tuple[Effect, Together]]:

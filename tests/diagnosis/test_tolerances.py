@@ -102,6 +102,12 @@ def test_a_bent_link_is_named_where_it_is_larger_than_tolerance(robot: RobotDesc
     assert [(cause.effect, cause.where) for cause in file.causes] == [("link_geometry", ELBOW)]
 
 
+@pytest.mark.parametrize("seed", [5, 8])
+def test_a_camera_is_named_though_large_tolerances_could_follow_it(robot: RobotDescription, seed: int) -> None:
+    file = found_in(robot, seed, Effect.at(robot, "camera_pose", values=[3e-3, 1e-3, -2e-3, 6e-3, -3e-3, 5e-3]))
+    assert [(cause.effect, cause.where) for cause in file.causes] == [("camera_pose", None)]
+
+
 def _with_small_tolerances(robot: RobotDescription) -> Fit:
     """Return a fit of a joint offset with tolerances that are smaller than the arm's."""
     rng = np.random.default_rng([7, 4])
