@@ -239,7 +239,7 @@ class Sets:
         if max(here.scales.lengths, here.scales.angles) <= 1.0:
             return None
         near = replace(here, scales=here.scales.no_larger)
-        added = [_without(group, here.chosen) for group in self._groups if len(group) > 1 or group[0] in self._poses]
+        added = [_without(group, here.chosen) for group in self._groups if group[0] in self._poses or len(group) > 1]
         return _better([self.of((*here.chosen, *group), near) for group in added if group], here)
 
     def with_one(self, here: Together) -> Iterator[tuple[Effect, Together]]:
