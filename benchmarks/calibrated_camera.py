@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -105,10 +105,7 @@ def main() -> None:
         truth, error = arm.true.positions(test) @ frame_turn(rig).T, CommonError(rig, SIDE_SIGMA_M / SIDE_M)
 
         def judge(name: str, predicted: FloatArray, sigma: FloatArray, truth: FloatArray = truth) -> None:
-            off = predicted - truth
-            figures = (np.square(off).sum(1).mean(), np.square(sigma).sum(1).mean())
-            shares = ((np.abs(off) < sigma).mean(), (np.abs(off) < 2.0 * sigma).mean())
-            rows.setdefault(name, []).append((*map(float, figures), *map(float, shares)))
+            rows.setdefault(name, []).append(figures(predicted - truth, sigma))
 
         alone, told = (RigidLearner(arm.nominal, DRAWN) for _ in range(2))
         alone.learn(q, x, cov=cov)
@@ -120,11 +117,22 @@ def main() -> None:
             for name, common in (("online, fixes alone", None), ("online, with what fixes share", error.variance)):
                 prediction = online(arm, q, x, cov, common).snapshot.predict(test)
                 judge(name, prediction.x, prediction.sigma)
-    for name, figures in rows.items():
-        off, claimed, once, twice = np.mean(figures, axis=0)
+    report(rows)
+
+
+def figures(off: FloatArray, sigma: FloatArray) -> tuple[float, ...]:
+    """Return mean squares of errors and of claims (n, 3) [m²], and the shares within 1 and 2 sigma."""
+    squares = (np.square(off).sum(axis=1).mean(), np.square(sigma).sum(axis=1).mean())
+    return *map(float, squares), *(float((np.abs(off) < times * sigma).mean()) for times in (1.0, 2.0))
+
+
+def report(rows: Mapping[str, Sequence[tuple[float, ...]]]) -> None:
+    """Print the means of some arms' figures, a line for each name."""
+    for name, of_arms in rows.items():
+        off, claimed, once, twice = np.mean(of_arms, axis=0)
         print(
-            f"{name}: off by {1e6 * np.sqrt(off):.0f} µm RMS, {1e6 * np.sqrt(claimed):.0f} claimed, "
-            f"{100 * once:.0f} % within 1 sigma, {100 * twice:.0f} % within 2; {len(figures)} arms"
+            f"{name}: off by {1e6 * np.sqrt(off):.1f} µm RMS, {1e6 * np.sqrt(claimed):.1f} claimed, "
+            f"{100 * once:.0f} % within 1 sigma, {100 * twice:.0f} % within 2; {len(of_arms)} arms"
         )
 
 

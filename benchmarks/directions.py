@@ -17,6 +17,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks.calibrated_camera import figures, report
 from benchmarks.one_camera import CAMERA, DRAWN, PLACED, SIDE_M, Arm
 from bodyschema.interfaces.records import FloatArray, Pair, frozen_array
 from bodyschema.learning.config import LearnerConfig
@@ -103,7 +104,7 @@ def main() -> None:
     parser.add_argument("--alike", action="store_true")
     given = parser.parse_args()
     counts = sorted(map(int, given.pairs.split(",")))
-    rows: dict[int, list[tuple[float, ...]]] = {count: [] for count in counts}
+    rows: dict[str, list[tuple[float, ...]]] = {f"{count} pairs": [] for count in counts}
     for seed in range(given.arms):
         rng = np.random.default_rng([77, given.joints, seed])
         arm = (Arm if given.joints == 4 else SixJoints)(rng)
@@ -116,15 +117,8 @@ def main() -> None:
             cov = np.trace(cov, axis1=1, axis2=2)[:, None, None] / 3.0 * np.eye(3)
         for count, snapshot in zip(counts, snapshots(arm, q, x, cov, counts), strict=True):
             found = snapshot.predict(test)
-            off = np.abs(found.x - truth)
-            squares = (np.square(off).sum(axis=1).mean(), np.square(found.sigma).sum(axis=1).mean())
-            rows[count].append((*squares, (off < found.sigma).mean(), (off < 2.0 * found.sigma).mean()))
-    for count, figures in rows.items():
-        off, claimed, once, twice = np.mean(figures, axis=0)
-        print(
-            f"{count} pairs: off by {1e6 * np.sqrt(off):.1f} µm RMS, {1e6 * np.sqrt(claimed):.1f} claimed, "
-            f"{100 * once:.0f} % within 1 sigma, {100 * twice:.0f} % within 2; {len(figures)} arms"
-        )
+            rows[f"{count} pairs"].append(figures(found.x - truth, found.sigma))
+    report(rows)
 
 
 if __name__ == "__main__":

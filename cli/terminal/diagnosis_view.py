@@ -27,7 +27,7 @@ _HEADS: dict[Verdict, tuple[str, str]] = {
 _MEANING: dict[Verdict, str] = {
     "explained": "",
     "nothing_found": "",
-    "undecided": "The causes below describe the error, but this recording cannot tell some of them from others.",
+    "undecided": "What was found describes the error, but this recording cannot tell some of it from other causes.",
     "unexplained": "Something acts on this arm that is not among the effects that are known here. Take the causes "
     "below as a description, and change nothing on the robot because of them alone.",
 }

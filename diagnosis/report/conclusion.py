@@ -100,7 +100,7 @@ def _verdict(diagnosis: Diagnosis, causes: tuple[Cause, ...], gain_percent: floa
     if diagnosis.left.is_there or diagnosis.ended_early or is_at_limit(diagnosis.extended.background.scales):
         return "unexplained"
     if not causes:
-        return "nothing_found"
+        return "undecided" if tolerances.leaves_open else "nothing_found"
     is_open = any(cause.leaves_open for cause in causes) or tolerances.leaves_open or gain_percent <= 0.0
     return "undecided" if is_open else "explained"
 

@@ -28,8 +28,8 @@ _VERDICTS: dict[Verdict, tuple[str, str]] = {
     "nothing_found": ("Nothing found", "What is left of the error is noise: there is nothing to correct."),
     "undecided": (
         "Undecided",
-        "The causes describe the error, but this recording cannot tell some of them from others. See below which, and "
-        "which motion would.",
+        "What was found describes the error, but this recording cannot tell some of it from other causes. See below "
+        "which, and which motion would.",
     ),
     "unexplained": (
         "Not all explained",

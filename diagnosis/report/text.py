@@ -126,12 +126,13 @@ def sentence(
         timed, weighed: as in `Found`.
     """
     figures = f"{rms.aligned:.3g} → {rms.extended:.3g} mm on held-out data"
-    if verdict == "nothing_found" and rms.extended < _Settings.by_tolerances * rms.aligned:
+    nothing = not causes and verdict != "unexplained"
+    if nothing and rms.extended < _Settings.by_tolerances * rms.aligned:
         everywhere = f"small errors everywhere{_or_a_cause(tolerances, seen_by)}"
         return f"No cause stands out: {everywhere} explain {_share(gain)} ({figures})"
-    if verdict == "nothing_found" and tolerances is not None and not tolerances.in_extended:
+    if nothing and tolerances is not None and not tolerances.in_extended:
         return f"No cause stands out; small errors everywhere are not known well enough to correct {rms.aligned:.3g} mm"
-    if verdict == "nothing_found":
+    if nothing:
         return f"The simulation is right to within the noise: nothing found in {rms.aligned:.3g} mm of error"
     if not causes:
         told = "What is measured differs from the simulation in a way that none of the known effects explains"

@@ -108,6 +108,14 @@ def test_a_camera_is_named_though_large_tolerances_could_follow_it(robot: RobotD
     assert [(cause.effect, cause.where) for cause in file.causes] == [("camera_pose", None)]
 
 
+def test_a_link_that_large_tolerances_may_hide_leaves_the_verdict_open(robot: RobotDescription) -> None:
+    file = found_in(robot, 5, Effect.at(robot, "link_geometry", ELBOW, values=[2e-3, 0.0, 2.5e-3, 0.0, 0.01, 0.005]))
+    assert file.tolerances is not None
+    assert (file.verdict, file.causes) == ("undecided", ())
+    assert [(rival.effect, rival.where) for rival in file.tolerances.rivals] == [("link_geometry", ELBOW)]
+    assert "small errors everywhere (or a wrong link before joint" in file.sentence
+
+
 def _with_small_tolerances(robot: RobotDescription) -> Fit:
     """Return a fit of a joint offset with tolerances that are smaller than the arm's."""
     rng = np.random.default_rng([7, 4])
