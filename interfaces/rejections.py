@@ -9,7 +9,7 @@ from .records import Reason
 WORDS: Mapping[Reason, str] = {
     Reason.NO_MARKER: "no marker",
     Reason.AT_BORDER: "at the border",
-    Reason.OCCLUDED: "not all to be seen",
+    Reason.OCCLUDED: "partly covered",
     Reason.NOT_ROUND: "not round",
     Reason.NOT_STRAIGHT: "edges not straight",
     Reason.MIRRORED: "mirrored",
@@ -72,3 +72,8 @@ REMEDIES: Mapping[Reason, str] = {
     Reason.NOT_STORED: "Make room on the disk of the store, and see that it can be written.",
     Reason.NOT_BORNE: "Switch it on: `bodyschema command zero_force_on`.",
 }
+
+
+def words_of(reason: str) -> str:
+    """Return the words for a reason in a status message, also for one of a newer version."""
+    return WORDS[Reason(reason)] if reason in set(Reason) else reason.replace("_", " ")

@@ -125,7 +125,8 @@ class _Bag:
         """Return an error that lists what the bag has."""
         counts = self.counts
         listed = ", ".join(f"{topic} ({kind}, {counts[topic]})" for topic, kind in sorted(self.types.items()))
-        return RecordingError(what, file=self.source, remedy=f"{remedy} The bag has {listed or 'no topics'}")
+        ended = remedy if remedy.endswith(("?", ".")) else f"{remedy}."
+        return RecordingError(what, file=self.source, remedy=f"{ended} The bag has {listed or 'no topics'}")
 
 
 @contextmanager

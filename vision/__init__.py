@@ -1,4 +1,4 @@
-"""Marker position in: a coloured ball in rectified stereo images, to a point with covariance.
+"""Marker positions from camera images, and camera calibration.
 
 Nothing is imported here: the configuration is read by commands that must start without OpenCV.
 """

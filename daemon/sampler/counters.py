@@ -7,7 +7,7 @@ from collections import Counter, deque
 from bodyschema.daemon.transport.status import JointRange
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import FloatArray, Reason
-from bodyschema.interfaces.rejections import REMEDIES
+from bodyschema.interfaces.rejections import REMEDIES, WORDS
 from bodyschema.interfaces.waits import STATUS_EVERY_S
 from bodyschema.robot.description import RobotDescription
 
@@ -73,8 +73,7 @@ class SamplerCounters:
         if len(newest) < FEWEST_FRAMES or refused.total() < NEARLY_ALL * len(newest):
             return []
         [(reason, count)] = refused.most_common(1)
-        name = reason.replace("_", " ")
-        return [f"{count} of the last {len(newest)} frames were rejected: {name}. {REMEDIES[reason]}"]
+        return [f"{count} of the last {len(newest)} frames were rejected: {WORDS[reason]}. {REMEDIES[reason]}"]
 
     def reject(self, reason: Reason) -> None:
         """Count a frame that did not become a pair."""

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 # PING is the same in Protocol 1.0 and in Feetech's protocol: one scan finds both.
 SCANNERS = (Protocol2Scanner(), PingScanner(PROTOCOL1, FEETECH_SERVOS))
 
-
+MAKES = {make.table: make for make in (DYNAMIXEL, FEETECH)}
 Servos = DynamixelConfig | FeetechConfig
 
 
@@ -126,8 +126,7 @@ def other_holders(config: Config) -> list[Holder]:
 def servo_checks(config: Config) -> Iterator[Check]:
     """Check the servos of robot.toml: presence, health, reading rate. Writes nothing."""
     servos = require_servos(config)
-    make = DYNAMIXEL if isinstance(servos, DynamixelConfig) else FEETECH
-    yield from checks_of_servos(make, servos, SystemClock())
+    yield from checks_of_servos(MAKES[servos.table], servos, SystemClock())
 
 
 def encoder_checks(config: Config) -> Iterator[Check]:

@@ -446,7 +446,7 @@ def test_frames_refused_for_one_reason_are_a_complaint(config) -> None:
     with running(config, walk.sources(fixes=[*misses, held])) as bus:
         status = status_when(bus, lambda status: bool(status.health))
         held.set()
-    assert status.health == [f"40 of the last 40 frames were rejected: size mismatch. {REMEDIES[Reason.SIZE_MISMATCH]}"]
+    assert status.health == [f"40 of the last 40 frames were rejected: sizes differ. {REMEDIES[Reason.SIZE_MISMATCH]}"]
 
 
 def test_joints_too_fast_for_their_readings_make_no_pairs(config) -> None:

@@ -240,7 +240,7 @@ def test_a_film_in_its_own_time_skips_what_nobody_asked_for(tmp_path) -> None:
 def test_a_film_that_is_shorter_than_it_says_is_found_when_it_is_opened(tmp_path) -> None:
     (tmp_path / "l.avi").write_bytes(b"RIFF")
     config = CamerasConfig(videos=VideosConfig(left="l.avi", right="l.avi"))
-    with pytest.raises(ConfigError, match="is no film that can be read"), eyes_of(config, tmp_path, HandClock()):
+    with pytest.raises(ConfigError, match="is not a readable video"), eyes_of(config, tmp_path, HandClock()):
         raise AssertionError
 
 

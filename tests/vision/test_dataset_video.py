@@ -127,7 +127,7 @@ def test_the_ball_is_followed_in_av1_as_lerobot_encodes_it(config: Config, tmp_p
 def test_a_video_that_cannot_be_decoded_is_refused(config: Config, tmp_path: Path) -> None:
     folder = dataset(tmp_path / "data", "v2.1")
     next(folder.rglob("*.mp4")).write_bytes(b"no video" * 100)
-    with pytest.raises(ConfigError, match=r"is no film that can be read.*ffmpeg -i"):
+    with pytest.raises(ConfigError, match=r"is not a readable video.*ffmpeg -i"):
         markers_in_video(config, folder, CAMERA)
 
 

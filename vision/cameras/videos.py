@@ -85,7 +85,7 @@ class VideoRoll:
         """Look at the files, and count their frames.
 
         Raises:
-            ConfigError: a file is missing, no film, or the two are not of one size.
+            ConfigError: a file is missing, no readable video, or the two are not of one size.
         """
         both = config.side_by_side
         self._files = [folder / name for name in ((both,) if both else (config.left, config.right)) if name]
@@ -158,5 +158,5 @@ def _measured(file: Path) -> tuple[tuple[int, int], int, float]:
     finally:
         capture.release()
     if not count:
-        raise ConfigError("is no film that can be read", file=file, remedy=f"Convert it: {_CONVERT}")
+        raise ConfigError("is not a readable video", file=file, remedy=f"Convert it: {_CONVERT}")
     return size, count, rate_hz
