@@ -13,7 +13,6 @@ from rich.table import Table
 from rich.text import Text
 
 from bodyschema.daemon.transport.status import JointRange, SamplerStatus
-from bodyschema.interfaces.rejections import words_of
 
 BAR_WIDTH = 24
 
@@ -62,6 +61,8 @@ def titled_table(title: str, *, numbers: bool = True) -> Table:
 
 def rejected(status: SamplerStatus) -> list[tuple[str, int]]:
     """Return a text of the rejected frames by reason, the most frequent first."""
+    from bodyschema.interfaces.rejections import words_of
+
     return [(words_of(reason), count) for reason, count in sorted(status.rejected.items(), key=lambda item: -item[1])]
 
 
