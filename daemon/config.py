@@ -98,18 +98,13 @@ class Tables(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Config:
-    """Everything that robot.toml says, checked.
-
-    Attributes:
-        extended: the robot with the effects that the file adds to it, if it adds any.
-        given_state_dir: the place for store and checkpoint that the command line gave, if it gave one.
-    """
+    """Everything that robot.toml says, checked."""
 
     file: Path
     robot: RobotDescription
     tables: Tables
-    extended: Simulation | None = None
-    given_state_dir: Path | None = None
+    extended: Simulation | None = None  # the robot with the effects that the file adds to it, if it adds any
+    given_state_dir: Path | None = None  # the place for store and checkpoint that the command line gave, if it gave one
 
     @classmethod
     def load(cls, file: Path, environment: Mapping[str, str] = os.environ) -> Config:

@@ -24,9 +24,6 @@ class Replay:
 
     At each row's time there is one joint reading and one fix, so that joint angles interpolated to the fix's time are
     exactly the row's. Neither source runs more than a few rows ahead of the other, however fast it is read.
-
-    Attributes:
-        t: times of the rows [s], shape (n,): `Recording.play_times`.
     """
 
     def __init__(
@@ -45,7 +42,7 @@ class Replay:
             sigma_m: 1-sigma per axis of the positions where the recording has no covariances [m]; None takes what
                 `calibration` says, and without that 1 mm.
         """
-        self.t = recording.play_times
+        self.t = recording.play_times  # times of the rows [s], shape (n,): `Recording.play_times`
         cov = recording.cov if recording.cov is not None else default_covariances(recording, sigma_m, calibration)
         self._pace = _Pace(self.t, speed, now)
         self.joints = ReplayJoints(recording, self.t, self._pace)

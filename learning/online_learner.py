@@ -60,7 +60,6 @@ class OnlineLearner:
 
         Args:
             nominal: the nominal model, where learning starts.
-            settings: of the learner.
             solver: of the models that need all pairs.
             together_s: maximum wait of pairs to be judged together [s], which costs a fraction of judging each. The
                 instant learner does not wait.

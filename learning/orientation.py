@@ -105,23 +105,14 @@ class OrientationState(msgspec.Struct, kw_only=True):
 
 @dataclass(frozen=True, eq=False)
 class OrientationModel:
-    """Answering model with its predicted error; later learning does not change it.
+    """Answering model with its predicted error; later learning does not change it."""
 
-    Attributes:
-        name: of the model.
-        chain: the rigid chain that gives the uncertainty, and answers itself unless there is a map.
-        map: of e1, e2, e3.
-        inside: 1-sigma about each axis at the data, in addition to the chain's uncertainty [rad].
-        surprise: ratio of the prediction errors to the predicted ones, at least 1.
-        support: support of the data; None without data.
-    """
-
-    name: str
-    chain: OrientedChain
-    map: KBMap | None
-    inside: float
-    surprise: float
-    support: SupportSet | None
+    name: str  # of the model
+    chain: OrientedChain  # the rigid chain that gives the uncertainty, and answers itself unless there is a map
+    map: KBMap | None  # of e1, e2, e3
+    inside: float  # 1-sigma about each axis at the data, in addition to the chain's uncertainty [rad]
+    surprise: float  # ratio of the prediction errors to the predicted ones, at least 1
+    support: SupportSet | None  # support of the data; None without data
 
     def rotations(self, q: FloatArray) -> FloatArray:
         """Return orientations (n, 3, 3) at q (n, d) [rad]."""

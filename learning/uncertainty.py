@@ -101,17 +101,11 @@ _SUPPORT, _CONTEST = "support_q", "squares_"
 
 @dataclass(frozen=True)
 class PredictiveUncertainty:
-    """Predictive uncertainty of a model.
+    """Predictive uncertainty of a model."""
 
-    Attributes:
-        inside: 1-sigma at the data, per axis (3,) [m].
-        layers: variance terms that the model's data leave.
-        surprise: ratio of the prediction errors to the predicted ones, at least 1.
-    """
-
-    inside: FloatArray
-    layers: tuple[VarianceTerm | ChainTerm | DepartureTerm, ...] = ()
-    surprise: float = 1.0
+    inside: FloatArray  # 1-sigma at the data, per axis (3,) [m]
+    layers: tuple[VarianceTerm | ChainTerm | DepartureTerm, ...] = ()  # variance terms that the model's data leave
+    surprise: float = 1.0  # ratio of the prediction errors to the predicted ones, at least 1
 
     def variance(self, q: FloatArray) -> FloatArray:
         """Return the variance per axis of predictions at q (n, d) [rad], shape (n, 3) [m²]."""

@@ -223,13 +223,7 @@ class VirtualHand:
 
 
 class _Inertias:
-    """The smallest inertias that the hand feels over some postures.
-
-    Attributes:
-        masses: at each of the links [kg].
-        turning: about the first of them [kg·m²].
-        joints: of each joint of the body with the others held [kg·m² or kg], shape (n,).
-    """
+    """The smallest inertias that the hand feels over some postures."""
 
     def __init__(self, body: Body, roles: JointRoles, links: tuple[str, str], postures: FloatArray) -> None:
         columns = list(roles.guided)
@@ -242,9 +236,9 @@ class _Inertias:
             linear, angular = zip(*(body.jacobians(link, posture) for link in links), strict=True)
             masses.append([1 / _largest(J[:, columns] @ inverse @ J[:, columns].T) for J in linear])
             turning.append(1 / _largest(angular[0][:, columns] @ inverse @ angular[0][:, columns].T))
-        self.masses = tuple(np.min(masses, axis=0))
-        self.turning = float(np.min(turning))
-        self.joints = np.min(joints, axis=0)
+        self.masses = tuple(np.min(masses, axis=0))  # at each of the links [kg]
+        self.turning = float(np.min(turning))  # about the first of them [kg·m²]
+        self.joints = np.min(joints, axis=0)  # of each joint of the body with the others held [kg·m² or kg], shape (n,)
 
 
 def _largest(matrix: FloatArray) -> float:

@@ -81,9 +81,6 @@ class ReadingSearch:
         q, x: rows to be read, (n, d) [rad, m] and (n, 3) [m].
         exact_m: distances below this are not distinguished [m].
         pose_known: the camera pose is known.
-
-    Attributes:
-        fits: the best fit of each reading so far.
     """
 
     def __init__(self, chain: RigidChain, q: FloatArray, x: FloatArray, exact_m: float, pose_known: bool) -> None:
@@ -92,7 +89,7 @@ class ReadingSearch:
         self._std = np.where(chain.prismatic, SLIDES_M, ZEROS_RAD)
         self.poses = Poses.of(chain, q)
         self._tried: set[Reading] = set()
-        self.fits: dict[Reading, ReadingFit] = {}
+        self.fits: dict[Reading, ReadingFit] = {}  # the best fit of each reading so far
 
     def verdict(self) -> tuple[Reading, Reading, list[Reading]]:
         """Return the columns as they are, the simplest reading among the best, and others nearly as simple."""

@@ -167,16 +167,11 @@ def signs_in(*, is_ros2: bool, is_plugin: bool) -> str:
 
 
 class Speeds:
-    """Velocities of joints whose encoders do not report them.
-
-    Attributes:
-        v: over the last tenth of a second or more [rad/s], shape (d,).
-        are_known: True once the joints were observed long enough.
-    """
+    """Velocities of joints whose encoders do not report them."""
 
     def __init__(self, d: int) -> None:
-        self.v: FloatArray = np.zeros(d)
-        self.are_known = False
+        self.v: FloatArray = np.zeros(d)  # over the last tenth of a second or more [rad/s], shape (d,)
+        self.are_known = False  # True once the joints were observed long enough
         self._t, self._q = -math.inf, self.v
 
     def take(self, t: float, q: FloatArray) -> None:
@@ -190,17 +185,13 @@ class Speeds:
 
 
 class SignCheck:
-    """Predicts by the URDF where the marker went when one joint was moved, for the user to compare.
-
-    Attributes:
-        said: the prediction in words, for the joint moved last; empty before.
-    """
+    """Predicts by the URDF where the marker went when one joint was moved, for the user to compare."""
 
     def __init__(self, robot: RobotDescription) -> None:
         self._robot, self._chain = robot, _from_parent(robot)
         self._begin: FloatArray | None = None
         self._rest: tuple[float, FloatArray] | None = None  # since when, and where
-        self.said = ""
+        self.said = ""  # the prediction in words, for the joint moved last; empty before
 
     def take(self, t: float, q: FloatArray) -> None:
         """Add the joint angles `q` (d,) [rad] at `t` [s]."""

@@ -27,19 +27,14 @@ LIVE_WAIT_S = 0.5
 
 
 class History:
-    """The sampler's stored pairs from a sequence number on, page by page. Publications only trigger the next look.
-
-    Attributes:
-        next_seq: sequence number of the next pair.
-        missing: numbers between the pairs so far that the sampler does not have.
-    """
+    """The sampler's stored pairs from a sequence number on, page by page. Publications only trigger the next look."""
 
     def __init__(self, bus: ZenohSession, robot: RobotDescription, from_seq: int) -> None:
         self._bus, self._joints, self._keys = bus, robot.joints, Keys(robot.name)
         self._news = Event()
         self._store: str | None = None
-        self.next_seq = from_seq
-        self.missing = Damage()
+        self.next_seq = from_seq  # sequence number of the next pair
+        self.missing = Damage()  # numbers between the pairs so far that the sampler does not have
         self._begun = False
         bus.subscribe(self._keys.pair, lambda _: self._news.set())
 

@@ -58,19 +58,14 @@ class SolverPool:
 
 
 class PooledSolver:
-    """A `Solver` of one robot, in a process shared with others.
-
-    Attributes:
-        asked: True if a solution is wanted that the process does not work on yet.
-        answers: answers not fetched yet.
-    """
+    """A `Solver` of one robot, in a process shared with others."""
 
     def __init__(self, shared: SolverPool, process: SolverProcess, robot: int) -> None:
         self._shared, self._process, self._robot = shared, process, robot
         self._orders: deque[Callable[[], None]] = deque()
         self._pairs = self._new = self._had_turn = 0
-        self.asked = False
-        self.answers: deque[Solved] = deque()
+        self.asked = False  # True if a solution is wanted that the process does not work on yet
+        self.answers: deque[Solved] = deque()  # answers not fetched yet
 
     def start(self, task: Task) -> None:
         """Discard all pairs and start a new task."""

@@ -44,12 +44,7 @@ class KeepsRecord(Protocol):
 
 
 class DeviceWatch:
-    """Records in the store which devices read the joints, and detects changes.
-
-    Attributes:
-        kept: the record of this session; empty before there is one.
-        changes: differences from the devices of earlier pairs, with remedies.
-    """
+    """Records in the store which devices read the joints, and detects changes."""
 
     def __init__(self, joints: JointSource, store: PairStore, wall: Clock) -> None:
         """Store the settings; nothing is queried yet.
@@ -61,8 +56,8 @@ class DeviceWatch:
         self._store, self._wall = store, wall
         stored = store.reader.devices()
         self._before: Sequence[Device] = stored[-1].record if stored else ()
-        self.kept: Sequence[Device] = ()
-        self.changes: list[str] = []
+        self.kept: Sequence[Device] = ()  # the record of this session; empty before there is one
+        self.changes: list[str] = []  # differences from the devices of earlier pairs, with remedies
 
     def look(self) -> bool:
         """Store the record if it is new; return True if pairs from now on differ from earlier ones."""

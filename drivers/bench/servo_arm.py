@@ -71,11 +71,7 @@ ConfigT = TypeVar("ConfigT", bound=ServosConfig[Any])
 
 
 class ServoArm(BenchArm, Generic[ServoT, ConfigT]):
-    """Servos as configured, one chain per bus.
-
-    Attributes:
-        chains: by name of the bus.
-    """
+    """Servos as configured, one chain per bus."""
 
     unit: ClassVar[str] = "packets understood"
     kinds: ClassVar[FaultKinds]
@@ -99,7 +95,7 @@ class ServoArm(BenchArm, Generic[ServoT, ConfigT]):
         """
         self._config, self._return_delay_s, self._rng, self._now = config, return_delay_s, Random(seed), now
         self._servos: dict[str, ServoT] = {}
-        self.chains: dict[str, ServoChain[ServoT]] = {}
+        self.chains: dict[str, ServoChain[ServoT]] = {}  # by name of the bus
         for name in config.buses:
             fitted = [entry for entry in config.servos if config.bus_of(entry) == name]
             for entry in fitted:

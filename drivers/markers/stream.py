@@ -107,11 +107,7 @@ class Receiver(Protocol):
     """The wire that messages come over."""
 
     def open(self) -> None:
-        """Open it.
-
-        Raises:
-            SourceError: that is not possible.
-        """
+        """Open it; raise SourceError if that is not possible."""
 
     def close(self) -> None:
         """Close it; again does no harm."""

@@ -56,19 +56,13 @@ class Sample:
 
 
 class Channel(ABC):
-    """The answers of one servo since the bus was opened.
-
-    Attributes:
-        newest: the last accepted sample.
-        doubts: number of consecutive rejected answers.
-        surprising: the newest sample deviates from the trend of the two before it.
-    """
+    """The answers of one servo since the bus was opened."""
 
     def __init__(self, servo: IdentifiedServo) -> None:
         self.servo = servo
-        self.newest: Sample | None = None
-        self.doubts = 0
-        self.surprising = True
+        self.newest: Sample | None = None  # the last accepted sample
+        self.doubts = 0  # number of consecutive rejected answers
+        self.surprising = True  # the newest sample deviates from the trend of the two before it
         self._trend: tuple[float, float, float] | None = None
         self._speed = 0.0
         self._off_course = max(_Settings.surprise_rad / servo.model.rad_per_tick, _Settings.surprise_ticks)

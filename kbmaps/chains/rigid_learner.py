@@ -352,11 +352,7 @@ class RigidLearner(Model):
         return arrays | {"shape": self._shape} if self._shaped else arrays
 
     def restore(self, arrays: Mapping[str, FloatArray]) -> None:
-        """Resume with stored pairs.
-
-        Raises:
-            ModelFormatError: they are missing, or not pairs.
-        """
+        """Resume with stored pairs."""
         self._q, self._x, self._sigma = stored_pairs(arrays, self.joints)
         shape = arrays.get("shape", np.broadcast_to(np.eye(3), (self.pairs, 3, 3)))
         if shape.shape != (self.pairs, 3, 3) or not np.isfinite(shape).all():

@@ -60,11 +60,7 @@ LARGEST_SPEED = 3400  # [ticks/s]
 
 
 class Servo(EmulatedServo):
-    """An emulated servo. Torque has no effect on the shaft.
-
-    Attributes:
-        knows_sync_read: it answers SYNC_READ.
-    """
+    """An emulated servo. Torque has no effect on the shaft."""
 
     delay_unit_us = RETURN_DELAY_UNIT_US
 
@@ -85,7 +81,7 @@ class Servo(EmulatedServo):
             multi_turn: it counts turns until it loses power.
         """
         super().__init__(model, angle)
-        self.knows_sync_read = model.protocol != SCS
+        self.knows_sync_read = model.protocol != SCS  # it answers SYNC_READ
         self._multi_turn, self._base = multi_turn, 0
         self["model"] = model.number
         self._set_factory_values()
