@@ -20,8 +20,6 @@ from kbmaps.robust import OUTLIER_SIGMAS
 
 
 class _Settings:
-    """Settings of the outlook."""
-
     further: tuple[int, ...] = (100, 300)
     # Number of poses of a motion, and of the region where the arm is used. More would not make the figures steadier
     # than the posterior is.
@@ -34,8 +32,6 @@ class _Settings:
 
 @dataclass(frozen=True, eq=False)
 class LearnerEvidence:
-    """Evidence for a data outlook at one moment."""
-
     nominal: NominalModel
     belief: ChainBelief  # posterior of the chain from the pairs with the current tool
     wide: ChainBelief  # the same without the selection of narrower tolerances

@@ -61,7 +61,6 @@ class NominalModel:
 
     @classmethod
     def of(cls, robot: RobotDescription) -> NominalModel:
-        """Return the nominal model of a robot description."""
         return cls(robot.chain, robot.lower, robot.upper, robot.camera.pose_known, robot.robot.marker_known)
 
     @classmethod

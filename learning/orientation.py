@@ -195,7 +195,6 @@ class Orientations:
         )
 
     def restore(self, state: OrientationState) -> None:
-        """Resume from a state."""
         self.pairs, self.answering, self.errors = state.pairs, state.answering, dict(state.errors)
         packed: Mapping[str, bytes | None] = {PRIOR: state.prior, RIGID: state.chain}
         self._chains = {name: OrientedChain.from_bytes(data) for name, data in packed.items() if data is not None}

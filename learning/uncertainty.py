@@ -92,8 +92,6 @@ _SUPPORT, _CONTEST = "support_q", "squares_"
 
 @dataclass(frozen=True)
 class PredictiveUncertainty:
-    """Predictive uncertainty of a model."""
-
     inside: FloatArray  # 1-sigma at the data, per axis (3,) [m]
     layers: tuple[VarianceTerm | ChainTerm | DepartureTerm, ...] = ()  # variance terms that the model's data leave
     surprise: float = 1.0  # ratio of the prediction errors to the predicted ones, at least 1

@@ -155,7 +155,6 @@ class RobotDescription:
 
     @property
     def name(self) -> str:
-        """The robot's name."""
         return self.robot.name
 
     @property

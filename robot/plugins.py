@@ -55,7 +55,6 @@ def load(group: Group, name: str) -> Any:
 
 
 def installed(group: Group) -> tuple[EntryPoint, ...]:
-    """Return the entry points of all installed packages."""
     from importlib.metadata import entry_points
 
     found = tuple(entry_points(group=group))

@@ -25,7 +25,6 @@ def toml_text(tables: Mapping[str, Any]) -> str:
 
 
 def toml_value(value: object) -> str:
-    """Return a value as TOML, in one line."""
     return tomlkit.item(value).as_string()
 
 

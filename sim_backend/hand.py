@@ -18,8 +18,6 @@ from .truth import TrueRobot
 
 
 class _Settings:
-    """Settings of the simulated hand that guides the arm."""
-
     # Postures of one tour. With few, the nearest is farther away, so the tour covers the joint ranges sooner.
     postures: int = 50
     batch: int = 1000

@@ -36,8 +36,6 @@ PERIOD_S = 1.0
 
 
 class _Settings:
-    """Settings of the search for postures."""
-
     # Number of frames that are rendered ahead.
     ahead: int = 2
     batch: int = 500

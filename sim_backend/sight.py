@@ -19,8 +19,6 @@ from .truth import TrueRobot
 
 
 class _Settings:
-    """Settings of the search for a line of sight."""
-
     solve_steps: int = 12
     track_gain: float = 0.25
     # The marker stays this far inside the images [px], and between these distances from the eyes [m].
@@ -183,7 +181,6 @@ class Sight:
 
 
 def _below(joints, link: str) -> set[str]:
-    """Return the link and all its descendants."""
     found = {link}
     grown = True
     while grown:

@@ -89,8 +89,6 @@ def plausibility(
 
 @dataclass(frozen=True, slots=True)
 class _Check:
-    """Check of one recording."""
-
     robot: RobotDescription  # the robot's description
     search: ReadingSearch  # the finished search over readings of the columns
     as_it_is: Reading  # the columns as they are

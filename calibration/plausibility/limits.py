@@ -21,8 +21,6 @@ BoolArray = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class _Settings:
-    """Settings of the check of units."""
-
     # Only in another unit can the median distance from the median position reach this many times the arm's reach.
     farthest: float = 2.0
     # A joint of limited range is never this far beyond its limits [rad]: encoders wrap after a turn at the latest.

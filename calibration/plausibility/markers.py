@@ -17,8 +17,6 @@ from .verdict import Plausibility, mm
 
 @dataclass(frozen=True)
 class _Settings:
-    """Settings of the check for several markers."""
-
     # Rows that place the arm, and how often they are chosen: of three markers in equal parts, none are of one alone
     # once in 140.
     chosen: int = 5

@@ -19,8 +19,6 @@ from .verdict import FEWEST_ROWS, THRESHOLDS, Plausibility, mm
 
 @dataclass(frozen=True)
 class _Settings:
-    """Settings of the check of rows."""
-
     # A position belongs to the angles of a row this near at most.
     near_rows: int = 3
     # Rows are shifted if this share of them fits so many times better with angles or positions of the row as far

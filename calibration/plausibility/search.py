@@ -28,8 +28,6 @@ ROWS = 80
 
 @dataclass(frozen=True)
 class _Settings:
-    """Settings of the search for another reading of the columns."""
-
     # Width and depth of the search over readings: offsets of up to four joints by a quarter turn are found.
     width: int = 4
     depth: int = 5

@@ -76,8 +76,6 @@ class LeftOutView(msgspec.Struct):
 
 
 class UnusableImage(msgspec.Struct):
-    """An image that could not be used."""
-
     name: str
     eye: str
     why: str

@@ -26,8 +26,6 @@ _MOST_TAGS = 100
 
 @dataclass(frozen=True)
 class Tags:
-    """The tags to print."""
-
     shape: ShapeName = "tags"  # single tags, or one body of them
     ids: str | None = None  # numbers of the tags as in 0-5,9; None: as many as the shape has, from 0 on
     dictionary: Dictionary = "apriltag_36h11"

@@ -27,8 +27,6 @@ from kbmaps import RigidChain
 
 
 class _Settings:
-    """Settings of the watch on joints."""
-
     speed_over_s: float = 0.1
     moved_rad: float = math.radians(3.0)
     still_rad: float = math.radians(0.5)
@@ -44,8 +42,6 @@ WORDS = (("forward", "back"), ("left", "right"), ("up", "down"))  # REP 103: x, 
 
 
 class JointState(msgspec.Struct, frozen=True):
-    """Current state of one joint."""
-
     joint: str
     id: int | None  # ID of its servo; None if it has none
     angle: float  # [rad], as in q of the pairs
@@ -118,7 +114,6 @@ class JointsWatch:
         return [self.look() for _ in self._robot.joints][-1]
 
     def know_temperatures(self) -> None:
-        """Query all temperatures."""
         if self._servos is not None:
             for joint in self._temperatures:
                 self._temperatures[joint] = self._servos.temperature_c(joint)

@@ -42,8 +42,6 @@ Scan = Callable[[Sequence[int]], Sequence[ScannedBus]]
 
 @dataclass(frozen=True, slots=True)
 class LeRobotServo:
-    """The servo of a joint."""
-
     joint: str
     id: int
     model: str

@@ -176,7 +176,6 @@ class Found:
 
     @property
     def remedies(self) -> list[str]:
-        """Remedies for the causes found."""
         run = self.diagnosis.extended.run
         torques = np.abs(run.torques).max(axis=0)
         return remedies(self.file, self.robot, ticks(self.source.recording.q), torques)

@@ -211,7 +211,6 @@ def complaints_of(joints: JointSource) -> list[str]:
 
 
 def servos_of(joints: JointSource) -> dict[str, ServoStatus]:
-    """Return each joint's servo."""
     return dict(joints.servo_health) if isinstance(joints, Servos) else {}
 
 

@@ -69,7 +69,6 @@ class ReconnectingSource(Generic[R_co]):
 
     @property
     def health(self) -> tuple[str, ...]:
-        """The problem with the source, if there is one."""
         return () if self.trouble is None else (self.trouble,)
 
     def read(self, timeout_s: float) -> R_co | None:

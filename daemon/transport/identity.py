@@ -72,7 +72,6 @@ class Identity:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """All files that it was read from."""
         named = (self.ca, self.certificate, self.key, self.password_file, self.users_file)
         return tuple(path for path in named if path is not None)
 

@@ -63,7 +63,6 @@ class EmulatedServo(ABC):
 
     @property
     def id(self) -> int:
-        """ID on the bus."""
         return self["id"]
 
     @property

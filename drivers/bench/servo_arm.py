@@ -23,8 +23,6 @@ from .dry_run import BenchArm
 
 
 class _Settings:
-    """Settings of the emulated arm."""
-
     # period of the slowest swing
     slowest_s: float = 20.0
     # between neighbours: the golden angle, so that no two joints move together

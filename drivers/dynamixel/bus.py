@@ -35,7 +35,6 @@ class Bus(ServoBus):
 
     @staticmethod
     def packets_of(protocol: int) -> Packets:
-        """Return the packet codec of the protocol."""
         return packets_of(protocol)
 
     def sync_write(self, register: Register, values: Mapping[int, int]) -> None:

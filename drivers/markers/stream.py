@@ -23,8 +23,6 @@ from bodyschema.interfaces.waits import POLL_S, RIVAL_AFTER_S, SILENT_AFTER_S
 
 
 class _Settings:
-    """Settings of the checks of a stream of positions."""
-
     lately_s: float = 10.0
     bucket_s: float = 1.0
     # A share of faulty messages below this costs no pairs worth a message to a person.

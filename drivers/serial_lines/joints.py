@@ -27,8 +27,6 @@ log = logging.getLogger(__name__)
 
 
 class _Settings:
-    """Settings of the reading of an encoder board."""
-
     # an Arduino restarts when its port is opened, which takes two seconds
     header_s: float = 4.0
     anchor_s: float = 2.0

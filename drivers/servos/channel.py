@@ -18,8 +18,6 @@ from .bus import Answer
 
 
 class _Settings:
-    """Settings of the checks of one servo's readings."""
-
     # A position this far off the extrapolated one is requested again. Rounding of three positions alone makes two
     # ticks.
     surprise_rad: float = math.radians(0.35)

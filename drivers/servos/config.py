@@ -55,8 +55,6 @@ class ServoConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class ServosConfig(msgspec.Struct, Generic[BusT], frozen=True, forbid_unknown_fields=True):
-    """The table of a make."""
-
     table: ClassVar[str]
     models: ClassVar[Mapping[str, Model]]
     unsupported: ClassVar[Collection[str]] = ()
@@ -75,7 +73,6 @@ class ServosConfig(msgspec.Struct, Generic[BusT], frozen=True, forbid_unknown_fi
         return next(iter(self.buses)) if servo.bus is None else servo.bus
 
     def model_of(self, servo: ServoConfig) -> Model:
-        """Return the configured model of the servo."""
         return self.models[servo.model]
 
     def check(self, joints: Sequence[str], file: Path, text: str) -> None:

@@ -35,8 +35,6 @@ log = logging.getLogger(__name__)
 
 
 class _Settings:
-    """Settings of the reading of servos."""
-
     # this many must fail as well: the program itself may have been delayed
     few_polls: int = 3
     # consecutive implausible answers after which the servo was restarted

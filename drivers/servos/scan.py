@@ -38,7 +38,6 @@ class Kind:
 
     @property
     def packets(self) -> Packets:
-        """The packet codec."""
         return self.bus.packets_of(self.version)
 
     def told(self, head: bytes, id: int) -> Identity | None:
@@ -214,7 +213,6 @@ def heard(port: Port, clock: Clock, end: float, enough: int | None = None) -> by
 
 
 def open_line(port: str, baud: int, clock: Clock) -> Port:
-    """Open a real port."""
     return SerialLine.open(port, baud, clock.now)
 
 

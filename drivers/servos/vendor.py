@@ -77,8 +77,6 @@ def one_by_one(bus: Bus, servos: Sequence[IdentifiedServo]) -> Way:
 
 @dataclass(frozen=True, slots=True)
 class ServoVendor:
-    """A servo vendor."""
-
     table: str  # its table in robot.toml
     models: Mapping[int, Model] = field(repr=False)  # by number
     errors: Mapping[int, str]  # meaning and remedy of each bit of the hardware error

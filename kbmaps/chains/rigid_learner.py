@@ -33,8 +33,6 @@ from kbmaps.variance_components import error_covariances, inverse_roots, tells_d
 
 
 class _Settings:
-    """Settings of the learner's steps."""
-
     # A direction is open if at least this share of the prior's variance remains.
     open: float = 0.5
     # No step along a direction changes a parameter by more than this [rad, m]: beyond, the second order does not hold.

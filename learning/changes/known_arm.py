@@ -54,8 +54,6 @@ class KnownArm:
 
 
 class _Settings:
-    """Settings of the adaptation to a change."""
-
     # An unnamed change widens every kind at least this probable.
     improbable: float = 0.02
     # 1-sigma of the changed part: this multiple of its most probable change, and at least this many noises.

@@ -19,8 +19,6 @@ from kbmaps.variance_components import inverse_roots
 
 
 class _Settings:
-    """Settings of the monitor of changes."""
-
     # Minimum number of pairs of a reference model: with fewer it may be too far off.
     fewest_known: int = 100
     # A newer model replaces the reference after half as many pairs as it knows, within these limits. It would absorb a
@@ -96,8 +94,6 @@ class Reference:
 
 @dataclass(frozen=True, eq=False)
 class DetectedChange:
-    """Detected change."""
-
     reference: Reference  # the model before it
     kinds: tuple[ChangeKind, ...]  # the possible kinds
     noise_m: float  # 1-sigma of a coordinate of one measurement around the model [m]

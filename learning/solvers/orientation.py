@@ -38,8 +38,6 @@ ENTRY_OF_TURN = 0.8165
 
 @dataclass(frozen=True)
 class OrientationSolution:
-    """Solution for all orientations so far."""
-
     pairs: int  # number of pairs with an orientation
     chain: OrientedChain  # the rigid chain
     # 12 planes, of which those of e1, e2, e3 count; None if a map would be too large, or the pairs too few

@@ -38,8 +38,6 @@ LARGEST_NET = 2187
 
 
 class _Settings:
-    """Settings of the solver."""
-
     # Growth of the number of pairs before the next search for the prior's precision.
     retune: float = 1.25
     # Number of pairs that a chain is fitted to, evenly spread.
@@ -60,8 +58,6 @@ FOLDED = _Settings.fitted
 
 @dataclass(frozen=True)
 class Task:
-    """Task of a solver."""
-
     number: int  # identifies it
     prior: KBMap  # the map to start from, in the bases of the learnt maps
     belief: ChainBelief  # prior of the chain before the first pair of this task
@@ -161,7 +157,6 @@ class DirectSolver:
             self._q, self._x, self._cov = self._q[FOLDED:], self._x[FOLDED:], self._cov[FOLDED:]
 
     def solve(self) -> None:
-        """Solve for all models."""
         self._solved += self.solutions()
 
     def poll(self) -> Solved | None:

@@ -119,7 +119,6 @@ class Servo(EmulatedServo):
 
     @property
     def hardware_error(self) -> int:
-        """Hardware error bits."""
         return self._error1 if self.model.protocol == 1 else self["hardware_error"]
 
     def fail(self, bits: int) -> None:

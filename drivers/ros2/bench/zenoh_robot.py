@@ -63,7 +63,6 @@ class ZenohRobot:
 
     @property
     def is_heard(self) -> bool:
-        """True if there is a subscriber."""
         status: Any = self._publisher.matching_status  # zenoh's stub wrongly declares it as bool
         return bool(status.matching)
 
