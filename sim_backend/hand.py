@@ -9,12 +9,11 @@ import numpy as np
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.sim_backend.geometry import turn_between
-from bodyschema.sim_backend.truth import JointRoles, chain_from_root
 
 from .bullet import Body
 from .config import GuideConfig
 from .sight import Sight
-from .truth import TrueRobot
+from .truth import JointRoles, TrueRobot, chain_from_root
 
 
 class _Settings:

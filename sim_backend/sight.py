@@ -10,12 +10,11 @@ from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.pointing import Pointing
 from bodyschema.robot.rpy import rotation_of
 from bodyschema.sim_backend.geometry import cross_matrix
-from bodyschema.sim_backend.truth import JointRoles
 from kbmaps import RigidChain
 
 from .bullet import Body
 from .config import CameraConfig
-from .truth import TrueRobot
+from .truth import JointRoles, TrueRobot
 
 
 class _Settings:

@@ -12,14 +12,13 @@ from typing import Any, ClassVar, Generic, TypeVar
 import msgspec
 import numpy as np
 
-from bodyschema.drivers.bench.dry_run import GLITCH_TICKS
 from bodyschema.drivers.servos.config import ServoConfig, ServosConfig
 from bodyschema.interfaces.records import FloatArray, frozen_array
 
 from .asked_faults import AskedFault, FaultKinds, WireFaults
 from .chain import ServoChain, ServoT
 from .device import Angle, Faults
-from .dry_run import BenchArm
+from .dry_run import GLITCH_TICKS, BenchArm
 
 
 class _Settings:

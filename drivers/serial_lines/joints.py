@@ -12,7 +12,6 @@ from typing import Self
 from bodyschema.drivers.checks import MANY_TROUBLES, READ_S, Check, aligned, warned
 from bodyschema.drivers.echo import BITS_PER_BYTE, Port, close_quietly
 from bodyschema.drivers.serial_line import RETRY_S, SerialLine
-from bodyschema.drivers.serial_lines.config import SerialLinesConfig
 from bodyschema.drivers.turn_count import LOST_AFTER_S, TurnCount
 from bodyschema.drivers.turns import SpeedGate
 from bodyschema.interfaces.errors import SourceError, SourceLost
@@ -20,7 +19,7 @@ from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import JointReading, frozen_array
 
 from .board import Board, Counts, Timed
-from .config import TABLE, EncoderConfig
+from .config import TABLE, EncoderConfig, SerialLinesConfig
 from .lines import ASK_HEADER, Header
 
 log = logging.getLogger(__name__)

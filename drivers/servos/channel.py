@@ -10,11 +10,10 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Protocol
 
-from bodyschema.drivers.servos.bus import Bus
 from bodyschema.drivers.servos.handshake import IdentifiedServo
 from bodyschema.interfaces.records import JointReading
 
-from .bus import Answer
+from .bus import Answer, Bus
 
 
 class _Settings:

@@ -14,9 +14,6 @@ from typing import Any, Self
 
 from bodyschema.drivers.echo import Port, close_quietly, without_echo
 from bodyschema.drivers.serial_line import SerialLine, adapter_latency_s
-from bodyschema.drivers.servos.channel import Drive
-from bodyschema.drivers.servos.health import Inspection
-from bodyschema.drivers.servos.vendor import Plan, plans_of
 from bodyschema.drivers.turn_count import LOST_AFTER_S, TurnCount
 from bodyschema.drivers.turns import SpeedGate
 from bodyschema.interfaces.errors import SourceError, SourceLost
@@ -25,11 +22,11 @@ from bodyschema.interfaces.records import JointReading, frozen_array
 from bodyschema.interfaces.servos import BusStatus, ServoStatus
 
 from .bus import Bus, Counts, Request
-from .channel import Channel, Punctuality, Sample, middle
+from .channel import Channel, Drive, Punctuality, Sample, middle
 from .config import AnyBus, ServosConfig
 from .handshake import RETRY_S, IdentifiedServo, identify, require_all, restore_torque, switch_torque_off
-from .health import Health
-from .vendor import ServoVendor
+from .health import Health, Inspection
+from .vendor import Plan, ServoVendor, plans_of
 
 log = logging.getLogger(__name__)
 

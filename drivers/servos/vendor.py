@@ -7,11 +7,10 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from bodyschema.drivers.servos.bus import Bus, Request
-from bodyschema.drivers.servos.handshake import ATTEMPTS
 
 from .channel import Channel
 from .config import ServosConfig
-from .handshake import IdentifiedServo
+from .handshake import ATTEMPTS, IdentifiedServo
 from .model import Model
 from .settings import Setting
 
