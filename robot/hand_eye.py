@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Self
 
 import msgspec
 
-from bodyschema.interfaces.errors import ConfigError
-
 # numpy is imported where it is used: clients that only read these messages do without.
 if TYPE_CHECKING:
     from bodyschema.interfaces.records import FloatArray
@@ -142,15 +140,13 @@ def write_launch_file(pose: HandEye, folder: Path) -> Path:
     Raises:
         ConfigError: it cannot be written.
     """
-    from bodyschema.interfaces.whole_files import write_whole
+    from bodyschema.interfaces.whole_files import write_whole, writing
 
     file = folder / LAUNCH
     arguments = _arguments(pose.translation_m, pose.quaternion_xyzw, pose.parent, pose.child)
     text = _LAUNCH_FILE.format(package="tf2_ros", executable=_PUBLISHER, arguments=arguments)
-    try:
+    with writing(file, remedy="Give another folder"):
         write_whole({file: text.encode()})
-    except OSError as error:
-        raise ConfigError(f"cannot be written: {error.strerror}", file=file, remedy="Give another folder") from error
     return file
 
 

@@ -12,7 +12,7 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.interfaces.whole_files import replace_kept
+from bodyschema.interfaces.whole_files import replace_kept, writing
 
 from .toml_file import read_toml
 
@@ -83,7 +83,5 @@ def write_edited(file: Path, edited: str) -> Path:
     Raises:
         ConfigError: nothing could be written.
     """
-    try:
+    with writing(file):
         return replace_kept(file, edited.encode())
-    except OSError as error:
-        raise ConfigError(f"cannot be written: {error.strerror}", file=file) from error

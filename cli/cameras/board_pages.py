@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.interfaces.whole_files import write_whole
+from bodyschema.interfaces.whole_files import write_whole, writing
 from bodyschema.vision.printing import Page, pdf, svg
 
 _WRITERS = {".pdf": pdf, ".svg": svg}
@@ -16,7 +16,5 @@ def write_page(page: Page, out: Path) -> None:
     writer = _WRITERS.get(out.suffix.lower())
     if writer is None:
         raise ConfigError(f"{out}: neither .pdf nor .svg", remedy="Name a file that ends so")
-    try:
+    with writing(out, remedy="Name another folder"):
         write_whole({out: writer(page)})
-    except OSError as error:
-        raise ConfigError(f"cannot be written: {error.strerror}", file=out, remedy="Name another folder") from error

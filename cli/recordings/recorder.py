@@ -14,6 +14,7 @@ from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.wire import PairsReply, decode, pair_from_wire
 from bodyschema.interfaces.errors import BusError, RecordingError
 from bodyschema.interfaces.records import Pair
+from bodyschema.interfaces.whole_files import writing
 from bodyschema.recordings import files as recordings
 from bodyschema.recordings.csv_file import write_csv_rows
 from bodyschema.recordings.parquet_file import INTEGER_COLUMNS
@@ -105,12 +106,9 @@ def follow_history(history: History, robot: RobotDescription, out: Path, stopped
         if pairs:
             _write(recordings.from_pairs(pairs, robot.joints), out, robot)
         return len(pairs)
-    try:
-        with out.open("w", encoding="utf-8", newline="\n") as stream:
-            rows = _CsvRows(stream, robot.joints)
-            _follow(history, stopped, rows.add)
-    except OSError as error:
-        raise RecordingError(f"cannot be written: {error.strerror or error}", file=out) from error
+    with writing(out, RecordingError), out.open("w", encoding="utf-8", newline="\n") as stream:
+        rows = _CsvRows(stream, robot.joints)
+        _follow(history, stopped, rows.add)
     if not rows.count:
         out.unlink()
     return rows.count
