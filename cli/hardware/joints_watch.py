@@ -22,8 +22,6 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.interfaces.servos import EncoderJoints, ServoJoints
 from bodyschema.interfaces.waits import POLL_S
 from bodyschema.robot.description import RobotDescription
-from bodyschema.robot.urdf import chain_between
-from kbmaps import RigidChain
 
 
 class _Settings:
@@ -183,7 +181,9 @@ class SignCheck:
     """Predicts by the URDF where the marker went when one joint was moved, for the user to compare."""
 
     def __init__(self, robot: RobotDescription) -> None:
-        self._robot, self._chain = robot, _from_parent(robot)
+        # from the link that carries the cameras to the marker
+        placed = robot.with_placement(np.eye(4), np.array(robot.robot.marker_xyz))
+        self._robot, self._chain = robot, placed.chain
         self._begin: FloatArray | None = None
         self._rest: tuple[float, FloatArray] | None = None  # since when, and where
         self.said = ""  # the prediction in words, for the joint moved last; empty before
@@ -213,20 +213,6 @@ class SignCheck:
         word, sign = WORDS[axis][int(went[axis] < 0)], "+-"[int(went[axis] < 0)]
         parent = self._robot.camera.parent_link
         return f"{joint} {turn}: by the URDF the marker went {word} ({sign}{'xyz'[axis]} of {parent})"
-
-
-def _from_parent(robot: RobotDescription) -> RigidChain:
-    """Return the chain from the link that carries the cameras to the marker."""
-    section = robot.robot
-    return chain_between(
-        robot.tree,
-        section.joints,
-        section.held_at,
-        start=robot.camera.parent_link,
-        end=section.marker_link,
-        T_start_camera=np.eye(4),
-        marker_xyz=np.array(section.marker_xyz),
-    )
 
 
 HINT = "Move one joint at a time. It went the other way? Correct "
