@@ -34,18 +34,12 @@ class JointBuffer:
         self,
         prismatic: NDArray[np.bool_],
         max_gap_s: float,
-        capacity: int = CAPACITY,
+        capacity: int = CAPACITY,  # number of readings that are kept at most
         *,
-        live: bool = False,
-        kept_s: float = 0.0,
+        live: bool = False,  # `put` never waits
+        kept_s: float = 0.0,  # readings up to this long before the frame are kept [s]
     ) -> None:
-        """Start with an empty buffer.
-
-        Args:
-            capacity: number of readings that are kept at most.
-            live: `put` never waits.
-            kept_s: readings up to this long before the frame are kept [s].
-        """
+        """Start with an empty buffer."""
         self._prismatic = prismatic
         self.max_gap_s = max_gap_s  # readings around a frame may be this far apart [s]
         self._capacity = capacity

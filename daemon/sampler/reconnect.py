@@ -42,13 +42,10 @@ class ReconnectingSource(Generic[R_co]):
         name: str,
         wall: Clock,
         sleep: Callable[[float], None] = time.sleep,
+        # returns a device that this process will never be allowed to open, or None
         forbidden: Callable[[], str | None] = lambda: None,
     ) -> None:
-        """Store the settings; nothing is opened yet.
-
-        Args:
-            forbidden: returns a device that this process will never be allowed to open, or None.
-        """
+        """Store the settings; nothing is opened yet."""
         self._forbidden = forbidden
         self._source, self._name, self._wall, self._sleep = source, name, wall, sleep
         self._opened = ExitStack()

@@ -64,14 +64,11 @@ class Sampler:
         bus: ZenohSession,
         store: PairStore,
         *,
-        exit_at_end: bool = False,
+        exit_at_end: bool = False,  # return from `run` when the sources end, instead of continuing to serve the history
+        # is notified once everything is up, that `LOOPS` work, and of the sampler's state
         service: Service | None = None,
     ) -> None:
         """Prepare a sampler over an open bus and an open store; `run` opens the sources.
-
-        Args:
-            exit_at_end: return from `run` when the sources end, instead of continuing to serve the history.
-            service: is notified once everything is up, that `LOOPS` work, and of the sampler's state.
 
         Raises:
             ConfigError: the encoders' joints differ from robot.toml's.

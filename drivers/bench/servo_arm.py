@@ -78,18 +78,14 @@ class ServoArm(BenchArm, Generic[ServoT, ConfigT]):
     def __init__(
         self,
         config: ConfigT,
-        angles: Mapping[str, Angle],
+        angles: Mapping[str, Angle],  # by joint, its angle as a function of time [rad]
         *,
         faults: Sequence[AskedFault] = (),
         return_delay_s: float = 0.0,
         seed: int = 0,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Create the servos with their power on.
-
-        Args:
-            angles: by joint, its angle as a function of time [rad].
-        """
+        """Create the servos with their power on."""
         self._config, self._return_delay_s, self._rng, self._now = config, return_delay_s, Random(seed), now
         self._servos: dict[str, ServoT] = {}
         self.chains: dict[str, ServoChain[ServoT]] = {}  # by name of the bus

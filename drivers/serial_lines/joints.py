@@ -93,21 +93,16 @@ class SerialLineJoints:
 
     def __init__(
         self,
-        config: SerialLinesConfig,
+        config: SerialLinesConfig,  # checked; see `SerialLinesConfig.check`
         joints: Sequence[str],
         clock: Clock,
         *,
+        # of each joint [rad]; a range below one turn determines the turn
         limits: Sequence[tuple[float, float]] | None = None,
-        last_pose: Sequence[float] | None = None,
+        last_pose: Sequence[float] | None = None,  # last joint angles [rad], shape (d,), from which turns are counted
         open_port: OpenPort = open_serial,
     ) -> None:
-        """Prepare without opening anything.
-
-        Args:
-            config: checked; see `SerialLinesConfig.check`.
-            limits: of each joint [rad]; a range below one turn determines the turn.
-            last_pose: last joint angles [rad], shape (d,), from which turns are counted.
-        """
+        """Prepare without opening anything."""
         self._config, self.joints, self._clock, self._open_port = config, tuple(joints), clock, open_port
         by_joint = {encoder.joint: encoder for encoder in config.encoders}
         self._wanted = [by_joint[joint] for joint in joints]

@@ -72,23 +72,17 @@ class ServoJoints:
 
     def __init__(
         self,
-        config: ServosConfig[Any],
+        config: ServosConfig[Any],  # checked; see `ServosConfig.check`
         joints: Sequence[str],
         clock: Clock,
         *,
         open_port: OpenPort = open_serial,
+        # of each joint [rad]; a range below one turn determines the turn
         limits: Sequence[tuple[float, float]] | None = None,
-        last_pose: Sequence[float] | None = None,
-        drives: Sequence[Drive] = (),
+        last_pose: Sequence[float] | None = None,  # last joint angles [rad], shape (d,), from which turns are counted
+        drives: Sequence[Drive] = (),  # may move joints on request; without any, torque stays off
     ) -> None:
-        """Prepare without opening anything.
-
-        Args:
-            config: checked; see `ServosConfig.check`.
-            limits: of each joint [rad]; a range below one turn determines the turn.
-            last_pose: last joint angles [rad], shape (d,), from which turns are counted.
-            drives: may move joints on request; without any, torque stays off.
-        """
+        """Prepare without opening anything."""
         self._config, self.joints, self._clock = config, tuple(joints), clock
         self._open_port, self.drives = open_port, tuple(drives)
         by_joint = {servo.joint: servo for servo in config.servos}

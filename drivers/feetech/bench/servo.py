@@ -71,15 +71,10 @@ class Servo(EmulatedServo):
         angle: Angle,
         *,
         baud: int = 1_000_000,
-        return_delay_s: float = 500e-6,
-        multi_turn: bool = False,
+        return_delay_s: float = 500e-6,  # delay between instruction and answer
+        multi_turn: bool = False,  # it counts turns until it loses power
     ) -> None:
-        """Create a servo with factory settings, except for the arguments.
-
-        Args:
-            return_delay_s: delay between instruction and answer.
-            multi_turn: it counts turns until it loses power.
-        """
+        """Create a servo with factory settings, except for the arguments."""
         super().__init__(model, angle)
         self.knows_sync_read = model.protocol != SCS  # it answers SYNC_READ
         self._multi_turn, self._base = multi_turn, 0

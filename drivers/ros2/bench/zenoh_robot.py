@@ -22,17 +22,13 @@ class ZenohRobot:
     def __init__(
         self,
         nodes: Sequence[Node],
-        listen: str,
+        listen: str,  # endpoint of the router, such as tcp/127.0.0.1:7447
         *,
         domain: int = 0,
         topic: str = "/joint_states",
         via: Literal["rmw_zenoh", "ros2dds"] = "rmw_zenoh",
     ) -> None:
-        """Prepare without opening anything.
-
-        Args:
-            listen: endpoint of the router, such as tcp/127.0.0.1:7447.
-        """
+        """Prepare without opening anything."""
         self._via = via
         self._nodes, self._listen, self._domain, self._topic = list(nodes), listen, domain, topic
         self._session: zenoh.Session | None = None
