@@ -68,7 +68,6 @@ class PooledSolver:
         self.answers: deque[Solved] = deque()  # answers not fetched yet
 
     def start(self, task: Task) -> None:
-        """Discard all pairs and start a new task."""
         self.clear()
         self._orders.append(lambda: self._process.start(task, self._robot))
 
@@ -84,7 +83,6 @@ class PooledSolver:
         self.asked = True
 
     def poll(self) -> Solved | None:
-        """Return the next solution that has arrived, without waiting."""
         self._shared.attend()
         return self.answers.popleft() if self.answers else None
 

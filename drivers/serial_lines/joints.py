@@ -55,12 +55,10 @@ class Encoder:
 
     @property
     def joint(self) -> str:
-        """The joint's name."""
         return self.config.joint
 
     @property
     def label(self) -> str:
-        """Name of the encoder, for messages."""
         return f"encoder {self.config.name!r}"
 
     @property
@@ -69,11 +67,9 @@ class Encoder:
         return 2 * math.pi / self.ticks_per_turn
 
     def angle(self, ticks: int) -> float:
-        """Return the joint angle [rad] at a position with its turns [ticks]."""
         return self.config.direction * (ticks - self.config.zero_ticks) * self.rad_per_tick
 
     def ticks(self, angle: float) -> float:
-        """Return the position [ticks] at a joint angle [rad]."""
         return self.config.zero_ticks + self.config.direction * angle / self.rad_per_tick
 
 

@@ -204,7 +204,6 @@ class Servo(EmulatedServo):
         return places
 
     def write(self, address: int, data: bytes, t: float) -> Error:
-        """Write bytes of the control table where that is allowed."""
         for begin, part in self._runs(address, data):
             error = self._write(begin, part, t)
             if error is not Error.NONE:
