@@ -58,7 +58,6 @@ class OnlineLearner:
         together_s: float = 0.0,
         common: Callable[[FloatArray], FloatArray] | None = None,  # as `Snapshot` has it
     ) -> None:
-        """Initialise before any pair."""
         self.nominal, self._settings, self._common = nominal, settings, common
         self._solving = SolverClient(solver, settings.solve_every)
         self._lock = threading.Lock()

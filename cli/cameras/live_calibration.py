@@ -128,7 +128,6 @@ class LiveCalibration:
         # called with the images of every view taken and its number, from 1 on
         keep: Callable[[ImagePair, int], None] = lambda _pair, _number: None,
     ) -> None:
-        """Store the arguments; open nothing yet."""
         self._eyes, self._calibrated, self._show, self._keep = eyes, calibrated, show, keep
         self._source = ReconnectingSource(RequiredEyes(eyes, SameAsFirst()), "the cameras", clock)
         self._views = views

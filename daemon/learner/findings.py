@@ -67,7 +67,6 @@ class Findings:
         robots: int = 1,  # number of robots that share the background thread
         turns: FindingTurns | None = None,  # their common time limit
     ) -> None:
-        """Start without findings."""
         self._learning, self._robot, self._clock = learning, robot, clock
         self._turns = turns or FindingTurns()
         self._parts = SHARE * robots

@@ -39,7 +39,6 @@ class JointBuffer:
         live: bool = False,  # `put` never waits
         kept_s: float = 0.0,  # readings up to this long before the frame are kept [s]
     ) -> None:
-        """Start with an empty buffer."""
         self._prismatic = prismatic
         self.max_gap_s = max_gap_s  # readings around a frame may be this far apart [s]
         self._capacity = capacity

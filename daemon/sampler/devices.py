@@ -140,7 +140,6 @@ class SamplerRules:
         buffer: JointBuffer,
         deciding: threading.Lock,  # held while a pair is decided on and stored, so that no pair sees half of a change
     ) -> None:
-        """Start with the rules of `config`."""
         self._config, self._store, self._devices, self._wall = config, store, devices, wall
         self._gate, self._buffer, self._deciding = gate, buffer, deciding
         self._one_at_a_time = threading.Lock()

@@ -45,7 +45,6 @@ class ReconnectingSource(Generic[R_co]):
         # returns a device that this process will never be allowed to open, or None
         forbidden: Callable[[], str | None] = lambda: None,
     ) -> None:
-        """Store the settings; nothing is opened yet."""
         self._forbidden = forbidden
         self._source, self._name, self._wall, self._sleep = source, name, wall, sleep
         self._opened = ExitStack()

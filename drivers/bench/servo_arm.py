@@ -85,7 +85,6 @@ class ServoArm(BenchArm, Generic[ServoT, ConfigT]):
         seed: int = 0,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Create the servos with their power on."""
         self._config, self._return_delay_s, self._rng, self._now = config, return_delay_s, Random(seed), now
         self._servos: dict[str, ServoT] = {}
         self.chains: dict[str, ServoChain[ServoT]] = {}  # by name of the bus

@@ -158,7 +158,6 @@ class FusedMarkers:
     """
 
     def __init__(self, members: Sequence[Member], clock: Clock) -> None:
-        """Prepare without opening anything."""
         self.members, self._clock = list(members), clock
         self._opened = ExitStack()
         self._last_t = -math.inf

@@ -130,7 +130,6 @@ class MarkerStream:
     """
 
     def __init__(self, table: SourceTable, receiver: Receiver, decode: Decode, clock: Clock) -> None:
-        """Prepare without opening anything."""
         self._table, self._receiver, self._decode, self._clock = table, receiver, decode, clock
         self.name = table.label
         self._is_open = False

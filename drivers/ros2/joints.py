@@ -201,7 +201,6 @@ class Ros2Joints:
         prismatic: Sequence[bool] | None = None,  # True for each prismatic joint; none by default
         open_link: OpenLink = open_zenoh,
     ) -> None:
-        """Prepare without opening anything."""
         self._config, self.joints, self._clock, self._open_link = config, tuple(joints), clock, open_link
         self._wanted = config.ros_names(joints)
         slides = [False] * len(joints) if prismatic is None else list(prismatic)

@@ -98,7 +98,6 @@ class SerialLineJoints:
         last_pose: Sequence[float] | None = None,  # last joint angles [rad], shape (d,), from which turns are counted
         open_port: OpenPort = open_serial,
     ) -> None:
-        """Prepare without opening anything."""
         self._config, self.joints, self._clock, self._open_port = config, tuple(joints), clock, open_port
         by_joint = {encoder.joint: encoder for encoder in config.encoders}
         self._wanted = [by_joint[joint] for joint in joints]

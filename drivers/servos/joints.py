@@ -82,7 +82,6 @@ class ServoJoints:
         last_pose: Sequence[float] | None = None,  # last joint angles [rad], shape (d,), from which turns are counted
         drives: Sequence[Drive] = (),  # may move joints on request; without any, torque stays off
     ) -> None:
-        """Prepare without opening anything."""
         self._config, self.joints, self._clock = config, tuple(joints), clock
         self._open_port, self.drives = open_port, tuple(drives)
         by_joint = {servo.joint: servo for servo in config.servos}

@@ -71,7 +71,6 @@ class PingScanner:
     """
 
     def __init__(self, *kinds: Kind) -> None:
-        """Scan for `kinds`."""
         self._kinds, self._packets = kinds, kinds[0].packets
         self._ping_sizes = (len(self._packets.ping(0)), self._packets.overhead + self._packets.ping_size)
 

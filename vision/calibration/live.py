@@ -49,7 +49,6 @@ class LiveViews:
     """
 
     def __init__(self, board: Board, detector: Detector | None = None, eyes: tuple[Eye, ...] = EYES) -> None:
-        """Start without views."""
         self.found = Gathered(board, eyes=eyes)  # the views taken, and their images
         self.coverage = self.found.coverage()  # image coverage of these views
         self._detector = BoardDetector(board) if detector is None else detector

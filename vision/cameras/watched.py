@@ -28,7 +28,6 @@ class WatchedCamera:
     """
 
     def __init__(self, camera: StereoCamera, config: VisionConfig) -> None:
-        """Nothing is opened yet."""
         self._camera = camera
         self._tracker = tracker_of(camera.calibration, config)
         self._annotator = Annotator(camera.calibration, config)
@@ -76,7 +75,6 @@ class PlainEyes:
     """Frames of cameras without a calibration: nothing is searched for in them."""
 
     def __init__(self, eyes: StereoEyes) -> None:
-        """Nothing is opened yet."""
         self._eyes = eyes
         self.frames = 0  # number of frames read
 

@@ -80,7 +80,6 @@ class Planned:
     """Encoder that corrupts the next message on request, or a random share of all."""
 
     def __init__(self, rng: Random, *, share: float = 0.0, kinds: tuple[Fault, ...] = tuple(Fault)) -> None:
-        """Start without any corrupted message."""
         self._rng, self._share, self._kinds = rng, share, kinds
         self._before_ns = 0
         self.next: Fault | None = None  # fault of the next message; reset to None once it is applied

@@ -28,7 +28,6 @@ class ZenohRobot:
         topic: str = "/joint_states",
         via: Literal["rmw_zenoh", "ros2dds"] = "rmw_zenoh",
     ) -> None:
-        """Prepare without opening anything."""
         self._via = via
         self._nodes, self._listen, self._domain, self._topic = list(nodes), listen, domain, topic
         self._session: zenoh.Session | None = None

@@ -37,7 +37,6 @@ class EncoderBoard:
         drift: float = 0.0,  # how much its clock is too fast
         faults: Faults = no_faults,
     ) -> None:
-        """Create a board with its power on."""
         self.encoders, self.faults = dict(encoders), faults
         self.failing: set[str] = set()
         self.glitch_ticks: dict[str, int] = {}
