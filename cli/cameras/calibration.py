@@ -86,8 +86,8 @@ class CamerasFile(msgspec.Struct):
     """Output of `bodyschema calibrate cameras --json`. Half widths are those of 95 % intervals.
 
     One camera alone has no baseline. Positions are those of a marker of known size all over the view, 0.6 m ahead.
-    `right_camera` is the pose of the right optical frame in the left one. `refocused`
-    has a sentence for each sign that a lens refocused between the views, or was free to.
+    `right_camera` is the pose of the right optical frame in the left one. `refocused` has a sentence for each sign that
+    a lens refocused between the views, or was free to.
     """
 
     model: str

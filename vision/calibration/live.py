@@ -44,8 +44,7 @@ class LiveViews:
     """Selection of views from a stream of image pairs.
 
     A view is taken when both eyes see the board, it has been still for two frames, and no similar view was taken. A
-    view
-    of a single eye is taken if it shows the board in a part of the image that is not covered yet.
+    view of a single eye is taken if it shows the board in a part of the image that is not covered yet.
     """
 
     def __init__(self, board: Board, detector: Detector | None = None, eyes: tuple[Eye, ...] = EYES) -> None:
