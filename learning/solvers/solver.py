@@ -88,7 +88,6 @@ class Solver(Protocol):
 
     def start(self, task: Task) -> None:
         """Forget all pairs and begin a new task."""
-        ...
 
     def learn(
         self, q: FloatArray, x: FloatArray, cov: FloatArray | None = None, turns: FloatArray | None = None
@@ -101,15 +100,12 @@ class Solver(Protocol):
             cov: their covariances (n, 3, 3) [m²], NaN where a pair has none; None where no pair has any.
             turns: their orientations, quaternions (n, 4), likewise.
         """
-        ...
 
     def solve(self) -> None:
         """Request the solutions of all pairs so far; `poll` returns them one by one, perhaps later."""
-        ...
 
     def poll(self) -> Solved | None:
         """Return the next answer to a `solve`, without waiting."""
-        ...
 
 
 class DirectSolver:

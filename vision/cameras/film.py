@@ -40,7 +40,6 @@ class Roll(Protocol):
 
     def open(self, place: int) -> None:
         """Prepare to read the pair at `place`."""
-        ...
 
     def close(self) -> None: ...
 
