@@ -1,7 +1,5 @@
 """`python -m bodyschema` is `bodyschema`."""
 
-from __future__ import annotations
-
 import os
 import sys
 

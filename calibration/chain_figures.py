@@ -22,8 +22,6 @@ IntArray = NDArray[np.intp]
 
 
 class _Settings:
-    """Settings of the figures that are shown."""
-
     # Where what is probable differs by more than this, the pairs do not tell.
     told_within: float = 4.0
     # A zero that is still as uncertain as it was before is nothing that the pairs show.

@@ -59,8 +59,6 @@ class WorstRow(msgspec.Struct, frozen=True):
 
 
 class LeftOut(msgspec.Struct, frozen=True):
-    """Rows that were not compared."""
-
     # first, second: number of rows of each recording without a match in the other
     first: int
     second: int

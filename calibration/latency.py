@@ -27,8 +27,6 @@ STEP_S = 0.004
 
 
 class _Settings:
-    """Settings of the search for the latency."""
-
     fewest_fixes: int = 60
     blocks: int = 10
     # a second minimum is a rival if its residual is below this multiple of the best one's

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bodyschema.interfaces.errors import RecordingError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.whole_files import require_target, write_whole
+from bodyschema.interfaces.whole_files import require_target, write_whole, writing
 from bodyschema.robot.description import link_poses
 from kbmaps import ChainPosterior, ExperimentDesign, next_poses
 
@@ -81,10 +81,8 @@ class NextPoses:
             RecordingError: the file is there already, or cannot be written.
         """
         check_target(file, replace=replace)
-        try:
+        with writing(file, RecordingError):
             write_whole({file: (self._json() if file.suffix.lower() == JSON else self._csv())})
-        except OSError as error:
-            raise RecordingError(f"cannot be written: {error.strerror}", file=file) from error
 
     def _json(self) -> bytes:
         value = {

@@ -20,8 +20,6 @@ from kbmaps import ChainBelief, ChainParameters, RigidLearner
 
 
 class _Settings:
-    """Settings of the tests for another tool, for late time stamps and for positions that nothing measured."""
-
     # Minimum number of pairs on either side of a change, and the share of all squared residuals that it must explain.
     fewest: int = 6
     explained: float = 0.5
@@ -43,8 +41,6 @@ class _Settings:
 
 @dataclass(frozen=True, slots=True)
 class ToolJump:
-    """A change of the tool."""
-
     row: int  # the first row with the other tool, counted from 1
     distance_m: float  # distance between the marker positions of the two tools
 

@@ -37,8 +37,6 @@ Trusted = Literal["nothing", "links", "urdf"]
 
 
 class _Settings:
-    """Settings of the calibration and its cross-validation."""
-
     # How many pairs are asked. No arm is quite rigid, and thousands of pairs would take its sag for bad workmanship.
     judged_pairs: int = 300
     slide_zeros_m: float = 0.02

@@ -47,16 +47,12 @@ class ClientConfig:
     """The robot's name, its joints, and where its processes are.
 
     `Config` reads and checks everything else; clients leave that to the processes, which takes half of the time.
-
-    Attributes:
-        file: robot.toml.
-        urdf: file of the URDF.
     """
 
-    file: Path
+    file: Path  # robot.toml
     name: str
     joints: tuple[str, ...]
-    urdf: Path
+    urdf: Path  # file of the URDF
     zenoh: ZenohConfig
 
     @classmethod

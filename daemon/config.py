@@ -40,39 +40,29 @@ LARGEST_MAP = 3**12
 
 
 class DaemonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [daemon]: the sampler's rules, and where state is kept.
+    """The table [daemon]: the sampler's rules, and where state is kept."""
 
-    Attributes:
-        state_dir: where store and checkpoint live, relative to robot.toml; by default
-            $XDG_STATE_HOME/bodyschema/<robot name>.
-        min_step_deg, max_step_deg: Euclidean norm over all joints of the step between neighbouring pairs. Nearer:
-            wait. Farther: a new segment. Prismatic joints count with `metres_per_degree`.
-        metres_per_degree: how far a prismatic joint moves for what counts as one degree.
-        any_step: accept every pair whatever its step (recordings of static poses far apart); each starts a segment
-            of its own where the step is larger than `max_step_deg`.
-        max_reading_gap_s: encoder readings around a frame may be this far apart.
-        max_marker_speed_m_s: a marker that moved faster since its last fix is not believed.
-        max_time_error_deg: joints that move farther than this while the time of a frame is uncertain (1-sigma, and
-            what lies between the two eyes' images) are too fast for a pair.
-        segment_gap_s: a pause between pairs longer than this starts a new segment.
-        keep_days: pairs older than this are deleted; without it, age does not matter.
-        keep_mb: maximum size of the store in 10^6 bytes; the oldest pairs beyond it are deleted. Without it, the disk
-            is the limit.
-        keep_newest: this number of newest pairs is kept whatever their age and size.
-    """
-
+    # where store and checkpoint live, relative to robot.toml; by default $XDG_STATE_HOME/bodyschema/<robot name>
     state_dir: str | None = None
+    # min_step_deg, max_step_deg: Euclidean norm over all joints of the step between neighbouring pairs. Nearer: wait.
+    # Farther: a new segment. Prismatic joints count with `metres_per_degree`.
     min_step_deg: Positive = 1.0
     max_step_deg: Positive = 3.0
-    metres_per_degree: Positive = 0.005
+    metres_per_degree: Positive = 0.005  # how far a prismatic joint moves for what counts as one degree
+    # accept every pair whatever its step (recordings of static poses far apart); each starts a segment of its own where
+    # the step is larger than `max_step_deg`
     any_step: bool = False
-    max_reading_gap_s: Positive = 0.1
-    max_marker_speed_m_s: Positive = 3.0
+    max_reading_gap_s: Positive = 0.1  # encoder readings around a frame may be this far apart
+    max_marker_speed_m_s: Positive = 3.0  # a marker that moved faster since its last fix is not believed
+    # joints that move farther than this while the time of a frame is uncertain (1-sigma, and what lies between the two
+    # eyes' images) are too fast for a pair
     max_time_error_deg: Positive = 0.2
-    segment_gap_s: Positive = 1.0
-    keep_days: Positive | None = None
+    segment_gap_s: Positive = 1.0  # a pause between pairs longer than this starts a new segment
+    keep_days: Positive | None = None  # pairs older than this are deleted; without it, age does not matter
+    # maximum size of the store in 10^6 bytes; the oldest pairs beyond it are deleted. Without it, the disk is the
+    # limit.
     keep_mb: Positive | None = None
-    keep_newest: Count = 20_000
+    keep_newest: Count = 20_000  # this number of newest pairs is kept whatever their age and size
 
 
 # A larger radius is one of another unit [m].
@@ -98,18 +88,13 @@ class Tables(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Config:
-    """Everything that robot.toml says, checked.
-
-    Attributes:
-        extended: the robot with the effects that the file adds to it, if it adds any.
-        given_state_dir: the place for store and checkpoint that the command line gave, if it gave one.
-    """
+    """Everything that robot.toml says, checked."""
 
     file: Path
     robot: RobotDescription
     tables: Tables
-    extended: Simulation | None = None
-    given_state_dir: Path | None = None
+    extended: Simulation | None = None  # the robot with the effects that the file adds to it, if it adds any
+    given_state_dir: Path | None = None  # the place for store and checkpoint that the command line gave, if it gave one
 
     @classmethod
     def load(cls, file: Path, environment: Mapping[str, str] = os.environ) -> Config:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from bodyschema.daemon.transport.status import Change as LastChange
 from bodyschema.daemon.transport.status import LearnerStatus
-from bodyschema.dashboard.documents import OutlookDocument
 
-from .documents import Change, CourseDocument, SeriesDocument, Version
+from .documents import Change, CourseDocument, OutlookDocument, SeriesDocument, Version
 
 LARGEST_SERIES = 600
 LARGEST_COURSE = 50

@@ -43,7 +43,6 @@ class Diagnoses:
         history: Callable[[int], History],
         tell: Callable[[DiagnosisDocument], None],
     ) -> None:
-        """Initialise without a diagnosis."""
         self._robot_file, self._joints, self._history, self._tell = robot_file, joints, history, tell
         self._lock = threading.Lock()
         self._document = DiagnosisDocument()

@@ -21,8 +21,6 @@ class RobotDocument(msgspec.Struct, frozen=True):
 
 
 class ProcessDocument(msgspec.Struct, frozen=True):
-    """State of one process."""
-
     answers: bool  # true if it is alive now
     endpoint: str  # its expected endpoint
     heard: float | None  # time of its last message, UTC [s since 1970]; null before
@@ -127,8 +125,6 @@ class ArmDocument(msgspec.Struct, frozen=True):
 
 
 class LinkShape(msgspec.Struct, frozen=True):
-    """A visual shape of a link."""
-
     kind: str  # box, sphere, cylinder, capsule or mesh. Cylinders and capsules lie along z.
     sizes: list[float]  # edges of a box; radius; radius and length [m]
     pose: list[float]  # in its link, as in `ArmDocument`

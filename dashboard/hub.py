@@ -89,7 +89,6 @@ class Hub:
         return follower
 
     def leave(self, follower: Follower) -> None:
-        """Remove a follower."""
         with self._lock:
             self._followers.discard(follower)
 

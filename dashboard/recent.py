@@ -41,7 +41,6 @@ class RecentPairs:
         return [self._pairs[k] for k in range(max(at + 1 - count, 0), at + 1)]
 
     def add(self, pairs: Iterable[Pair]) -> None:
-        """Append pairs."""
         self._pairs.extend(pairs)
 
     def segments(self) -> list[Segment]:

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
+import io
 import re
+import textwrap
+import tokenize
 import types
 import typing
 from collections.abc import Iterator
 from pathlib import Path
+from tokenize import COMMENT
 
 import msgspec
 
@@ -106,14 +112,40 @@ def _default(field: msgspec.structs.FieldInfo) -> str:
 
 
 def _documented(kind: type[msgspec.Struct]) -> dict[str, str]:
-    """Return what the docstrings of the class and its bases say of each key; keys that share a line share it here."""
+    """Return what the class and its bases say of each key: in `Attributes:`, or beside and above the fields."""
     told: dict[str, str] = {}
-    for base in reversed(kind.__mro__):
+    for base in reversed(kind.__mro__[:-1]):
         _, _, section = (base.__doc__ or "").partition("Attributes:\n")
         for entry in re.split(r"\n(?= {8}\w)", "\n" + section.split("\n\n")[0]):
             names, _, text = " ".join(entry.split()).partition(": ")
-            told |= dict.fromkeys((name.strip() for name in names.split(",")), text.replace("|", "\\|"))
-    return told
+            told |= dict.fromkeys((name.strip() for name in names.split(",")), text)
+        if issubclass(base, msgspec.Struct) and base is not msgspec.Struct:
+            told |= _beside(textwrap.dedent(inspect.getsource(base)))
+    return {name: text.replace("|", "\\|") for name, text in told.items()}
+
+
+def _beside(source: str) -> dict[str, str]:
+    """Return what the comments of a class say of each field; those above may begin with the names that share them."""
+    tokens = tokenize.generate_tokens(io.StringIO(source).readline)
+    comments = {token.start[0]: (token.string[1:].strip(), token.line) for token in tokens if token.type == COMMENT}
+    [definition] = ast.parse(source).body
+    assert isinstance(definition, ast.ClassDef)
+    fields = [node for node in definition.body if isinstance(node, ast.AnnAssign)]
+    told: dict[str, str] = {}
+    for field in fields:
+        name, row, above = ast.unparse(field.target), field.lineno - 1, list[str]()
+        while row in comments and comments[row][1].lstrip().startswith("#"):
+            above.insert(0, comments[row][0])
+            row -= 1
+        text = " ".join(above)
+        shared = re.match(r"(\w+(?:, \w+)+): ", text)
+        if field.end_lineno in comments:
+            told[name] = comments[field.end_lineno][0]
+        elif shared:
+            told |= dict.fromkeys(shared[1].split(", "), text.removeprefix(shared[0]))
+        elif text:
+            told[name] = text
+    return {name: text if text.endswith(".") else f"{text}." for name, text in told.items()}
 
 
 def messages() -> str:

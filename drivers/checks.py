@@ -24,8 +24,6 @@ LONGEST_COMMAND = 60
 
 @dataclass(frozen=True, slots=True)
 class Check:
-    """Result of one check."""
-
     subject: str  # what was checked
     state: State  # "wrong" prevents reading the arm, "warning" degrades it
     said: str  # what was found

@@ -31,28 +31,20 @@ HARDWARE = {
 
 
 class DriversConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [drivers]: where joint readings come from.
+    """The table [drivers]: where joint readings come from."""
 
-    Attributes:
-        recording: a recording (CSV or Parquet) that stands in for encoders and camera, relative to robot.toml.
-        speed: how fast it is played: 1 as it was recorded, 2 twice as fast, 0 as fast as the sampler takes it.
-        recording_sigma_m: 1-sigma per axis of its marker positions [m] where it has no columns for that. Without
-            this key it comes from the stereo camera in [camera], or is 1 mm where there is none.
-        dynamixel: the joints are Dynamixel servos.
-        feetech: the joints are Feetech servos.
-        serial_lines: the joints have encoders of their own, on a microcontroller.
-        ros2: the joints are those of a ROS 2 robot.
-        plugin: a driver of another package reads them.
-    """
-
+    # a recording (CSV or Parquet) that stands in for encoders and camera, relative to robot.toml
     recording: str | None = None
+    # how fast it is played: 1 as it was recorded, 2 twice as fast, 0 as fast as the sampler takes it
     speed: NonNegative = 1.0
+    # 1-sigma per axis of its marker positions [m] where it has no columns for that. Without this key it comes from the
+    # stereo camera in [camera], or is 1 mm where there is none.
     recording_sigma_m: Positive | None = None
-    dynamixel: DynamixelConfig | None = None
-    feetech: FeetechConfig | None = None
-    serial_lines: SerialLinesConfig | None = None
-    ros2: Ros2Config | None = None
-    plugin: PluginConfig | None = None
+    dynamixel: DynamixelConfig | None = None  # the joints are Dynamixel servos
+    feetech: FeetechConfig | None = None  # the joints are Feetech servos
+    serial_lines: SerialLinesConfig | None = None  # the joints have encoders of their own, on a microcontroller
+    ros2: Ros2Config | None = None  # the joints are those of a ROS 2 robot
+    plugin: PluginConfig | None = None  # a driver of another package reads them
 
     @property
     def hardware(self) -> DynamixelConfig | FeetechConfig | SerialLinesConfig | Ros2Config | PluginConfig | None:

@@ -10,8 +10,6 @@ KNOWN_AFTER_S = 1.0
 
 
 class _Settings:
-    """Settings of the fit of a device's clock."""
-
     # difference of the clock rates until it is estimated, and its later change
     drift: float = 3e-4
     # intervals that miss each other by less are still accepted

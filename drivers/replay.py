@@ -24,28 +24,21 @@ class Replay:
 
     At each row's time there is one joint reading and one fix, so that joint angles interpolated to the fix's time are
     exactly the row's. Neither source runs more than a few rows ahead of the other, however fast it is read.
-
-    Attributes:
-        t: times of the rows [s], shape (n,): `Recording.play_times`.
     """
 
     def __init__(
         self,
         recording: Recording,
         *,
-        speed: float = 1.0,
+        speed: float = 1.0,  # 1 as recorded, 2 twice as fast; 0 as fast as it is read
+        # 1-sigma per axis of the positions where the recording has no covariances [m]; None takes what `calibration`
+        # says, and without that 1 mm
         sigma_m: float | None = None,
         calibration: StereoCalibration | None = None,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Prepare the replay; it starts once both sources are entered and one is read.
-
-        Args:
-            speed: 1 as recorded, 2 twice as fast; 0 as fast as it is read.
-            sigma_m: 1-sigma per axis of the positions where the recording has no covariances [m]; None takes what
-                `calibration` says, and without that 1 mm.
-        """
-        self.t = recording.play_times
+        """Prepare the replay; it starts once both sources are entered and one is read."""
+        self.t = recording.play_times  # times of the rows [s], shape (n,): `Recording.play_times`
         cov = recording.cov if recording.cov is not None else default_covariances(recording, sigma_m, calibration)
         self._pace = _Pace(self.t, speed, now)
         self.joints = ReplayJoints(recording, self.t, self._pace)

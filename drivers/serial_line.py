@@ -72,7 +72,6 @@ class SerialLine:
 
     @property
     def baud(self) -> int:
-        """Bits per second."""
         return self.device.baudrate
 
     def close(self) -> None:
@@ -83,14 +82,12 @@ class SerialLine:
             raise BusLost(str(self.device.port), error) from error
 
     def write(self, data: bytes) -> None:
-        """Send `data`; raise BusLost if the port is gone."""
         try:
             self.device.write(data)
         except (OSError, termios.error) as error:
             raise BusLost(str(self.device.port), error) from error
 
     def receive(self, until: float) -> bytes:
-        """Return what has arrived, else what arrives next; empty when nothing arrives before `until` on the clock."""
         if not self.wait(until):
             return b""
         try:
@@ -110,7 +107,6 @@ class SerialLine:
         return bool(readable)
 
     def flush(self) -> None:
-        """Discard what has arrived."""
         try:
             self.device.reset_input_buffer()
         except (OSError, termios.error) as error:  # an unplugged port raises termios.error, which is not an OSError

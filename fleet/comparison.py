@@ -28,8 +28,6 @@ from bodyschema.learning.status import ChainCalibration
 
 
 class _Settings:
-    """Settings of the comparison of units of one type."""
-
     poses: int = 400
     # With two robots, an outlier cannot be attributed to either.
     fewest_to_judge: int = 3

@@ -17,8 +17,6 @@ ENDINGS = (CSV, PARQUET, *STORE_ENDINGS)
 
 @dataclass(frozen=True)
 class Job:
-    """Recording to diagnose."""
-
     name: str  # unique name of the row and of the report's folder
     recording: Path  # its file
     robot: Path  # its robot.toml

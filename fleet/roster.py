@@ -105,17 +105,13 @@ def places(endpoints: Sequence[str], files: Sequence[Path]) -> list[Place]:
 
 
 class Fleet:
-    """Queries the status of all robots. Use as a context manager; robots and routes may come and go.
-
-    Attributes:
-        unreached: reasons why routes could not be queried the last time.
-    """
+    """Queries the status of all robots. Use as a context manager; robots and routes may come and go."""
 
     def __init__(self, places: Sequence[Place]) -> None:
         self._places = places
         self._sessions: dict[Route, ZenohSession] = {}
         self._open = ExitStack()
-        self.unreached: list[str] = []
+        self.unreached: list[str] = []  # reasons why routes could not be queried the last time
 
     def __enter__(self) -> Self:
         return self

@@ -19,8 +19,6 @@ PLACED = ("camera_pose", "camera_moved", "tool_offset", "tool_slip")
 
 
 class Row(msgspec.Struct, frozen=True, kw_only=True):
-    """Row of one recording."""
-
     name: str  # of the row, and of the report's folder
     recording: str  # its file
     robot: str  # name of its robot
@@ -52,14 +50,11 @@ class Type(msgspec.Struct, frozen=True):
 
 
 class Summary(msgspec.Struct, frozen=True):
-    """Summary of all recordings."""
-
     rows: tuple[Row, ...]
     types: tuple[Type, ...]
 
 
 def summary(results: Sequence[Diagnosed]) -> Summary:
-    """Return the summary of the recordings' results."""
     types: dict[tuple[str, ...], list[Diagnosed]] = {}
     for result in results:
         if result.file is not None:

@@ -1,3 +1,1 @@
 """Protocols and frozen records shared by all other packages."""
-
-from __future__ import annotations

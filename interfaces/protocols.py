@@ -52,7 +52,6 @@ class JointSource(Source, Protocol):
             SourceEnded: there will be no more.
             SourceLost: the device went away.
         """
-        ...
 
 
 @runtime_checkable
@@ -76,7 +75,6 @@ class StereoEyes(Source, Protocol):
             SourceEnded: there will be no more.
             SourceLost: a device went away.
         """
-        ...
 
 
 @runtime_checkable
@@ -95,7 +93,6 @@ class StereoCamera(Source, Protocol):
             SourceEnded: there will be no more.
             SourceLost: the device went away.
         """
-        ...
 
 
 @runtime_checkable
@@ -109,4 +106,3 @@ class MarkerSource(Source, Protocol):
             SourceEnded: there will be no more.
             SourceLost: the device went away.
         """
-        ...

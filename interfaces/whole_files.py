@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import secrets
 import stat
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 from bodyschema.interfaces.errors import ConfigError, RecordingError
@@ -23,6 +24,17 @@ def require_target(
         raise error(f"there is no folder {out.parent}", file=out, remedy="Make it first")
     if out.exists() and not force:
         raise error("the file is there already", file=out, remedy="Give another name, or --force")
+
+
+@contextmanager
+def writing(
+    file: Path, error: type[ConfigError | RecordingError] = ConfigError, *, what: str = "written", remedy: str = ""
+) -> Iterator[None]:
+    """Raise `error` with the system's reason where `file` cannot be written, or made."""
+    try:
+        yield
+    except OSError as failed:
+        raise error(f"cannot be {what}: {failed.strerror or failed}", file=file, remedy=remedy) from failed
 
 
 def write_whole(contents: Mapping[Path, bytes], *, mode: int | None = None) -> None:

@@ -14,8 +14,6 @@ from kbmaps.errors import ShapeError
 
 
 class _Settings:
-    """Settings of the comparison of models."""
-
     # Over longer lags than this share of the series, the sum would be dominated by noise.
     longest_lag_share: float = 0.25
     # Minimum number of pairs predicted by both models for a comparison.

@@ -41,10 +41,7 @@ def qr_in_place(square: FloatArray, targets: FloatArray) -> tuple[FloatArray, Fl
 def qr_append(
     factor: FloatArray, targets: FloatArray, rows: FloatArray, row_targets: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Return R and Qᵀ·targets after rows were appended below them.
-
-    Overwrites all four.
-    """
+    """Return R and Qᵀ·targets after rows were appended below them. Overwrites all four."""
     panel = min(_PANEL_COLUMNS, len(factor))
     updated, reflectors, blocks, _ = _routine("dtpqrt")(0, panel, factor, rows, overwrite_a=1, overwrite_b=1)
     rotated, _, _ = _routine("dtpmqrt")(

@@ -57,11 +57,7 @@ def describe_memory(memory: Memory) -> dict[str, float | None]:
 
 
 def parse_memory(value: Any) -> Memory:
-    """Return the memory from `describe_memory`.
-
-    Raises:
-        ModelFormatError, SettingError: it does not describe one.
-    """
+    """Return the memory from `describe_memory`; raise ModelFormatError, SettingError if it does not describe one."""
     described = named(value, "the memory", ("window", "forgetting"))
     window = None if described["window"] is None else count(described["window"], "the window")
     return Memory(window, number(described["forgetting"], "forgetting"))

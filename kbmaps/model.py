@@ -105,7 +105,6 @@ class Model(PositionModel, Protocol):
         Raises:
             ShapeError, NonFiniteError, SettingError (a sigma that is not positive): nothing has changed.
         """
-        ...
 
     def estimate(self, q: ArrayLike) -> Estimate:
         """Return positions at q (n, d), or (d,), with their uncertainty."""

@@ -20,8 +20,6 @@ from kbmaps.robust import OUTLIER_SIGMAS
 
 
 class _Settings:
-    """Settings of the outlook."""
-
     further: tuple[int, ...] = (100, 300)
     # Number of poses of a motion, and of the region where the arm is used. More would not make the figures steadier
     # than the posterior is.
@@ -34,47 +32,27 @@ class _Settings:
 
 @dataclass(frozen=True, eq=False)
 class LearnerEvidence:
-    """Evidence for a data outlook at one moment.
-
-    Attributes:
-        nominal: the nominal model.
-        belief: posterior of the chain from the pairs with the current tool.
-        wide: the same without the selection of narrower tolerances.
-        tolerances: those of the first prior.
-        claim: uncertainty of the answering model.
-        solved: True if that model is a solution, whose error the belief describes.
-        pairs: number of learnt pairs with the current tool.
-        region: poses (m, d) [rad, m] that represent the data's region.
-        seen: poses (n, d) [rad, m] of some of them, evenly spread.
-        q, x: the newest that the solver knows, (m, d) [rad, m] and (m, 3) [m].
-    """
-
     nominal: NominalModel
-    belief: ChainBelief
-    wide: ChainBelief
-    tolerances: ChainTolerances
-    claim: PredictiveUncertainty
-    solved: bool
-    pairs: int
-    region: FloatArray
-    seen: FloatArray
+    belief: ChainBelief  # posterior of the chain from the pairs with the current tool
+    wide: ChainBelief  # the same without the selection of narrower tolerances
+    tolerances: ChainTolerances  # those of the first prior
+    claim: PredictiveUncertainty  # uncertainty of the answering model
+    solved: bool  # True if that model is a solution, whose error the belief describes
+    pairs: int  # number of learnt pairs with the current tool
+    region: FloatArray  # poses (m, d) [rad, m] that represent the data's region
+    seen: FloatArray  # poses (n, d) [rad, m] of some of them, evenly spread
+    # q, x: the newest that the solver knows, (m, d) [rad, m] and (m, 3) [m]
     q: FloatArray
     x: FloatArray
 
 
 @dataclass(frozen=True)
 class Scatter:
-    """Scatter of the newest pairs around the most probable chain.
+    """Scatter of the newest pairs around the most probable chain."""
 
-    Attributes:
-        noise_m: 1-sigma of a measured coordinate [m], including errors that no chain explains.
-        outliers: number of pairs too far away for this noise.
-        shared: number of neighbours on the path that carry as much information as one pair.
-    """
-
-    noise_m: float
-    outliers: int
-    shared: float
+    noise_m: float  # 1-sigma of a measured coordinate [m], including errors that no chain explains
+    outliers: int  # number of pairs too far away for this noise
+    shared: float  # number of neighbours on the path that carry as much information as one pair
 
     @classmethod
     def of(cls, known: LearnerEvidence) -> Scatter:
@@ -95,7 +73,6 @@ def forecast(known: LearnerEvidence, scatter: Scatter, joints: tuple[str, ...]) 
     The current error is the predicted one there. The forecast gives the factor by which it falls.
 
     Args:
-        known: the evidence of the learner.
         scatter: of the newest pairs.
         joints: their names.
     """

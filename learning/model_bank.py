@@ -55,7 +55,6 @@ class ModelBank:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the current models."""
         return (*self._fixed, INSTANT) if self._residual is None else (*self._fixed, INSTANT, RESIDUAL)
 
     @property

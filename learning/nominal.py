@@ -38,22 +38,17 @@ LARGEST_GRID = 20_000
 
 @dataclass(frozen=True)
 class NominalModel:
-    """Chain of robot.toml and URDF, with the parts of it that are only roughly known.
+    """Chain of robot.toml and URDF, with the parts of it that are only roughly known."""
 
-    Attributes:
-        chain: measurement frame to marker.
-        lower, upper: joint limits, shape (d,) [rad or m].
-        pose_known, marker_known: as in robot.toml.
-        extended: the simulation whose rigid part the chain is, if it has other effects too.
-        bases: bases of the learnt maps: scaled orthonormal over the whole turn, or the stroke of a prismatic joint.
-    """
-
-    chain: RigidChain
+    chain: RigidChain  # measurement frame to marker
+    # lower, upper: joint limits, shape (d,) [rad or m]
     lower: FloatArray
     upper: FloatArray
+    # pose_known, marker_known: as in robot.toml
     pose_known: bool = True
     marker_known: bool = True
-    extended: Simulation | None = None
+    extended: Simulation | None = None  # the simulation whose rigid part the chain is, if it has other effects too
+    # bases of the learnt maps: scaled orthonormal over the whole turn, or the stroke of a prismatic joint
     bases: tuple[JointBasis, ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -66,7 +61,6 @@ class NominalModel:
 
     @classmethod
     def of(cls, robot: RobotDescription) -> NominalModel:
-        """Return the nominal model of a robot description."""
         return cls(robot.chain, robot.lower, robot.upper, robot.camera.pose_known, robot.robot.marker_known)
 
     @classmethod

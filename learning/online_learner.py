@@ -49,23 +49,15 @@ class OnlineLearner:
 
     def __init__(
         self,
-        nominal: NominalModel,
+        nominal: NominalModel,  # the nominal model, where learning starts
         settings: LearnerConfig,
-        solver: Solver,
+        solver: Solver,  # of the models that need all pairs
         *,
+        # maximum wait of pairs to be judged together [s], which costs a fraction of judging each. The instant learner
+        # does not wait.
         together_s: float = 0.0,
-        common: Callable[[FloatArray], FloatArray] | None = None,
+        common: Callable[[FloatArray], FloatArray] | None = None,  # as `Snapshot` has it
     ) -> None:
-        """Initialise before any pair.
-
-        Args:
-            nominal: the nominal model, where learning starts.
-            settings: of the learner.
-            solver: of the models that need all pairs.
-            together_s: maximum wait of pairs to be judged together [s], which costs a fraction of judging each. The
-                instant learner does not wait.
-            common: as `Snapshot` has it.
-        """
         self.nominal, self._settings, self._common = nominal, settings, common
         self._solving = SolverClient(solver, settings.solve_every)
         self._lock = threading.Lock()

@@ -39,21 +39,13 @@ MEAN_OVER_RMS = 0.9213
 
 
 class AngleMemory(msgspec.Struct):
-    """Discounted sums over one model's recent prediction errors.
+    """Discounted sums over one model's recent prediction errors."""
 
-    Attributes:
-        weight: effective number of errors.
-        angle: sum of their angles [rad].
-        square: sum of their squares [rad²].
-        noise: sum of the measurements' variances, all three axes [rad²]; 0 where not given.
-        ratio: sum of their squares over the predicted ones.
-    """
-
-    weight: float = 0.0
-    angle: float = 0.0
-    square: float = 0.0
-    noise: float = 0.0
-    ratio: float = 0.0
+    weight: float = 0.0  # effective number of errors
+    angle: float = 0.0  # sum of their angles [rad]
+    square: float = 0.0  # sum of their squares [rad²]
+    noise: float = 0.0  # sum of the measurements' variances, all three axes [rad²]; 0 where not given
+    ratio: float = 0.0  # sum of their squares over the predicted ones
 
     def add(self, angle: float, noise: float, claimed: float) -> None:
         """Add an error of this angle [rad].
@@ -82,46 +74,29 @@ class AngleMemory(msgspec.Struct):
 
 
 class OrientationState(msgspec.Struct, kw_only=True):
-    """State of the orientation models in a checkpoint.
+    """State of the orientation models in a checkpoint."""
 
-    Attributes:
-        pairs: number of pairs with an orientation.
-        answering: the model that answers.
-        errors: prequential errors, by model.
-        prior, chain, map: the models, as bytes; None before there are any.
-        map_noise: 1-sigma of an orientation about one axis around the map [rad].
-        noise: mean variance of the measured orientations about one axis [rad²].
-    """
-
-    pairs: int
-    answering: str
-    errors: dict[str, AngleMemory]
+    pairs: int  # number of pairs with an orientation
+    answering: str  # the model that answers
+    errors: dict[str, AngleMemory]  # prequential errors, by model
+    # prior, chain, map: the models, as bytes; None before there are any
     prior: bytes | None
     chain: bytes | None
     map: bytes | None
-    map_noise: float
-    noise: float
+    map_noise: float  # 1-sigma of an orientation about one axis around the map [rad]
+    noise: float  # mean variance of the measured orientations about one axis [rad²]
 
 
 @dataclass(frozen=True, eq=False)
 class OrientationModel:
-    """Answering model with its predicted error; later learning does not change it.
+    """Answering model with its predicted error; later learning does not change it."""
 
-    Attributes:
-        name: of the model.
-        chain: the rigid chain that gives the uncertainty, and answers itself unless there is a map.
-        map: of e1, e2, e3.
-        inside: 1-sigma about each axis at the data, in addition to the chain's uncertainty [rad].
-        surprise: ratio of the prediction errors to the predicted ones, at least 1.
-        support: support of the data; None without data.
-    """
-
-    name: str
-    chain: OrientedChain
-    map: KBMap | None
-    inside: float
-    surprise: float
-    support: SupportSet | None
+    name: str  # of the model
+    chain: OrientedChain  # the rigid chain that gives the uncertainty, and answers itself unless there is a map
+    map: KBMap | None  # of e1, e2, e3
+    inside: float  # 1-sigma about each axis at the data, in addition to the chain's uncertainty [rad]
+    surprise: float  # ratio of the prediction errors to the predicted ones, at least 1
+    support: SupportSet | None  # support of the data; None without data
 
     def rotations(self, q: FloatArray) -> FloatArray:
         """Return orientations (n, 3, 3) at q (n, d) [rad]."""
@@ -220,7 +195,6 @@ class Orientations:
         )
 
     def restore(self, state: OrientationState) -> None:
-        """Resume from a state."""
         self.pairs, self.answering, self.errors = state.pairs, state.answering, dict(state.errors)
         packed: Mapping[str, bytes | None] = {PRIOR: state.prior, RIGID: state.chain}
         self._chains = {name: OrientedChain.from_bytes(data) for name, data in packed.items() if data is not None}

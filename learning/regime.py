@@ -29,8 +29,6 @@ LOOKED_BACK = 500
 
 
 class _Settings:
-    """Settings of a regime."""
-
     # Number of pairs that determine the errors of a refitted prior, and that are replayed on top of it.
     recent: int = 200
     replay_steps: int = 64
@@ -96,7 +94,6 @@ class Regime:
 
     @property
     def model(self) -> LearntModel:
-        """Answering model."""
         return self.models.model(self.answering)
 
     @property

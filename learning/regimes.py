@@ -28,17 +28,12 @@ from kbmaps import ChainBelief, ChainTolerances, DegenerateDataError, Explanatio
 
 @dataclass(frozen=True)
 class Fit:
-    """Prior that was fitted to pairs.
+    """Prior that was fitted to pairs."""
 
-    Attributes:
-        prior: the map to learn on top of.
-        chain: the nominal chain, placed; after a tool change, the chain that gives the orientation of the hand.
-        belief: posterior of the chain; None after a tool change, where only the tool is fitted.
-    """
-
-    prior: KBMap
+    prior: KBMap  # the map to learn on top of
+    # the nominal chain, placed; after a tool change, the chain that gives the orientation of the hand
     chain: RigidChain
-    belief: ChainBelief | None = None
+    belief: ChainBelief | None = None  # posterior of the chain; None after a tool change, where only the tool is fitted
 
 
 class Fitting:

@@ -54,7 +54,6 @@ class PairMemory:
         self._count += len(q)
 
     def clear(self) -> None:
-        """Forget all pairs."""
         self._count = self._first = 0
 
     def place_of(self, count: int) -> int:
@@ -147,7 +146,6 @@ class Permutations:
         self._taken = self._places
 
     def restore(self, position: tuple[int, int, int]) -> None:
-        """Resume from a position."""
         epoch, places, taken = position
         self._begin(epoch, places)
         self._taken = taken

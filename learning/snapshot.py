@@ -28,49 +28,31 @@ class NoFrameError(RequestError):
 
 @dataclass(frozen=True)
 class Prediction:
-    """Marker positions for a batch of joint angles.
+    """Marker positions for a batch of joint angles."""
 
-    Attributes:
-        x: positions in the measurement frame (n, 3) [m].
-        sigma: their 1-sigma per axis (n, 3) [m].
-        in_support: True for each row near data (n,).
-        R: orientations in the measurement frame, quaternions x, y, z, w (n, 4); None if none are learnt.
-        sigma_R: their 1-sigma about each axis of the measurement frame (n, 3) [rad]; None likewise.
-    """
-
-    x: FloatArray
-    sigma: FloatArray
-    in_support: NDArray[np.bool_]
+    x: FloatArray  # positions in the measurement frame (n, 3) [m]
+    sigma: FloatArray  # their 1-sigma per axis (n, 3) [m]
+    in_support: NDArray[np.bool_]  # True for each row near data (n,)
+    # orientations in the measurement frame, quaternions x, y, z, w (n, 4); None if none are learnt
     R: FloatArray | None = None
+    # their 1-sigma about each axis of the measurement frame (n, 3) [rad]; None likewise
     sigma_R: FloatArray | None = None
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """Answering model at one moment.
+    """Answering model at one moment."""
 
-    Attributes:
-        answering: its name.
-        model: None while the frame is not known.
-        map: the best of the models that are KB-Maps, for export to a file; mostly the same one.
-        claim: its predictive uncertainty.
-        support: support of the data with the current tool; None without data.
-        pairs: number of pairs it had learnt.
-        newest_utc: storage time of the last of them, ISO 8601; None before any since the learner started.
-        waiting_for: what is missing while there is no model.
-        orientation: the model of the marker's orientation; None if none was learnt.
-        common: variance (n, 3) [m²] at positions (n, 3) [m] of errors that all pairs share, so that no pair shows them.
-    """
-
-    answering: str
-    model: LearntModel | None
-    map: KBMap | None
+    answering: str  # its name
+    model: LearntModel | None  # None while the frame is not known
+    map: KBMap | None  # the best of the models that are KB-Maps, for export to a file; mostly the same one
     claim: PredictiveUncertainty
-    support: SupportSet | None
-    pairs: int
-    newest_utc: str | None
-    waiting_for: str
-    orientation: OrientationModel | None = None
+    support: SupportSet | None  # support of the data with the current tool; None without data
+    pairs: int  # number of pairs it had learnt
+    newest_utc: str | None  # storage time of the last of them, ISO 8601; None before any since the learner started
+    waiting_for: str  # what is missing while there is no model
+    orientation: OrientationModel | None = None  # the model of the marker's orientation; None if none was learnt
+    # variance (n, 3) [m²] at positions (n, 3) [m] of errors that all pairs share, so that no pair shows them
     common: Callable[[FloatArray], FloatArray] | None = None
 
     @cached_property
@@ -79,21 +61,13 @@ class Snapshot:
         return self.model.digest if self.model is not None else ""
 
     def require_model(self) -> LearntModel:
-        """Return the model.
-
-        Raises:
-            NoFrameError: there is none yet.
-        """
+        """Return the model; raise NoFrameError if there is none yet."""
         if self.model is None:
             raise NoFrameError(self.waiting_for)
         return self.model
 
     def require_map(self) -> KBMap:
-        """Return the best KB-Map, with the planes of e1, e2, e3 if learnt.
-
-        Raises:
-            NoFrameError: there is none yet.
-        """
+        """Return the best KB-Map, with the planes of e1, e2, e3 if learnt; raise NoFrameError if there is none yet."""
         if self.map is None:
             raise NoFrameError(self.waiting_for)
         turned = self.orientation

@@ -33,65 +33,44 @@ class StateError(BodyschemaError):
 
 
 class Counters(msgspec.Struct, kw_only=True):
-    """All counters. `pairs` are learnt online, each once; `last_seq` is the newest of them.
+    """All counters. `pairs` are learnt online, each once; `last_seq` is the newest of them."""
 
-    Attributes:
-        store: identity of the store the pairs came from.
-        since_change: pairs since the last change, or since the beginning.
-        changes: changes of the tool, or of another part, that were reported or detected.
-        doubted: pairs that looked like gross outliers.
-        missed: pairs that the sampler no longer kept when they were requested.
-    """
-
-    store: str | None = None
+    store: str | None = None  # identity of the store the pairs came from
     pairs: int = 0
     last_seq: int = 0
-    since_change: int = 0
+    since_change: int = 0  # pairs since the last change, or since the beginning
     replayed: int = 0
     refused: int = 0
     gaps_recovered: int = 0
-    changes: int = 0
-    doubted: int = 0
-    missed: int = 0
+    changes: int = 0  # changes of the tool, or of another part, that were reported or detected
+    doubted: int = 0  # pairs that looked like gross outliers
+    missed: int = 0  # pairs that the sampler no longer kept when they were requested
 
 
 class LearningHeader(msgspec.Struct, kw_only=True):
-    """Part of the state without arrays. Fields with a default belong to a regime.
+    """Part of the state without arrays. Fields with a default belong to a regime."""
 
-    Attributes:
-        fingerprint: of the nominal model and the tolerances it started from.
-        claims: uncertainties and errors of the models.
-        kept_of: number of pairs since the prior; the newest of them are kept.
-        next_fit: number of pairs at which an unknown frame, or the tool after a change, is fitted again; None for
-            never.
-        first_fit: True if that is the first one.
-        answering: the model that answers.
-        doubted_in_a_row: number of consecutive outliers up to now.
-        replays_due: replay steps that are still due.
-        replay_position: their position: epochs begun, pairs of the current one, and the number of these replayed.
-        belief: prior of the chain before the first of these pairs, as bytes; None before the alignment.
-        residual: prior of the arm beyond that, as bytes; None without any.
-        orientation: state of the orientation models; None in a checkpoint of an older version.
-        change: the last change; None if there was none.
-        before: the state before it, for rollback; None if there is none. Its arrays' names begin with `BEFORE`.
-    """
-
-    fingerprint: str
+    fingerprint: str  # of the nominal model and the tolerances it started from
     counters: Counters
-    claims: UncertaintyState
+    claims: UncertaintyState  # uncertainties and errors of the models
     curve: list[CurvePoint]
     curve_stride: int
-    kept_of: int
+    kept_of: int  # number of pairs since the prior; the newest of them are kept
+    # number of pairs at which an unknown frame, or the tool after a change, is fitted again; None for never
     next_fit: int | None
-    first_fit: bool
-    answering: str = PRIOR
-    doubted_in_a_row: int = 0
-    replays_due: float = 0.0
+    first_fit: bool  # True if that is the first one
+    answering: str = PRIOR  # the model that answers
+    doubted_in_a_row: int = 0  # number of consecutive outliers up to now
+    replays_due: float = 0.0  # replay steps that are still due
+    # their position: epochs begun, pairs of the current one, and the number of these replayed
     replay_position: tuple[int, int, int] = (0, 0, 0)
+    # prior of the chain before the first of these pairs, as bytes; None before the alignment
     belief: bytes | None = None
-    residual: bytes | None = None
+    residual: bytes | None = None  # prior of the arm beyond that, as bytes; None without any
+    # state of the orientation models; None in a checkpoint of an older version
     orientation: OrientationState | None = None
-    change: ChangeRecord | None = None
+    change: ChangeRecord | None = None  # the last change; None if there was none
+    # the state before it, for rollback; None if there is none. Its arrays' names begin with `BEFORE`.
     before: LearningHeader | None = None
 
 

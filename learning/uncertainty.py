@@ -29,23 +29,14 @@ DISCOUNT = 0.98
 
 
 class ErrorMemory(msgspec.Struct):
-    """Discounted sums over one model's recent prediction errors.
+    """Discounted sums over one model's recent prediction errors."""
 
-    Attributes:
-        expected_m: RMS distance expected before there were errors [m].
-        weight: effective number of errors.
-        square: sums of their squares per axis [m²].
-        noise: sums of the measurements' variances per axis [m²].
-        ratio: sum of their squares over the predicted ones.
-        discount: weight of the error one pair back.
-    """
-
-    expected_m: float
-    discount: float = DISCOUNT
-    weight: float = 0.0
-    square: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    noise: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    ratio: float = 0.0
+    expected_m: float  # RMS distance expected before there were errors [m]
+    discount: float = DISCOUNT  # weight of the error one pair back
+    weight: float = 0.0  # effective number of errors
+    square: tuple[float, float, float] = (0.0, 0.0, 0.0)  # sums of their squares per axis [m²]
+    noise: tuple[float, float, float] = (0.0, 0.0, 0.0)  # sums of the measurements' variances per axis [m²]
+    ratio: float = 0.0  # sum of their squares over the predicted ones
 
     def add(self, errors: FloatArray, variances: FloatArray, ratios: FloatArray | float = 1.0) -> None:
         """Add errors, in their order.
@@ -101,17 +92,9 @@ _SUPPORT, _CONTEST = "support_q", "squares_"
 
 @dataclass(frozen=True)
 class PredictiveUncertainty:
-    """Predictive uncertainty of a model.
-
-    Attributes:
-        inside: 1-sigma at the data, per axis (3,) [m].
-        layers: variance terms that the model's data leave.
-        surprise: ratio of the prediction errors to the predicted ones, at least 1.
-    """
-
-    inside: FloatArray
-    layers: tuple[VarianceTerm | ChainTerm | DepartureTerm, ...] = ()
-    surprise: float = 1.0
+    inside: FloatArray  # 1-sigma at the data, per axis (3,) [m]
+    layers: tuple[VarianceTerm | ChainTerm | DepartureTerm, ...] = ()  # variance terms that the model's data leave
+    surprise: float = 1.0  # ratio of the prediction errors to the predicted ones, at least 1
 
     def variance(self, q: FloatArray) -> FloatArray:
         """Return the variance per axis of predictions at q (n, d) [rad], shape (n, 3) [m²]."""
@@ -132,29 +115,18 @@ class PredictiveUncertainty:
 
 
 class UncertaintyState(msgspec.Struct, kw_only=True):
-    """State of the uncertainties, without arrays.
+    """State of the uncertainties, without arrays."""
 
-    Attributes:
-        errors: prequential errors, by model.
-        judged: number of compared pairs so far.
-        trusted: the models, the most trusted first.
-        residuals: errors of the instant learner on pairs that it has learnt already; None before any.
-        misfits: discrepancy of each solution at pairs that it knows, 1-sigma per axis [m].
-        misfits_before: the same with the last tool, 1-sigma per axis [m].
-        belief: posterior of the chain, as bytes; None before a solution was requested.
-        wide: the same without the selection of narrower tolerances.
-        residual: the chain with residual, as bytes; None before its first solution.
-    """
-
-    errors: dict[str, ErrorMemory]
-    judged: int
-    trusted: tuple[str, ...]
-    residuals: ErrorMemory | None
+    errors: dict[str, ErrorMemory]  # prequential errors, by model
+    judged: int  # number of compared pairs so far
+    trusted: tuple[str, ...]  # the models, the most trusted first
+    residuals: ErrorMemory | None  # errors of the instant learner on pairs that it has learnt already; None before any
+    # discrepancy of each solution at pairs that it knows, 1-sigma per axis [m]
     misfits: dict[str, tuple[float, float, float]]
-    misfits_before: dict[str, tuple[float, float, float]]
-    belief: bytes | None
-    wide: bytes | None
-    residual: bytes | None
+    misfits_before: dict[str, tuple[float, float, float]]  # the same with the last tool, 1-sigma per axis [m]
+    belief: bytes | None  # posterior of the chain, as bytes; None before a solution was requested
+    wide: bytes | None  # the same without the selection of narrower tolerances
+    residual: bytes | None  # the chain with residual, as bytes; None before its first solution
 
 
 class UncertaintyTracker:

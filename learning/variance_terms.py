@@ -48,15 +48,10 @@ class QueryPoints:
 
 @dataclass(frozen=True)
 class VarianceTerm:
-    """Uncertainty away from data.
+    """Uncertainty away from data."""
 
-    Attributes:
-        support: support of the data; None without data.
-        sigma: 1-sigma of a coordinate far from all data [m].
-    """
-
-    support: SupportSet | None
-    sigma: float
+    support: SupportSet | None  # support of the data; None without data
+    sigma: float  # 1-sigma of a coordinate far from all data [m]
 
     def variance(self, where: QueryPoints) -> FloatArray:
         """Return the variance of a coordinate there, shape (n, 1) [m²]."""
@@ -76,17 +71,11 @@ class ChainTerm:
 
 @dataclass(frozen=True, eq=False)
 class DepartureTerm:
-    """Distance of a model from the most probable chain: only the chain's uncertainty is known.
+    """Distance of a model from the most probable chain: only the chain's uncertainty is known."""
 
-    Attributes:
-        predict: positions (n, 3) [m] that the model predicts at q (n, d) [rad].
-        belief: posterior of the chain.
-        support: support of the model's own data; None without data.
-    """
-
-    predict: Predict
-    belief: ChainBelief
-    support: SupportSet | None = None
+    predict: Predict  # positions (n, 3) [m] that the model predicts at q (n, d) [rad]
+    belief: ChainBelief  # posterior of the chain
+    support: SupportSet | None = None  # support of the model's own data; None without data
 
     def variance(self, where: QueryPoints) -> FloatArray:
         """Return the squared difference of each coordinate there, shape (n, 3) [m²]."""
@@ -104,14 +93,11 @@ class GrowingSupport:
 
     Args:
         bases: bases of the learnt maps.
-
-    Attributes:
-        view: copy that later pairs do not change; None before any.
     """
 
     def __init__(self, bases: Sequence[JointBasis]) -> None:
         self._growing = SupportSet(bases)
-        self.view: SupportSet | None = None
+        self.view: SupportSet | None = None  # copy that later pairs do not change; None before any
 
     @property
     def configurations(self) -> FloatArray:

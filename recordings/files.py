@@ -57,8 +57,6 @@ def from_pairs(pairs: Sequence[Pair], joints: tuple[str, ...], file: Path | None
 
 @dataclass(frozen=True)
 class StoredPairs:
-    """Pairs of a store."""
-
     store: str  # its identity
     recording: Recording  # all pairs in it that can be read; rows are counted from 1
     numbers: Sequence[int]  # sequence number of each row, ascending

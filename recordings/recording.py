@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from bodyschema.interfaces.covariance import from_upper, upper_triangles
 from bodyschema.interfaces.errors import RecordingError
 from bodyschema.interfaces.records import FloatArray, frozen_array
+from bodyschema.interfaces.whole_files import writing
 from bodyschema.robot.limited import UnfitFile
 
 from .columns import (
@@ -160,11 +161,8 @@ class Recording:
         Raises:
             RecordingError: the file cannot be written.
         """
-        try:
-            with file.open("w", encoding="utf-8", newline="\n") as out:
-                self.write_csv_to(out)
-        except OSError as error:
-            raise RecordingError(f"cannot be written: {error.strerror or error}", file=file) from error
+        with writing(file, RecordingError), file.open("w", encoding="utf-8", newline="\n") as out:
+            self.write_csv_to(out)
 
     def write_csv_to(self, out: TextIO) -> None:
         """Write CSV to an open file; raise OSError if that fails."""
@@ -179,10 +177,8 @@ class Recording:
         Raises:
             RecordingError: the file cannot be written, or the extra `export` is not installed.
         """
-        try:
+        with writing(file, RecordingError):
             write_parquet_table(file, self.to_table())
-        except OSError as error:
-            raise RecordingError(f"cannot be written: {error.strerror or error}", file=file) from error
 
     def rows(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> Recording:
         """Return a recording of the rows selected by a mask or by indices."""

@@ -18,8 +18,6 @@ log = logging.getLogger(__name__)
 
 
 class _Settings:
-    """Settings of the interpolation of a recording's tracks."""
-
     # Between joint readings farther apart than this nothing is interpolated, as in the sampler.
     max_gap_s: float = 0.1
     # A pause between marker positions longer than this begins another segment, as in the sampler.
@@ -32,8 +30,6 @@ class _Settings:
 
 @dataclass(frozen=True, eq=False)
 class JointTrack:
-    """Readings of all joints."""
-
     t: FloatArray  # times (n,) [s]
     q: FloatArray  # (n, d) [rad, m]
     # which readings belong together (n,): nothing is interpolated between two runs, whose clocks differ

@@ -54,9 +54,8 @@ class CalibratedGeometry:
         T_camera_parent = T_measured_nominal @ inverse(robot.camera.pose)
         if way.upward[0]:
             T_camera_parent = chain.fixed[0] @ inverse(way.between[0])
-        # The pose reached on the path, with all joints at zero and before the camera has moved. The link above
-        # a joint that is walked upward is the next joint's own if that leads up too; the topmost one keeps its
-        # nominal pose.
+        # The pose reached on the path, with all joints at zero and before the camera has moved. The link above a joint
+        # that is walked upward is the next joint's own if that leads up too; the topmost one keeps its nominal pose.
         reached = inverse(T_measured_nominal) @ T_camera_parent @ way.between[0]
         origins: dict[str, FloatArray] = {}
         for k, joint in enumerate(way.joints):

@@ -15,7 +15,7 @@ import numpy as np
 
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.whole_files import write_whole
+from bodyschema.interfaces.whole_files import write_whole, writing
 
 from .calibrated import CalibratedGeometry
 from .description import RobotDescription
@@ -60,7 +60,7 @@ def write_calibrated(
         urdf: calibrated_urdf(robot, geometry, folder, heading),
         toml: f"# {heading}\n\n{toml_text(_tables(robot, geometry, folder))}".encode(),
     }
-    try:
+    with writing(folder, remedy="Give another folder"):
         folder.mkdir(parents=True, exist_ok=True)
         for file in texts:
             own = file.exists() and any(file.samefile(read) for read in (robot.file, robot.tree.file))
@@ -68,8 +68,6 @@ def write_calibrated(
                 remedy = "Give another folder" if own else "Give another folder, or --force"
                 raise ConfigError("is there already", file=file, remedy=remedy)
         write_whole(texts)
-    except OSError as error:
-        raise ConfigError(f"cannot be written: {error.strerror}", file=folder, remedy="Give another folder") from error
     return toml
 
 

@@ -33,57 +33,39 @@ Name = Annotated[str, Meta(pattern=NAME)]
 
 
 class RobotSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [robot].
+    """The table [robot]."""
 
-    Attributes:
-        name: letters, digits, `_`, `.`, `-`; part of the zenoh keys.
-        urdf: file, relative to robot.toml; meshes and masses are not needed.
-        joints: the joints to read and learn, from camera to marker; the order of `q` everywhere. At most twelve
-            revolute joints, more if some are prismatic.
-        marker_link: the link that carries the marker.
-        marker_xyz: the marker in that link [m].
-        marker_known: false: `marker_xyz` is a guess and is fitted first.
-        hold: what bears the arm while recording: `torque_free` (your hand), `zero_force` (the motors compensate
-            gravity), `held` (the motors hold position).
-        held_at: positions [rad or m] of other joints between camera and marker, which stand still; 0 where not named.
-    """
-
-    name: Name
-    urdf: str
+    name: Name  # letters, digits, `_`, `.`, `-`; part of the zenoh keys
+    urdf: str  # file, relative to robot.toml; meshes and masses are not needed
+    # the joints to read and learn, from camera to marker; the order of `q` everywhere. At most twelve revolute joints,
+    # more if some are prismatic.
     joints: Annotated[tuple[str, ...], Meta(min_length=1)]
-    marker_link: str
-    marker_xyz: Vector3 = (0.0, 0.0, 0.0)
-    marker_known: bool = True
+    marker_link: str  # the link that carries the marker
+    marker_xyz: Vector3 = (0.0, 0.0, 0.0)  # the marker in that link [m]
+    marker_known: bool = True  # false: `marker_xyz` is a guess and is fitted first
+    # what bears the arm while recording: `torque_free` (your hand), `zero_force` (the motors compensate gravity),
+    # `held` (the motors hold position)
     hold: Literal["torque_free", "zero_force", "held"] = "torque_free"
+    # positions [rad or m] of other joints between camera and marker, which stand still; 0 where not named
     held_at: dict[str, float] = {}
 
 
 class CameraSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [camera]: the measurement frame, and the stereo geometry where there is one.
+    """The table [camera]: the measurement frame, and the stereo geometry where there is one."""
 
-    Attributes:
-        parent_link: the link that the cameras are mounted on: the base, a head, a flange. Joints between it and the
-            marker belong into `joints`.
-        xyz, rpy: pose of the left optical frame in it [m], [rad], URDF convention.
-        pose_known: false: `xyz` and `rpy` are a guess and are fitted first.
-        eyes: 2 of a stereo pair, 1 of a single camera.
-        focal_px: of the rectified stereo pair [px]; this and the next three, or none of them.
-        principal_point_px: column and row [px]; pixel centres are integers.
-        baseline_m: distance of the cameras [m]; not with `eyes = 1`.
-        image_size_px: width and height [px].
-        pixel_sigma: 1-sigma of a marker centre's image coordinates [px].
-    """
-
+    # the link that the cameras are mounted on: the base, a head, a flange. Joints between it and the marker belong into
+    # `joints`.
     parent_link: str
+    # xyz, rpy: pose of the left optical frame in it [m], [rad], URDF convention
     xyz: Vector3 = (0.0, 0.0, 0.0)
     rpy: Vector3 = (0.0, 0.0, 0.0)
-    pose_known: bool = True
-    eyes: Literal[1, 2] = 2
-    focal_px: Positive | None = None
-    principal_point_px: tuple[float, float] | None = None
-    baseline_m: Positive | None = None
-    image_size_px: ImageSize | None = None
-    pixel_sigma: Positive = 0.2
+    pose_known: bool = True  # false: `xyz` and `rpy` are a guess and are fitted first
+    eyes: Literal[1, 2] = 2  # 2 of a stereo pair, 1 of a single camera
+    focal_px: Positive | None = None  # of the rectified stereo pair [px]; this and the next three, or none of them
+    principal_point_px: tuple[float, float] | None = None  # column and row [px]; pixel centres are integers
+    baseline_m: Positive | None = None  # distance of the cameras [m]; not with `eyes = 1`
+    image_size_px: ImageSize | None = None  # width and height [px]
+    pixel_sigma: Positive = 0.2  # 1-sigma of a marker centre's image coordinates [px]
 
     @property
     def pose(self) -> FloatArray:
@@ -173,7 +155,6 @@ class RobotDescription:
 
     @property
     def name(self) -> str:
-        """The robot's name."""
         return self.robot.name
 
     @property

@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING, Self
 
 import msgspec
 
-from bodyschema.interfaces.errors import ConfigError
-
 # numpy is imported where it is used: clients that only read these messages do without.
 if TYPE_CHECKING:
     from bodyschema.interfaces.records import FloatArray
@@ -23,25 +21,18 @@ _PUBLISHER = "static_transform_publisher"
 
 
 class HandEye(msgspec.Struct, frozen=True):
-    """A pose of one frame in another, in SI.
+    """A pose of one frame in another, in SI."""
 
-    Attributes:
-        parent, child: the frames; the pose is that of `child` in `parent`.
-        translation_m: x, y, z.
-        quaternion_xyzw: unit quaternion, w not negative.
-        matrix: homogeneous, four rows of four.
-        covariance: 6 x 6, row by row as in geometry_msgs/PoseWithCovariance: x, y, z [m²], then turns about the
-            parent's x, y, z [rad²]; null where it is not known.
-        static_transform_publisher: the command that publishes it in ROS 2.
-    """
-
+    # parent, child: the frames; the pose is that of `child` in `parent`
     parent: str
     child: str
-    translation_m: list[float]
-    quaternion_xyzw: list[float]
-    matrix: list[list[float]]
+    translation_m: list[float]  # x, y, z
+    quaternion_xyzw: list[float]  # unit quaternion, w not negative
+    matrix: list[list[float]]  # homogeneous, four rows of four
+    # 6 x 6, row by row as in geometry_msgs/PoseWithCovariance: x, y, z [m²], then turns about the parent's x, y, z
+    # [rad²]; null where it is not known
     covariance: list[float] | None
-    static_transform_publisher: str
+    static_transform_publisher: str  # the command that publishes it in ROS 2
 
     @classmethod
     def of(cls, parent: str, child: str, T_parent_child: FloatArray, covariance: FloatArray | None = None) -> Self:
@@ -61,21 +52,16 @@ class HandEye(msgspec.Struct, frozen=True):
 
 
 class MarkerPose(msgspec.Struct, frozen=True):
-    """A pose of the marker in the measurement frame, in SI: the form of all messages, with the names of `HandEye`.
+    """A pose of the marker in the measurement frame, in SI: the form of all messages, with the names of `HandEye`."""
 
-    Attributes:
-        translation_m: x, y, z.
-        quaternion_xyzw, matrix: orientation, and homogeneous matrix of four rows of four; null without an orientation.
-        covariance: 6 x 6, row by row, as that of `HandEye`, of a prediction without correlations; null where that of
-            the orientation is not known.
-        translation_covariance: 3 x 3, row by row [m²].
-    """
-
-    translation_m: list[float]
+    translation_m: list[float]  # x, y, z
+    # quaternion_xyzw, matrix: orientation, and homogeneous matrix of four rows of four; null without an orientation
     quaternion_xyzw: list[float] | None
     matrix: list[list[float]] | None
+    # 6 x 6, row by row, as that of `HandEye`, of a prediction without correlations; null where that of the orientation
+    # is not known
     covariance: list[float] | None
-    translation_covariance: list[float]
+    translation_covariance: list[float]  # 3 x 3, row by row [m²]
 
     @classmethod
     def of(cls, x: FloatArray, cov: FloatArray, R: FloatArray | None = None, cov_R: FloatArray | None = None) -> Self:
@@ -154,15 +140,13 @@ def write_launch_file(pose: HandEye, folder: Path) -> Path:
     Raises:
         ConfigError: it cannot be written.
     """
-    from bodyschema.interfaces.whole_files import write_whole
+    from bodyschema.interfaces.whole_files import write_whole, writing
 
     file = folder / LAUNCH
     arguments = _arguments(pose.translation_m, pose.quaternion_xyzw, pose.parent, pose.child)
     text = _LAUNCH_FILE.format(package="tf2_ros", executable=_PUBLISHER, arguments=arguments)
-    try:
+    with writing(file, remedy="Give another folder"):
         write_whole({file: text.encode()})
-    except OSError as error:
-        raise ConfigError(f"cannot be written: {error.strerror}", file=file, remedy="Give another folder") from error
     return file
 
 

@@ -41,8 +41,6 @@ LARGEST_OFFSET: Mapping[Make, int] = {"feetech": 2047, "dynamixel": 1_044_479}
 
 @dataclass(frozen=True, slots=True)
 class LeRobotArm:
-    """An arm that LeRobot supports."""
-
     make: Make  # of its servos
     models: Mapping[str, str]  # of the motors, by their names in LeRobot; their IDs count from 1 in this order
 
@@ -52,7 +50,6 @@ class LeRobotArm:
         return tuple(name for name in self.models if name != GRIPPER)
 
     def id(self, motor: str) -> int:
-        """Return the ID that LeRobot gives the motor."""
         return list(self.models).index(motor) + 1
 
 

@@ -47,12 +47,7 @@ def find_mesh(name: str, urdf: Path) -> Path | None:
 
 
 class MeshSet:
-    """Scaled meshes of one URDF, each under a number.
-
-    Attributes:
-        missing: names of those that are not there.
-        unusable: why others cannot be used, by name.
-    """
+    """Scaled meshes of one URDF, each under a number."""
 
     def __init__(self, urdf: Path, most_triangles: int) -> None:
         """Initialise without meshes; all of them together will be drawn with at most `most_triangles`."""
@@ -63,8 +58,8 @@ class MeshSet:
         self._numbers: dict[tuple[str, tuple[float, ...]], int] = {}
         self._names: list[str] = []
         self.shapes: list[FloatArray] = []
-        self.missing: list[str] = []
-        self.unusable: dict[str, str] = {}
+        self.missing: list[str] = []  # names of those that are not there
+        self.unusable: dict[str, str] = {}  # why others cannot be used, by name
 
     def number_of(self, name: str, scale: tuple[float, ...]) -> int | None:
         """Return the number of the mesh `name` with factors of x, y and z; None when it cannot be used."""

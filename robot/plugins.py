@@ -23,19 +23,13 @@ Group = Literal["bodyschema.drivers", "bodyschema.trackers", "bodyschema.effects
 
 
 class PluginConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [drivers.plugin] or [vision.plugin].
+    """The table [drivers.plugin] or [vision.plugin]."""
 
-    Attributes:
-        name: of the entry point.
-        settings: passed to it unchanged.
-        devices: the files in /dev that it opens; the service grants access to no others.
-        network: True if it uses the network; the service grants access only then.
-    """
-
-    name: str
-    settings: dict[str, Any] = {}
+    name: str  # of the entry point
+    settings: dict[str, Any] = {}  # passed to it unchanged
+    # the files in /dev that it opens; the service grants access to no others
     devices: tuple[Annotated[str, msgspec.Meta(pattern=r"^/dev/.+\Z")], ...] = ()
-    network: bool = False
+    network: bool = False  # True if it uses the network; the service grants access only then
 
     def check(self, _: Sequence[str], file: Path, text: str) -> None:
         """Raise ConfigError when no installed package has such a driver."""
@@ -61,7 +55,6 @@ def load(group: Group, name: str) -> Any:
 
 
 def installed(group: Group) -> tuple[EntryPoint, ...]:
-    """Return the entry points of all installed packages."""
     from importlib.metadata import entry_points
 
     found = tuple(entry_points(group=group))

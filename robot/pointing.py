@@ -11,8 +11,6 @@ from bodyschema.interfaces.records import FloatArray, frozen_array
 
 
 class _Settings:
-    """Settings of the step towards the marker."""
-
     # Damping of the step [squared tangents of angle]; stabilises it where one of the head's axes points at the marker.
     damping: float = 1e-2
     longest_step: float = 0.4

@@ -12,7 +12,7 @@ import tomlkit
 from tomlkit.exceptions import TOMLKitError
 
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.interfaces.whole_files import replace_kept
+from bodyschema.interfaces.whole_files import replace_kept, writing
 
 from .toml_file import read_toml
 
@@ -25,7 +25,6 @@ def toml_text(tables: Mapping[str, Any]) -> str:
 
 
 def toml_value(value: object) -> str:
-    """Return a value as TOML, in one line."""
     return tomlkit.item(value).as_string()
 
 
@@ -84,7 +83,5 @@ def write_edited(file: Path, edited: str) -> Path:
     Raises:
         ConfigError: nothing could be written.
     """
-    try:
+    with writing(file):
         return replace_kept(file, edited.encode())
-    except OSError as error:
-        raise ConfigError(f"cannot be written: {error.strerror}", file=file) from error

@@ -31,8 +31,6 @@ MOST_QUOTED = 60  # characters of a wrong attribute in a message: one line of a 
 
 @dataclass(frozen=True, slots=True)
 class UrdfJoint:
-    """One joint of a URDF."""
-
     name: str  # of the joint
     kind: str  # revolute, continuous, prismatic or fixed
     # parent, child: its links
@@ -48,8 +46,6 @@ class UrdfJoint:
 
 @dataclass(frozen=True, slots=True)
 class PointMass:
-    """Mass of a link."""
-
     mass_kg: float  # the link's mass [kg]
     centre: FloatArray  # its centre of mass in the link's frame [m], shape (3,)
 

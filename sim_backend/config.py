@@ -16,38 +16,25 @@ BALL_RADIUS_M, BALL_RGB = 0.02, (0.86, 0.07, 0.06)
 
 
 class EncoderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The table [sim.encoders].
+    """The table [sim.encoders]."""
 
-    Attributes:
-        ticks_per_turn: resolution of a revolute joint's encoder.
-        ticks_per_metre: resolution of a prismatic joint's encoder.
-        noise_ticks: 1-sigma of the noise that is added before a reading is rounded to whole ticks.
-        rate_hz: readings a second.
-    """
-
-    ticks_per_turn: Annotated[int, Meta(ge=1)] = 4096
-    ticks_per_metre: Annotated[int, Meta(ge=1)] = 20_000
-    noise_ticks: NonNegative = 0.3
-    rate_hz: Rate = 120
+    ticks_per_turn: Annotated[int, Meta(ge=1)] = 4096  # resolution of a revolute joint's encoder
+    ticks_per_metre: Annotated[int, Meta(ge=1)] = 20_000  # resolution of a prismatic joint's encoder
+    noise_ticks: NonNegative = 0.3  # 1-sigma of the noise that is added before a reading is rounded to whole ticks
+    rate_hz: Rate = 120  # readings a second
 
 
 class SimTag(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One of [[sim.camera.tags]]: a tag in the hand in the place of the ball.
+    """One of [[sim.camera.tags]]: a tag in the hand in the place of the ball."""
 
-    Attributes:
-        id: its number.
-        xyz: its centre in the marker's frame [m].
-        rpy: how its frame (x right, y up, z out of it) is turned in the marker's [rad], URDF convention.
-        side_m: side of its black square, or of each of a chessboard's [m]; the white margin is an eighth of a tag, or
-            half a square.
-        squares: columns and rows of a plain chessboard in the place of a tag.
-    """
-
-    id: Annotated[int, Meta(ge=0)]
-    xyz: tuple[float, float, float]
+    id: Annotated[int, Meta(ge=0)]  # its number
+    xyz: tuple[float, float, float]  # its centre in the marker's frame [m]
+    # how its frame (x right, y up, z out of it) is turned in the marker's [rad], URDF convention
     rpy: tuple[float, float, float]
+    # side of its black square, or of each of a chessboard's [m]; the white margin is an eighth of a tag, or half a
+    # square
     side_m: Positive
-    squares: tuple[int, int] | None = None
+    squares: tuple[int, int] | None = None  # columns and rows of a plain chessboard in the place of a tag
 
     @property
     def half_sheet_m(self) -> tuple[float, float]:
@@ -57,33 +44,23 @@ class SimTag(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 class CameraConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The table [sim.camera].
+    """The table [sim.camera]."""
 
-    Attributes:
-        rate_hz: stereo frames a second.
-        noise: 1-sigma of the image noise [grey levels].
-        clutter: number of coloured objects in the background; 0 is a plain wall.
-        scene_step: 2: the arm is rendered at half resolution, except around the marker; 1 takes four times as long.
-        supersampling: samples across one pixel around the marker.
-        light: how brightly all but the marker is lit; with less than 1 a ball glows, as a lamp does.
-        ball_radius_m: radius of the marker ball [m]; without this key, as [vision] has it.
-        ball_rgb: its colour; without this key, as [vision] has it.
-        clutter_gap_deg: nothing in the background has a hue nearer to the ball's [deg].
-        tags: what is in the hand instead of the ball; without this table, what [vision] looks for.
-        tag_dictionary: OpenCV's number of the tags' dictionary.
-    """
-
-    rate_hz: Rate = 30
-    noise: NonNegative = 2.0
-    clutter: Annotated[int, Meta(ge=0, le=1000)] = 60
+    rate_hz: Rate = 30  # stereo frames a second
+    noise: NonNegative = 2.0  # 1-sigma of the image noise [grey levels]
+    clutter: Annotated[int, Meta(ge=0, le=1000)] = 60  # number of coloured objects in the background; 0 is a plain wall
+    # 2: the arm is rendered at half resolution, except around the marker; 1 takes four times as long
     scene_step: Annotated[int, Meta(ge=1, le=4)] = 2
-    supersampling: Annotated[int, Meta(ge=1, le=8)] = 3
+    supersampling: Annotated[int, Meta(ge=1, le=8)] = 3  # samples across one pixel around the marker
+    # how brightly all but the marker is lit; with less than 1 a ball glows, as a lamp does
     light: Annotated[float, Meta(gt=0, le=1)] = 1.0
-    ball_radius_m: Positive | None = None
-    ball_rgb: tuple[Fraction, Fraction, Fraction] | None = None
+    ball_radius_m: Positive | None = None  # radius of the marker ball [m]; without this key, as [vision] has it
+    ball_rgb: tuple[Fraction, Fraction, Fraction] | None = None  # its colour; without this key, as [vision] has it
+    # nothing in the background has a hue nearer to the ball's [deg]
     clutter_gap_deg: Annotated[float, Meta(ge=0, le=100)] = 36.0
+    # what is in the hand instead of the ball; without this table, what [vision] looks for
     tags: tuple[SimTag, ...] = ()
-    tag_dictionary: Annotated[int, Meta(ge=0)] = 20
+    tag_dictionary: Annotated[int, Meta(ge=0)] = 20  # OpenCV's number of the tags' dictionary
 
     @property
     def rgb(self) -> tuple[float, float, float]:
@@ -99,71 +76,47 @@ class CameraConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 
 class ErrorConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The table [sim.errors]: 1-sigma of the random differences between the true robot and its description.
+    """The table [sim.errors]: 1-sigma of the random differences between the true robot and its description."""
 
-    Attributes:
-        joint_offset_rad: zero position of each joint's encoder [rad] (m for a prismatic joint, a tenth of it).
-        link_length_m: each coordinate of each joint's place on its parent link [m].
-        link_axis_rad: each component of the rotation of each joint's frame [rad].
-        camera_position_m: each coordinate of the cameras' place [m].
-        camera_rotation_rad: each component of their rotation [rad].
-        tool_m: each coordinate of the marker's place on the hand [m].
-        tool_rotation_rad: each component of the marker's rotation on the hand [rad]; without effect for a ball.
-    """
-
+    # zero position of each joint's encoder [rad] (m for a prismatic joint, a tenth of it)
     joint_offset_rad: NonNegative = 0.045
-    link_length_m: NonNegative = 0.005
-    link_axis_rad: NonNegative = 0.01
-    camera_position_m: NonNegative = 0.005
-    camera_rotation_rad: NonNegative = 0.02
-    tool_m: NonNegative = 0.01
+    link_length_m: NonNegative = 0.005  # each coordinate of each joint's place on its parent link [m]
+    link_axis_rad: NonNegative = 0.01  # each component of the rotation of each joint's frame [rad]
+    camera_position_m: NonNegative = 0.005  # each coordinate of the cameras' place [m]
+    camera_rotation_rad: NonNegative = 0.02  # each component of their rotation [rad]
+    tool_m: NonNegative = 0.01  # each coordinate of the marker's place on the hand [m]
+    # each component of the marker's rotation on the hand [rad]; without effect for a ball
     tool_rotation_rad: NonNegative = 0.1
 
 
 class GuideConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The table [sim.guide]: the virtual hand.
+    """The table [sim.guide]: the virtual hand."""
 
-    Attributes:
-        speed_rad_s: speed in joint space, Euclidean norm over all learnt joints, the gaze's included [rad/s].
-        force_limit_n: strongest pull at wrist and elbow [N].
-        torque_limit_nm: strongest twist at the wrist [N·m].
-        gravity_compensation: the arm's drives bear its weight (zero-force mode); otherwise the hand has to.
-        gaze_speed_rad_s: greatest speed of each head joint [rad/s].
-    """
-
+    # speed in joint space, Euclidean norm over all learnt joints, the gaze's included [rad/s]
     speed_rad_s: Positive = 0.87
-    force_limit_n: Positive = 80.0
-    torque_limit_nm: Positive = 15.0
-    gravity_compensation: bool = True
-    gaze_speed_rad_s: Positive = 1.5
+    force_limit_n: Positive = 80.0  # strongest pull at wrist and elbow [N]
+    torque_limit_nm: Positive = 15.0  # strongest twist at the wrist [N·m]
+    gravity_compensation: bool = True  # the arm's drives bear its weight (zero-force mode); otherwise the hand has to
+    gaze_speed_rad_s: Positive = 1.5  # greatest speed of each head joint [rad/s]
 
 
 class ToolChange(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One of [[sim.tool_changes]].
+    """One of [[sim.tool_changes]]."""
 
-    Attributes:
-        at_s: simulated time of the change [s].
-        marker_xyz: the new tool's marker in the marker link [m].
-    """
-
-    at_s: NonNegative
-    marker_xyz: tuple[float, float, float]
+    at_s: NonNegative  # simulated time of the change [s]
+    marker_xyz: tuple[float, float, float]  # the new tool's marker in the marker link [m]
 
 
 class SimConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The table [sim].
+    """The table [sim]."""
 
-    Attributes:
-        seed: all that is random is drawn from it.
-        servo_bench: the joints are read from the servos, encoders or ROS 2 robot of [drivers], which stand on a bench
-            where the simulated arm is: through their driver, with their resolution.
-        tool_changes: tool changes at given simulated times, besides those that `SimWorld.change_tool` asks for.
-    """
-
-    seed: Annotated[int, Meta(ge=0)] = 2
+    seed: Annotated[int, Meta(ge=0)] = 2  # all that is random is drawn from it
     encoders: EncoderConfig = EncoderConfig()
     camera: CameraConfig = CameraConfig()
     errors: ErrorConfig = ErrorConfig()
     guide: GuideConfig = GuideConfig()
+    # the joints are read from the servos, encoders or ROS 2 robot of [drivers], which stand on a bench where the
+    # simulated arm is: through their driver, with their resolution
     servo_bench: bool = False
+    # tool changes at given simulated times, besides those that `SimWorld.change_tool` asks for
     tool_changes: tuple[ToolChange, ...] = ()

@@ -9,17 +9,14 @@ import numpy as np
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.sim_backend.geometry import turn_between
-from bodyschema.sim_backend.truth import JointRoles, chain_from_root
 
 from .bullet import Body
 from .config import GuideConfig
 from .sight import Sight
-from .truth import TrueRobot
+from .truth import JointRoles, TrueRobot, chain_from_root
 
 
 class _Settings:
-    """Settings of the simulated hand that guides the arm."""
-
     # Postures of one tour. With few, the nearest is farther away, so the tour covers the joint ranges sooner.
     postures: int = 50
     batch: int = 1000
@@ -223,13 +220,7 @@ class VirtualHand:
 
 
 class _Inertias:
-    """The smallest inertias that the hand feels over some postures.
-
-    Attributes:
-        masses: at each of the links [kg].
-        turning: about the first of them [kg·m²].
-        joints: of each joint of the body with the others held [kg·m² or kg], shape (n,).
-    """
+    """The smallest inertias that the hand feels over some postures."""
 
     def __init__(self, body: Body, roles: JointRoles, links: tuple[str, str], postures: FloatArray) -> None:
         columns = list(roles.guided)
@@ -242,9 +233,9 @@ class _Inertias:
             linear, angular = zip(*(body.jacobians(link, posture) for link in links), strict=True)
             masses.append([1 / _largest(J[:, columns] @ inverse @ J[:, columns].T) for J in linear])
             turning.append(1 / _largest(angular[0][:, columns] @ inverse @ angular[0][:, columns].T))
-        self.masses = tuple(np.min(masses, axis=0))
-        self.turning = float(np.min(turning))
-        self.joints = np.min(joints, axis=0)
+        self.masses = tuple(np.min(masses, axis=0))  # at each of the links [kg]
+        self.turning = float(np.min(turning))  # about the first of them [kg·m²]
+        self.joints = np.min(joints, axis=0)  # of each joint of the body with the others held [kg·m² or kg], shape (n,)
 
 
 def _largest(matrix: FloatArray) -> float:

@@ -21,13 +21,11 @@ from bodyschema.sim_backend.randomness import Stream, generator
 from bodyschema.sim_backend.rendering.render_client import RenderProcess
 from bodyschema.sim_backend.rendering.scene import Scene, scene_of
 from bodyschema.sim_backend.sight import Gaze, Sight
-from bodyschema.sim_backend.sources import Encoders
 from bodyschema.sim_backend.truth import JointRoles, TrueRobot
-from bodyschema.sim_backend.world import stereo_calibration
 from kbmaps import RigidChain
 
-from .sources import SimClock, SimJoints, SimStereoCamera
-from .world import stereo_frame
+from .sources import Encoders, SimClock, SimJoints, SimStereoCamera
+from .world import stereo_calibration, stereo_frame
 
 log = logging.getLogger(__name__)
 
@@ -36,8 +34,6 @@ PERIOD_S = 1.0
 
 
 class _Settings:
-    """Settings of the search for postures."""
-
     # Number of frames that are rendered ahead.
     ahead: int = 2
     batch: int = 500

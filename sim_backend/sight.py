@@ -10,17 +10,14 @@ from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.pointing import Pointing
 from bodyschema.robot.rpy import rotation_of
 from bodyschema.sim_backend.geometry import cross_matrix
-from bodyschema.sim_backend.truth import JointRoles
 from kbmaps import RigidChain
 
 from .bullet import Body
 from .config import CameraConfig
-from .truth import TrueRobot
+from .truth import JointRoles, TrueRobot
 
 
 class _Settings:
-    """Settings of the search for a line of sight."""
-
     solve_steps: int = 12
     track_gain: float = 0.25
     # The marker stays this far inside the images [px], and between these distances from the eyes [m].
@@ -183,7 +180,6 @@ class Sight:
 
 
 def _below(joints, link: str) -> set[str]:
-    """Return the link and all its descendants."""
     found = {link}
     grown = True
     while grown:

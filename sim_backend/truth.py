@@ -25,8 +25,6 @@ _METRES_PER_RADIAN = 0.1
 
 @dataclass(frozen=True)
 class TrueRobot:
-    """The robot that is simulated."""
-
     robot: RobotDescription  # its description, the nominal model
     beyond: Simulation  # the robot with those effects, and the residual, that no rigid chain can represent
     # its true kinematics; joints that are not learnt are locked (kind fixed, their position in their origin)

@@ -105,7 +105,6 @@ class SimWorld:
 
     @property
     def renderer_process(self) -> subprocess.Popen[bytes]:
-        """The renderer's process."""
         return self._renderer.process
 
     def change_tool(self, marker_xyz: tuple[float, float, float] | FloatArray) -> float:

@@ -2,5 +2,3 @@
 
 Nothing is imported here: the configuration is read by commands that must start without OpenCV.
 """
-
-from __future__ import annotations

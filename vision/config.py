@@ -23,19 +23,13 @@ ColourName = Literal["red", "orange", "yellow", "green", "cyan", "blue", "magent
 
 
 class HueBand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A band of hues, and how colourful and bright a pixel has to be.
+    """A band of hues, and how colourful and bright a pixel has to be."""
 
-    Attributes:
-        hue_deg: centre of the band on the colour circle [deg]; red 0, green 120, blue 240.
-        half_width_deg: largest distance from the centre [deg].
-        min_saturation: 0 is grey, 1 a pure colour.
-        min_value: 0 is black, 1 the brightest the camera can tell.
-    """
-
+    # centre of the band on the colour circle [deg]; red 0, green 120, blue 240
     hue_deg: Annotated[float, Meta(ge=0, lt=360)]
-    half_width_deg: Annotated[float, Meta(gt=0, le=90)] = 16.0
-    min_saturation: Fraction = 0.5
-    min_value: Fraction = 0.15
+    half_width_deg: Annotated[float, Meta(gt=0, le=90)] = 16.0  # largest distance from the centre [deg]
+    min_saturation: Fraction = 0.5  # 0 is grey, 1 a pure colour
+    min_value: Fraction = 0.15  # 0 is black, 1 the brightest the camera can tell
 
 
 NAMED_COLOURS: dict[str, HueBand] = {
@@ -50,54 +44,41 @@ NAMED_COLOURS: dict[str, HueBand] = {
 
 
 class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [vision]: appearance of the marker, and limits for doubtful detections.
+    """The table [vision]: appearance of the marker, and limits for doubtful detections."""
 
-    Attributes:
-        marker: what is looked for: a coloured ball, a ball that is brighter than all around it, one tag ([vision.tag]),
-            a rigid cluster of tags ([vision.cluster]), a plain chessboard ([vision.chessboard]), or what a tracker of
-            another package finds ([vision.plugin]). The other keys of this table are a ball's.
-        colour: a name, or a band of hues as the table [vision.colour].
-        min_brightness: of a bright ball, where 1 is the brightest that the camera can tell.
-        radius_m: radius of the marker ball [m].
-        min_pixels: a patch of the marker's colour smaller than this is no candidate [px²].
-        border_margin_px: how far the ball's outline has to stay from the image border [px].
-        min_visible: share of the outline that has to be seen where the fitted ellipse says.
-        max_centre_sigma_px: a centre less certain than this is doubtful: what was fitted is no ellipse [px]. It applies
-            up to a radius of 5 px, and in proportion to larger ones.
-        epipolar_px: largest difference of the eyes' rows [px], on top of the noise of the two centres ...
-        epipolar_sigmas: ... which counts this many times, in sizes too.
-        eye_size_ratio: largest ratio of the sizes the two eyes claim for the ball, besides noise.
-        depth_size_ratio: largest ratio between the radius seen and the one expected at the triangulated depth.
-        max_speed_m_s: faster than this the marker does not move; what is farther off is something else [m/s].
-        max_candidates: at most this many patches per eye are looked at closely, the most disc-like first.
-        cameras: where images come from; without it there are none.
-        further_cameras: others that see the same marker; their positions are fused.
-        tag: the tag, or what the tags of a cluster have in common.
-        cluster: where on the marker which tag is.
-        chessboard: the squares of a chessboard; the limits are those of [vision.tag].
-        plugin: the tracker of another package.
-    """
-
+    # what is looked for: a coloured ball, a ball that is brighter than all around it, one tag ([vision.tag]), a rigid
+    # cluster of tags ([vision.cluster]), a plain chessboard ([vision.chessboard]), or what a tracker of another package
+    # finds ([vision.plugin]). The other keys of this table are a ball's.
     marker: MarkerKind = "ball"
-    colour: ColourName | HueBand = "red"
-    radius_m: Positive = 0.020
+    colour: ColourName | HueBand = "red"  # a name, or a band of hues as the table [vision.colour]
+    radius_m: Positive = 0.020  # radius of the marker ball [m]
+    # of a bright ball, where 1 is the brightest that the camera can tell
     min_brightness: Annotated[float, Meta(gt=0, le=1)] = 0.6
+    # a patch of the marker's colour smaller than this is no candidate [px²]
     min_pixels: Annotated[int, Meta(ge=12)] = 30
+    # how far the ball's outline has to stay from the image border [px]
     border_margin_px: Annotated[float, Meta(ge=0)] = 3.0
+    # share of the outline that has to be seen where the fitted ellipse says
     min_visible: Annotated[float, Meta(ge=0.5, le=1)] = 0.75
+    # a centre less certain than this is doubtful: what was fitted is no ellipse [px]. It applies up to a radius of 5
+    # px, and in proportion to larger ones.
     max_centre_sigma_px: Positive = 0.4
+    # largest difference of the eyes' rows [px], on top of the noise of the two centres times `epipolar_sigmas`
     epipolar_px: Annotated[float, Meta(ge=0)] = 0.5
-    epipolar_sigmas: Annotated[float, Meta(ge=0)] = 4.0
-    eye_size_ratio: Ratio = 1.05
+    epipolar_sigmas: Annotated[float, Meta(ge=0)] = 4.0  # how many times that noise counts, in sizes too
+    eye_size_ratio: Ratio = 1.05  # largest ratio of the sizes the two eyes claim for the ball, besides noise
+    # largest ratio between the radius seen and the one expected at the triangulated depth
     depth_size_ratio: Ratio = 1.3
+    # faster than this the marker does not move; what is farther off is something else [m/s]
     max_speed_m_s: Positive = 3.0
+    # at most this many patches per eye are looked at closely, the most disc-like first
     max_candidates: Annotated[int, Meta(ge=1, le=1000)] = 12
-    cameras: CamerasConfig | None = None
-    further_cameras: tuple[FurtherCameras, ...] = ()
-    tag: TagConfig = TagConfig()
-    cluster: ClusterConfig = ClusterConfig()
-    chessboard: ChessboardConfig | None = None
-    plugin: PluginConfig | None = None
+    cameras: CamerasConfig | None = None  # where images come from; without it there are none
+    further_cameras: tuple[FurtherCameras, ...] = ()  # others that see the same marker; their positions are fused
+    tag: TagConfig = TagConfig()  # the tag, or what the tags of a cluster have in common
+    cluster: ClusterConfig = ClusterConfig()  # where on the marker which tag is
+    chessboard: ChessboardConfig | None = None  # the squares of a chessboard; the limits are those of [vision.tag]
+    plugin: PluginConfig | None = None  # the tracker of another package
 
     @property
     def band(self) -> HueBand:

@@ -24,7 +24,6 @@ class DepthImage(Protocol):
 
     def depth_m(self, u: float, v: float) -> float | None:
         """Return the depth at a pixel of the left image [m]; None if it is unknown."""
-        ...
 
 
 class DepthChecked:

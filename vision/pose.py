@@ -18,38 +18,24 @@ from .least_squares import damped_step, minimised
 
 @dataclass(frozen=True, slots=True)
 class Sighting:
-    """Measurements by one eye of some points of the body.
+    """Measurements by one eye of some points of the body."""
 
-    Attributes:
-        points: positions in the body's frame (k, 3) [m].
-        pixels: image coordinates (k, 2) [px].
-        cov_px: covariance (2k, 2k) [px²] of u and v of the first, then of the second point ...
-        right: True for the right eye.
-        shared_px: 1-sigma (k, 2), or (1, 2), [px] of an error that the points of all sightings have in common.
-    """
-
-    points: FloatArray
-    pixels: FloatArray
-    cov_px: FloatArray
-    right: bool
+    points: FloatArray  # positions in the body's frame (k, 3) [m]
+    pixels: FloatArray  # image coordinates (k, 2) [px]
+    cov_px: FloatArray  # covariance (2k, 2k) [px²] of u and v of the first, then of the second point
+    right: bool  # True for the right eye
+    # 1-sigma (k, 2), or (1, 2), [px] of an error that the points of all sightings have in common
     shared_px: FloatArray = field(default_factory=lambda: np.zeros((1, 2)))
 
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """A pose in the left optical frame, with the covariance of its error.
+    """A pose in the left optical frame, with the covariance of its error."""
 
-    Attributes:
-        rotation: (3, 3), from the body's frame to the optical frame.
-        x: the body's origin (3,) [m].
-        cov: covariance (6, 6) of a small turn about the axes of the optical frame [rad], then of x [m].
-        squares: sum of the squared residuals in units of their sigmas.
-    """
-
-    rotation: FloatArray
-    x: FloatArray
-    cov: FloatArray
-    squares: float
+    rotation: FloatArray  # (3, 3), from the body's frame to the optical frame
+    x: FloatArray  # the body's origin (3,) [m]
+    cov: FloatArray  # covariance (6, 6) of a small turn about the axes of the optical frame [rad], then of x [m]
+    squares: float  # sum of the squared residuals in units of their sigmas
 
 
 @dataclass(frozen=True, slots=True)

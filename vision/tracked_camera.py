@@ -26,7 +26,6 @@ class MarkerTracker(Protocol):
 
     def forget(self) -> None:
         """Forget all earlier frames."""
-        ...
 
 
 class Draws(Protocol):

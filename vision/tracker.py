@@ -92,11 +92,7 @@ class StereoTracker:
     """
 
     def __init__(self, calibration: StereoCalibration, config: VisionConfig | None = None) -> None:
-        """Prepare for images of `calibration`.
-
-        Raises:
-            ConfigError: it describes no stereo pair.
-        """
+        """Prepare for images of `calibration`; raise ConfigError if it describes no stereo pair."""
         check_calibration(calibration)
         self.calibration = calibration
         self.config = config or VisionConfig()

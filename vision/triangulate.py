@@ -15,27 +15,18 @@ from bodyschema.vision.ball.sphere import Pinhole
 
 @dataclass(frozen=True, slots=True)
 class Location:
-    """A ball, located.
+    """A ball, located."""
 
-    Attributes:
-        x: its centre in the left optical frame, shape (3,) [m].
-        cov: covariance of x, shape (3, 3) [m²].
-        centres_px: image of its centre as (ul, vl, ur, vr), shape (4,) [px].
-        variances_px: variances of `centres_px`, shape (4,) [px²].
-        level: how bright the marker's colour is on it, mean of the eyes [grey levels].
-        radii_px: of the two discs, shape (2,) [px].
-        unrest: how far the limbs leave their ellipses, geometric mean of the two discs', in variances of their samples.
-        sizes, size_sigmas: the radii as parts of what they have to be at this depth, and the 1-sigma of that which the
-            images leave, shape (2,) each.
-    """
-
-    x: FloatArray
-    cov: FloatArray
-    centres_px: FloatArray
-    variances_px: FloatArray
-    level: float
+    x: FloatArray  # its centre in the left optical frame, shape (3,) [m]
+    cov: FloatArray  # covariance of x, shape (3, 3) [m²]
+    centres_px: FloatArray  # image of its centre as (ul, vl, ur, vr), shape (4,) [px]
+    variances_px: FloatArray  # variances of `centres_px`, shape (4,) [px²]
+    level: float  # how bright the marker's colour is on it, mean of the eyes [grey levels]
+    # how far the limbs leave their ellipses, geometric mean of the two discs', in variances of their samples
     unrest: float
-    radii_px: FloatArray
+    radii_px: FloatArray  # of the two discs, shape (2,) [px]
+    # sizes, size_sigmas: the radii as parts of what they have to be at this depth, and the 1-sigma of that which the
+    # images leave, shape (2,) each
     sizes: FloatArray
     size_sigmas: FloatArray
 

@@ -27,7 +27,6 @@ from .size import of_another_size, size_of
 from .verdict import FEWEST_ROWS, THRESHOLDS, Plausibility, mm
 
 
-@dataclass(frozen=True)
 class _Settings:
     """When a recording is not of the arm, in any reading."""
 
@@ -40,9 +39,6 @@ class _Settings:
     of_one_marker: float = 0.01
     # Distances below this share of the reach are not distinguished.
     exact: float = 1e-5
-
-
-_SETTINGS = _Settings()
 
 
 def told_sigma(recording: Recording) -> float | None:
@@ -73,12 +69,12 @@ def plausibility(
         orientation: of the marker, quaternions x, y, z, w (n, 4), if known.
     """
     chain = chain or robot.chain
-    exact_m, spread = _SETTINGS.exact * reach_m(robot), spread_m(x)
+    exact_m, spread = _Settings.exact * reach_m(robot), spread_m(x)
     if not place_an_arm(len(q), chain.joints) or spread < exact_m:
         return Plausibility()
     rows = np.unique(np.linspace(0, len(q) - 1, ROWS).astype(np.intp))
     search = ReadingSearch(chain, q[rows], x[rows], exact_m, robot.camera.pose_known)
-    noise = 0.0 if sigma_m is None else _SETTINGS.noises * sigma_m
+    noise = 0.0 if sigma_m is None else _Settings.noises * sigma_m
     check = _Check(robot, search, *search.verdict(), spread, noise)
     found = check.rows_and_size(q, x, t)
     if found.refusal is None:
@@ -89,8 +85,6 @@ def plausibility(
 
 @dataclass(frozen=True, slots=True)
 class _Check:
-    """Check of one recording."""
-
     robot: RobotDescription  # the robot's description
     search: ReadingSearch  # the finished search over readings of the columns
     as_it_is: Reading  # the columns as they are
@@ -112,7 +106,7 @@ class _Check:
             wrong = (partly_carried(search, self.robot.joints) if fits else None) or partly_shifted(
                 search, q, x, t, fits=fits
             )
-            if wrong is None and self._before > _SETTINGS.of_one_marker * self.spread:
+            if wrong is None and self._before > _Settings.of_one_marker * self.spread:
                 wrong = several_markers(search, self._before)
             if wrong is not None:
                 return wrong
@@ -134,7 +128,7 @@ class _Check:
         if held is not None and reading != self.as_it_is:
             reading, fit = held
         of_another_arm = max(
-            _SETTINGS.unexplained * self.spread / reading.scale, _SETTINGS.of_reach * reach_m(self.robot), self.noise
+            _Settings.unexplained * self.spread / reading.scale, _Settings.of_reach * reach_m(self.robot), self.noise
         )
         unnamed = reading != self.as_it_is and not nameable(reading, fit, self.spread)
         if after > of_another_arm or (unnamed and after > self.noise):

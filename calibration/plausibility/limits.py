@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -19,10 +18,7 @@ from kbmaps import RigidChain
 BoolArray = NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
 class _Settings:
-    """Settings of the check of units."""
-
     # Only in another unit can the median distance from the median position reach this many times the arm's reach.
     farthest: float = 2.0
     # A joint of limited range is never this far beyond its limits [rad]: encoders wrap after a turn at the latest.
@@ -40,8 +36,6 @@ class _Settings:
     slowest: float = 0.005
     usual: float = 0.3
 
-
-_SETTINGS = _Settings()
 
 # Divisors that convert other units to metres.
 UNITS_PER_METRE = {"millimetres": 1000.0, "centimetres": 100.0, "inches": 39.37, "feet": 3.281}
@@ -98,9 +92,9 @@ def require_units(robot: RobotDescription, recording: Recording, file: Path) -> 
 
 
 def _require_radians(robot: RobotDescription, recording: Recording, file: Path) -> None:
-    beyond = beyond_limits(robot, recording.q, _SETTINGS.beyond_limits_rad).mean(axis=0)
+    beyond = beyond_limits(robot, recording.q, _Settings.beyond_limits_rad).mean(axis=0)
     beyond[robot.chain.prismatic] = 0.0
-    if beyond.max() > _SETTINGS.many:
+    if beyond.max() > _Settings.many:
         joint = int(beyond.argmax())
         extreme = recording.q[np.abs(recording.q[:, joint]).argmax(), joint]
         raise RecordingError(
@@ -113,7 +107,7 @@ def _require_radians(robot: RobotDescription, recording: Recording, file: Path) 
 
 def _require_metres(robot: RobotDescription, recording: Recording, file: Path) -> None:
     spread, reach = spread_m(recording.x), reach_m(robot)
-    if spread > _SETTINGS.farthest * reach:
+    if spread > _Settings.farthest * reach:
         units = _likely_units(robot.chain, recording)
         raise RecordingError(
             f"the positions x, y, z lie about {spread:.4g} m from their middle, and the arm reaches {reach:.3g} m: "
@@ -127,7 +121,7 @@ def _likely_units(chain: RigidChain, recording: Recording) -> list[str]:
     """Return the unit in which the nominal arm fits the positions; if it fits in none, one or two by their size."""
     from kbmaps.chains.placement import place  # imports scipy, which `predict` starts without
 
-    rows = np.unique(np.linspace(0, len(recording.q) - 1, _SETTINGS.fitted_rows).astype(np.intp))
+    rows = np.unique(np.linspace(0, len(recording.q) - 1, _Settings.fitted_rows).astype(np.intp))
     q, x, factors = recording.q[rows], recording.x[rows], np.array(list(UNITS_PER_METRE.values()))
     drawn = max(spread_m(chain.positions(q)), 1e-9)
     placed = place(
@@ -139,11 +133,11 @@ def _likely_units(chain: RigidChain, recording: Recording) -> list[str]:
     )
     errors = dict(zip(UNITS_PER_METRE, placed.errors(MEASURED).tolist(), strict=True))
     best = min(errors, key=errors.__getitem__)
-    if errors[best] < _SETTINGS.fitting * drawn:
+    if errors[best] < _Settings.fitting * drawn:
         return [best]
     off = {unit: abs(math.log(spread_m(x) / (factor * drawn))) for unit, factor in UNITS_PER_METRE.items()}
     nearest = sorted(off, key=off.__getitem__)
-    return nearest[: 2 if off[nearest[1]] < math.log(_SETTINGS.also) else 1]
+    return nearest[: 2 if off[nearest[1]] < math.log(_Settings.also) else 1]
 
 
 def _require_seconds(robot: RobotDescription, recording: Recording, file: Path) -> None:
@@ -157,8 +151,8 @@ def _require_seconds(robot: RobotDescription, recording: Recording, file: Path) 
     if inside.sum() < FEWEST_MOVES:
         return
     gap, speed = float(np.median(gaps[inside])), float(np.median(steps[inside] / gaps[inside]))
-    if speed < _SETTINGS.slowest:
-        name, factor = min(_UNITS_PER_SECOND, key=lambda unit: abs(math.log(speed * unit[1] / _SETTINGS.usual)))
+    if speed < _Settings.slowest:
+        name, factor = min(_UNITS_PER_SECOND, key=lambda unit: abs(math.log(speed * unit[1] / _Settings.usual)))
         raise RecordingError(
             f"the times t are {gap:.4g} apart in the middle, in which the joints move by "
             f"{math.degrees(speed * gap):.2g}°: these look like {name}",

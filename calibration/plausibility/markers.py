@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.hierarchy import fcluster, linkage
@@ -15,10 +13,7 @@ from .search import ReadingSearch
 from .verdict import Plausibility, mm
 
 
-@dataclass(frozen=True)
 class _Settings:
-    """Settings of the check for several markers."""
-
     # Rows that place the arm, and how often they are chosen: of three markers in equal parts, none are of one alone
     # once in 140.
     chosen: int = 5
@@ -35,30 +30,27 @@ class _Settings:
     seed: int = 0
 
 
-_SETTINGS = _Settings()
-
-
 def several_markers(search: ReadingSearch, before: float) -> Plausibility | None:
     """Return a refusal if the marker is at several places on the hand in turn; else None.
 
     The arm is placed by a few rows at a time (Fischler and Bolles 1981): where these are of one marker, the others lie
     at few places on the hand.
     """
-    rng, rows = np.random.default_rng(_SETTINGS.seed), len(search.q)
-    if rows < 2 * _SETTINGS.chosen:
+    rng, rows = np.random.default_rng(_Settings.seed), len(search.q)
+    if rows < 2 * _Settings.chosen:
         return None
-    chosen = rng.permuted(np.tile(np.arange(rows), (_SETTINGS.tries, 1)), axis=1)[:, : _SETTINGS.chosen]
+    chosen = rng.permuted(np.tile(np.arange(rows), (_Settings.tries, 1)), axis=1)[:, : _Settings.chosen]
     found = search.placed_by(chosen)
-    scatters = [_scatter(search.on_hand(found, k)) for k in range(_SETTINGS.tries)]
+    scatters = [_scatter(search.on_hand(found, k)) for k in range(_Settings.tries)]
     places = _places(search, search.on_hand(found, int(np.argmin(scatters))))
     counts = np.bincount(places[places >= 0], minlength=1)
     largest = np.flatnonzero(places == counts.argmax())
-    if len(largest) < _SETTINGS.chosen:
+    if len(largest) < _Settings.chosen:
         return None
     on_hand = search.on_hand(search.placed_by(largest[None]), 0)
     places = _places(search, on_hand)
     names = np.unique(places[places >= 0])
-    if len(names) < 2 or (places >= 0).mean() < _SETTINGS.covered:
+    if len(names) < 2 or (places >= 0).mean() < _Settings.covered:
         return None
     centres = np.stack([on_hand[places == name].mean(axis=0) for name in names])
     kept = places >= 0
@@ -66,7 +58,7 @@ def several_markers(search: ReadingSearch, before: float) -> Plausibility | None
     after = max(float(np.sqrt(np.square(off).sum(axis=1).mean())), search.exact_m)
     # A marker that was moved once is reported by calibration, with its row.
     changes = int((np.diff(places[kept]) != 0).sum())
-    if before < _SETTINGS.better * after or changes < len(names):
+    if before < _Settings.better * after or changes < len(names):
         return None
     shares = ", ".join(f"{100.0 * float((places == name).mean()):.0f} %" for name in names)
     apart = max(float(np.linalg.norm(one - other)) for one in centres for other in centres)
@@ -88,13 +80,13 @@ def _scatter(on_hand: FloatArray) -> float:
 
 def _places(search: ReadingSearch, on_hand: FloatArray) -> NDArray[np.intp]:
     """Return the place of each point (n,), from 1; -1 where it is at none with enough others."""
-    places = np.asarray(fcluster(linkage(on_hand), _SETTINGS.one_place_m, "distance"), dtype=np.intp)
+    places = np.asarray(fcluster(linkage(on_hand), _Settings.one_place_m, "distance"), dtype=np.intp)
     for place in range(1, int(places.max()) + 1):
         rows = np.flatnonzero(places == place)
         # A pose that is held or comes back has the same errors of the arm in each row.
         if (
-            len(rows) < _SETTINGS.share * len(places)
-            or len(Poses.of(search.chain, search.q[rows]).rows) < _SETTINGS.fewest
+            len(rows) < _Settings.share * len(places)
+            or len(Poses.of(search.chain, search.q[rows]).rows) < _Settings.fewest
         ):
             places[rows] = -1
     return places

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,10 +16,7 @@ from .search import ROWS, ReadingSearch
 from .verdict import FEWEST_ROWS, THRESHOLDS, Plausibility, mm
 
 
-@dataclass(frozen=True)
 class _Settings:
-    """Settings of the check of rows."""
-
     # A position belongs to the angles of a row this near at most.
     near_rows: int = 3
     # Rows are shifted if this share of them fits so many times better with angles or positions of the row as far
@@ -31,9 +27,6 @@ class _Settings:
     most_choices: int = 400
 
 
-_SETTINGS = _Settings()
-
-
 def few_outliers(search: ReadingSearch, before: float) -> str:
     """Return a warning if few rows place the arm without some of them; else "".
 
@@ -41,7 +34,7 @@ def few_outliers(search: ReadingSearch, before: float) -> str:
     """
     rows, joints = len(search.q), search.chain.joints
     most = rows - math.ceil(MEASURED * rows)
-    if math.comb(rows, most) > _SETTINGS.most_choices:
+    if math.comb(rows, most) > _Settings.most_choices:
         return ""
     for off in range(1, most + 1):
         if 3 * (rows - off) <= joints + 9:
@@ -91,7 +84,7 @@ def all_shifted(search: ReadingSearch, q: FloatArray, x: FloatArray, t: FloatArr
 def many_apart(search: ReadingSearch, far: float) -> bool:
     """Return True if many rows are far [m] from the arm that the others place: few poses in turn fit some others."""
     (apart,) = search.distances(search.q, search.x, [(search.q, search.x)])
-    return bool((apart > far).mean() > _SETTINGS.shifted)
+    return bool((apart > far).mean() > _Settings.shifted)
 
 
 def partly_shifted(
@@ -112,10 +105,10 @@ def partly_shifted(
     pairs = [(own_q, own_x), *of_angles, *((own_q, x[rows + shift]) for shift in shifts)]
     placed_by = [(own_q, own_x), *([] if fits else of_angles)]
     found = np.stack([search.distances(*placed, pairs) for placed in placed_by])
-    nearer = _SETTINGS.shifted_better * found.min(axis=0)[1:] < found[0, 0]
+    nearer = _Settings.shifted_better * found.min(axis=0)[1:] < found[0, 0]
     shares = nearer.mean(axis=1).reshape(2, -1)
     angles, positions = shares.max(axis=1)
-    if max(angles, positions) < _SETTINGS.shifted:
+    if max(angles, positions) < _Settings.shifted:
         return None
     shift = shifts[int(shares[0].argmax())]
     row, remedy = _moved(shift)
@@ -142,17 +135,17 @@ def partly_carried(search: ReadingSearch, names: Sequence[str]) -> Plausibility 
         return None
     angles = [search.q, *(reading.angles(search.q, slides) for reading in readings)]
     own, *read = (search.distances(q, search.x, [(q, search.x)])[0] for q in angles)
-    nearer = [_SETTINGS.shifted_better * one < own for one in read]
+    nearer = [_Settings.shifted_better * one < own for one in read]
     shares = [search.poses.mean(rows) for rows in nearer]
-    worse = [search.poses.mean(_SETTINGS.shifted_better * own < one) for one in read]
+    worse = [search.poses.mean(_Settings.shifted_better * own < one) for one in read]
     best = int(np.argmax(np.subtract(shares, worse)))
     gain = search.poses.mean(np.log(np.maximum(own, search.exact_m) / np.maximum(read[best], search.exact_m)))
-    if shares[best] - worse[best] < _SETTINGS.shifted or not search.is_certain(gain):
+    if shares[best] - worse[best] < _Settings.shifted or not search.is_certain(gain):
         return None
     nothing = np.zeros(len(names))
     return Plausibility(
         f"it seems that {readings[best].looks(names, nothing)}: {100.0 * float(nearer[best].mean()):.0f} % of the rows "
-        f"then fit at least {_SETTINGS.shifted_better:g} times better",
+        f"then fit at least {_Settings.shifted_better:g} times better",
         readings[best].remedy(names, nothing),
         misread=True,
     )
@@ -160,7 +153,7 @@ def partly_carried(search: ReadingSearch, names: Sequence[str]) -> Plausibility 
 
 def _rows_nearby(count: int) -> tuple[list[int], NDArray[np.intp]]:
     """Return shifts, and rows of a recording of `count` that have neighbours so far away."""
-    near = _SETTINGS.near_rows
+    near = _Settings.near_rows
     shifts = [shift for shift in range(-near, near + 1) if shift]
     return shifts, np.unique(np.linspace(near, count - 1 - near, ROWS).astype(np.intp))
 

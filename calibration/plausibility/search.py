@@ -26,10 +26,7 @@ from .verdict import THRESHOLDS
 ROWS = 80
 
 
-@dataclass(frozen=True)
 class _Settings:
-    """Settings of the search for another reading of the columns."""
-
     # Width and depth of the search over readings: offsets of up to four joints by a quarter turn are found.
     width: int = 4
     depth: int = 5
@@ -60,9 +57,6 @@ class _Settings:
     listed: int = 2
 
 
-_SETTINGS = _Settings()
-
-
 @dataclass(frozen=True, slots=True)
 class ReadingFit:
     """Quality of a reading's fit."""
@@ -81,9 +75,6 @@ class ReadingSearch:
         q, x: rows to be read, (n, d) [rad, m] and (n, 3) [m].
         exact_m: distances below this are not distinguished [m].
         pose_known: the camera pose is known.
-
-    Attributes:
-        fits: the best fit of each reading so far.
     """
 
     def __init__(self, chain: RigidChain, q: FloatArray, x: FloatArray, exact_m: float, pose_known: bool) -> None:
@@ -92,7 +83,7 @@ class ReadingSearch:
         self._std = np.where(chain.prismatic, SLIDES_M, ZEROS_RAD)
         self.poses = Poses.of(chain, q)
         self._tried: set[Reading] = set()
-        self.fits: dict[Reading, ReadingFit] = {}
+        self.fits: dict[Reading, ReadingFit] = {}  # the best fit of each reading so far
 
     def verdict(self) -> tuple[Reading, Reading, list[Reading]]:
         """Return the columns as they are, the simplest reading among the best, and others nearly as simple."""
@@ -103,11 +94,11 @@ class ReadingSearch:
             # With a marker far from nominal, the fit of the right reading may have ended in a local minimum.
             self._fit([as_it_is] * 6, tools=TOOL_M * np.concatenate([np.eye(3), -np.eye(3)]))
         expanded, spread = [as_it_is], spread_m(self.x)
-        for depth in range(1, _SETTINGS.depth):
+        for depth in range(1, _Settings.depth):
             best = self._best()[0]
             left = self.fits[best].error / spread
             if best in expanded and (
-                left < _SETTINGS.enough or (best == as_it_is and (left < _SETTINGS.enough_as_it_is or depth > 1))
+                left < _Settings.enough or (best == as_it_is and (left < _Settings.enough_as_it_is or depth > 1))
             ):
                 break
             new = self._distinct(expanded)
@@ -116,7 +107,7 @@ class ReadingSearch:
                 self._try(as_it_is.doubles(slides))
             self._try(other for reading in new for other in reading.neighbours(slides))
         best = self._best()[0]
-        if self.fits[best].error > (_SETTINGS.enough_as_it_is if best == as_it_is else _SETTINGS.enough) * spread:
+        if self.fits[best].error > (_Settings.enough_as_it_is if best == as_it_is else _Settings.enough) * spread:
             self._try(as_it_is.mixed(slides))
         best = self._best()[0]
         if not nameable(best, self.fits[best], spread):
@@ -135,14 +126,14 @@ class ReadingSearch:
             key=lambda reading: (reading.changes, reading.quarters != as_it_is.quarters, self.fits[reading].nats),
         )
         others = [reading for reading in good[1:] if reading.changes <= good[0].changes + 1]
-        return as_it_is, good[0], others[: _SETTINGS.listed]
+        return as_it_is, good[0], others[: _Settings.listed]
 
     def carrying(self) -> list[Reading]:
         """Return the columns as they are, but for a joint that counts together with a parallel one before it."""
         axes, turns = self.chain.axes, self.chain.fixed[1:-1, :3, :3]
         along = np.einsum("ki,kij,kj->k", axes[:-1], turns, axes[1:])
         rigid = self.chain.prismatic[:-1] | self.chain.prismatic[1:]
-        parallel = np.flatnonzero(~rigid & (np.abs(along) > _SETTINGS.parallel)) + 1
+        parallel = np.flatnonzero(~rigid & (np.abs(along) > _Settings.parallel)) + 1
         plain = Reading.plain(self.chain.joints)
         return [reading for joint in parallel.tolist() for reading in plain.carrying(joint)]
 
@@ -155,15 +146,15 @@ class ReadingSearch:
 
     def has_far_zero(self, joint: int, fit: ReadingFit) -> bool:
         """Return True if a joint's zero is far off in `fit`, and the unchanged columns fit clearly worse with less."""
-        if self.chain.prismatic[joint] or abs(fit.zeros[joint]) <= _SETTINGS.far_zero_rad:
+        if self.chain.prismatic[joint] or abs(fit.zeros[joint]) <= _Settings.far_zero_rad:
             return False
         q, here = self.q.copy(), np.arange(self.chain.joints) == joint
-        q[:, joint] += math.copysign(_SETTINGS.near_zero_rad, fit.zeros[joint])
+        q[:, joint] += math.copysign(_Settings.near_zero_rad, fit.zeros[joint])
         held = place(
             self.chain,
             q[None],
             self.x[None],
-            zeros_std=np.where(here, _SETTINGS.held, 1.0) * self._std,
+            zeros_std=np.where(here, _Settings.held, 1.0) * self._std,
             tool_std=TOOL_M,
         )
         ratio = max(float(held.errors(MEASURED)[0]), self.exact_m) / fit.error
@@ -184,7 +175,7 @@ class ReadingSearch:
 
     def is_certain(self, gain: float, share: float = 1.0) -> bool:
         """Return True if the poses are evidence enough for a reading that fits better, as in `Poses.nats`."""
-        return self.poses.nats(gain, self.chain.joints, share) > _SETTINGS.certain
+        return self.poses.nats(gain, self.chain.joints, share) > _Settings.certain
 
     def placed_by(self, rows: NDArray[np.intp]) -> Placements:
         """Place the nominal chain to sets of rows (s, n), with the columns as they are."""
@@ -207,23 +198,23 @@ class ReadingSearch:
         if self.chain.prismatic[-1]:
             return None
         last = np.arange(self.chain.joints) == self.chain.joints - 1
-        std = np.where(last, _SETTINGS.last_zero_rad, self._std)
+        std = np.where(last, _Settings.last_zero_rad, self._std)
         turned = [reading.turned((turns * last).tolist()) for turns in (0, 1, -1, 2)] + self._turned_alike(reading)
         fits = self._placed(turned, std=std, tool_m=KNOWN_TOOL_M)
         as_given = fits.pop(reading, None)
-        best = min(fits, key=lambda each: fits[each].nats + _SETTINGS.a_change * each.changes, default=reading)
+        best = min(fits, key=lambda each: fits[each].nats + _Settings.a_change * each.changes, default=reading)
         if best not in turned or best == reading:
             return None
         fit = fits[best]
         # Without a fit the known marker itself has led from this reading to another one.
-        clearly = as_given is None or fit.nats + _SETTINGS.certain < as_given.nats
-        far = _SETTINGS.nearer * fit.tool_m < (as_given or self.fits[reading]).tool_m
+        clearly = as_given is None or fit.nats + _Settings.certain < as_given.nats
+        far = _Settings.nearer * fit.tool_m < (as_given or self.fits[reading]).tool_m
         return (best, fit) if clearly and far else None
 
     def with_marker_nearer(self, reading: Reading) -> Reading | None:
         """Return the reading with other quarter turns, as good a fit, that brings a far marker near to its place."""
         best = min(self._turned_alike(reading), key=lambda each: self.fits[each].tool_m, default=reading)
-        far = self.fits[reading].tool_m > _SETTINGS.nearer * max(self.fits[best].tool_m, KNOWN_TOOL_M)
+        far = self.fits[reading].tool_m > _Settings.nearer * max(self.fits[best].tool_m, KNOWN_TOOL_M)
         return best if far else None
 
     def _turned_alike(self, reading: Reading) -> list[Reading]:
@@ -256,7 +247,7 @@ class ReadingSearch:
 
     def _best(self) -> list[Reading]:
         """Return all readings, the best first."""
-        return sorted(self.fits, key=lambda reading: self.fits[reading].nats + _SETTINGS.a_change * reading.changes)
+        return sorted(self.fits, key=lambda reading: self.fits[reading].nats + _Settings.a_change * reading.changes)
 
     def _most_probable(self, as_it_is: Reading) -> tuple[Reading, list[float]]:
         """Return the most probable reading with links of some tolerance, and the errors of better fits that it refutes.
@@ -277,9 +268,9 @@ class ReadingSearch:
         slides = self.chain.prismatic
         read = [(each.angles(self.q, slides), each.positions(self.x), each.scale) for each in rivals]
         changes = np.array([reading.changes for reading in rivals])
-        probable = evidences(self.chain, read, self.poses.rows) - _SETTINGS.a_change * changes
+        probable = evidences(self.chain, read, self.poses.rows) - _Settings.a_change * changes
         # Where the columns as they are fit best, another reading has to be certain twice.
-        probable[rivals.index(as_it_is)] += 2.0 * _SETTINGS.certain if nearest == as_it_is else 0.0
+        probable[rivals.index(as_it_is)] += 2.0 * _Settings.certain if nearest == as_it_is else 0.0
         best = rivals[int(probable.argmax())]
         nats, error = self.fits[best].nats, self.fits[best].error
         fits = [self.fits[reading] for reading in rivals]
@@ -287,7 +278,7 @@ class ReadingSearch:
 
     @staticmethod
     def _alike(error: float, others: list[float]) -> bool:
-        return any(abs(error - other) <= _SETTINGS.same * other for other in others)
+        return any(abs(error - other) <= _Settings.same * other for other in others)
 
     def _distinct(self, expanded: list[Reading]) -> list[Reading]:
         """Return the best readings whose fits differ from those already expanded, and from each other."""
@@ -297,13 +288,13 @@ class ReadingSearch:
             if not self._alike(error, seen):
                 new.append(reading)
                 seen.append(error)
-            if len(new) == _SETTINGS.width:
+            if len(new) == _Settings.width:
                 break
         return new
 
     @staticmethod
     def _as_good(fit: ReadingFit, best: ReadingFit) -> bool:
-        return fit.nats < best.nats + _SETTINGS.certain or fit.error < THRESHOLDS.as_good * best.error
+        return fit.nats < best.nats + _Settings.certain or fit.error < THRESHOLDS.as_good * best.error
 
     def _try(self, readings: Iterable[Reading]) -> None:
         """Fit readings that were not tried yet."""
@@ -318,7 +309,7 @@ class ReadingSearch:
         Args:
             tools: marker offsets (s, 3) [m] to start from.
         """
-        std = self._std * (_SETTINGS.held if held else 1.0)
+        std = self._std * (_Settings.held if held else 1.0)
         for reading, fit in self._placed(new, std=std, tools=tools).items():
             if reading not in self.fits or fit.nats < self.fits[reading].nats:
                 self.fits[reading] = fit

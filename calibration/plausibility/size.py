@@ -27,7 +27,6 @@ _NOISES = np.geomspace(0.01, 2.0, 16)
 _FAR = 5.0
 
 
-@dataclass(frozen=True)
 class _Settings:
     """When positions of another size are reported."""
 
@@ -36,9 +35,6 @@ class _Settings:
     far: float = 5.0
     # Smaller ones are warned of: a joint whose ratio is 2 % off looks like positions 2.4 % off.
     other: float = 0.04
-
-
-_SETTINGS = _Settings()
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +59,7 @@ def of_another_size(size: Size, spread: float, before: float, best: float) -> Pl
         before: distance of the pairs as they are [m].
         best: the same, in the best reading of the columns.
     """
-    far = size.sigmas > _SETTINGS.far and size.error < THRESHOLDS.named / 2 * spread
+    far = size.sigmas > _Settings.far and size.error < THRESHOLDS.named / 2 * spread
     if not far or best < THRESHOLDS.as_good * size.error:
         return None
     factor, low, high = (size.factor * math.exp(k * size.log_sigma) for k in (0.0, -1.96, 1.96))
@@ -75,7 +71,7 @@ def of_another_size(size: Size, spread: float, before: float, best: float) -> Pl
         "Compare with what was measured: the size of the printed tag or the ball in [vision], the squares of the "
         "calibration board, the unit of the columns x, y, z. If these are right, the URDF is of an arm of another size"
     )
-    if best > THRESHOLDS.much_better * size.error and abs(math.log(size.factor)) > _SETTINGS.other:
+    if best > THRESHOLDS.much_better * size.error and abs(math.log(size.factor)) > _Settings.other:
         return Plausibility(f"it seems that {text}", remedy, misread=True)
     return Plausibility(warnings=(f"perhaps {text}. {remedy}",))
 

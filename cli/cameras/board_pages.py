@@ -5,18 +5,28 @@ from __future__ import annotations
 from pathlib import Path
 
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.interfaces.whole_files import write_whole
+from bodyschema.interfaces.whole_files import write_whole, writing
 from bodyschema.vision.printing import Page, pdf, svg
 
 _WRITERS = {".pdf": pdf, ".svg": svg}
 
 
-def write_page(page: Page, out: Path) -> None:
-    """Write a page as PDF or SVG; raise ConfigError if the file's ending is neither, or it cannot be written."""
+def write_page(page: Page, out: Path) -> tuple[float, float]:
+    """Write a page as PDF or SVG, ConfigError if that is not possible; return its rulers across and upright [mm]."""
     writer = _WRITERS.get(out.suffix.lower())
     if writer is None:
         raise ConfigError(f"{out}: neither .pdf nor .svg", remedy="Name a file that ends so")
-    try:
+    with writing(out, remedy="Name another folder"):
         write_whole({out: writer(page)})
-    except OSError as error:
-        raise ConfigError(f"cannot be written: {error.strerror}", file=out, remedy="Name another folder") from error
+    return page.rulers_mm
+
+
+def printed_scale(nominal_mm: float, measured_mm: float) -> float:
+    """Return the scale at which a page's ruler measures that; ConfigError if another line was measured."""
+    scale = measured_mm / nominal_mm
+    if not 0.5 < scale < 2.0:
+        raise ConfigError(
+            f"--ruler-mm {measured_mm:g}: the ruler across of this page is nominally {nominal_mm:g} mm",
+            remedy="Measure the line below the drawing, from the outer edge of its first tick to that of its last",
+        )
+    return scale

@@ -17,7 +17,7 @@ from rich.table import Table
 from rich.text import Text
 from scipy.spatial.transform import Rotation
 
-from bodyschema.cli.cameras.board_pages import write_page
+from bodyschema.cli.cameras.board_pages import printed_scale, write_page
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
@@ -76,8 +76,6 @@ class LeftOutView(msgspec.Struct):
 
 
 class UnusableImage(msgspec.Struct):
-    """An image that could not be used."""
-
     name: str
     eye: str
     why: str
@@ -88,8 +86,8 @@ class CamerasFile(msgspec.Struct):
     """Output of `bodyschema calibrate cameras --json`. Half widths are those of 95 % intervals.
 
     One camera alone has no baseline. Positions are those of a marker of known size all over the view, 0.6 m ahead.
-    `right_camera` is the pose of the right optical frame in the left one. `refocused`
-    has a sentence for each sign that a lens refocused between the views, or was free to.
+    `right_camera` is the pose of the right optical frame in the left one. `refocused` has a sentence for each sign that
+    a lens refocused between the views, or was free to.
     """
 
     model: str
@@ -153,21 +151,11 @@ def board_of(
 
 
 def as_printed(drawn: Board, ruler_mm: float | None) -> Board:
-    """Return the board in its printed size, at which the longer ruler of its page measures `ruler_mm`.
-
-    Raises:
-        ConfigError: `ruler_mm` is not between half and twice the nominal length; another line was measured.
-    """
+    """Return the board as printed: the longer ruler of its page measures `ruler_mm`. ConfigError if that cannot be."""
     if ruler_mm is None:
         return drawn
     width, height = drawn.size_m
-    length = rulers_mm((1e3 * width, 1e3 * height))[0]
-    scale = ruler_mm / length
-    if not 0.5 < scale < 2.0:
-        raise ConfigError(
-            f"--ruler-mm {ruler_mm:g}: the ruler across of this page is nominally {length:g} mm",
-            remedy="Measure the line below the board, from the outer edge of its first tick to that of its last",
-        )
+    scale = printed_scale(rulers_mm((1e3 * width, 1e3 * height))[0], ruler_mm)
     return replace(drawn, square_m=scale * drawn.square_m, marker_m=scale * drawn.marker_side_m)
 
 
@@ -177,9 +165,7 @@ def write_board(board: Board, paper: str, out: Path) -> tuple[float, float]:
     Raises:
         ConfigError: it does not fit, the ending is neither, or the file cannot be written.
     """
-    page = board_page(board, paper)
-    write_page(page, out)
-    return page.rulers_mm
+    return write_page(board_page(board, paper), out)
 
 
 def from_images(images: Images, board: Board, tell: Tell) -> Gathered:

@@ -120,20 +120,14 @@ class LiveCalibration:
     def __init__(
         self,
         eyes: HealthyEyes,
-        views: LiveViews,
+        views: LiveViews,  # empty collection of views of the board
+        # calibrates from views and serials; raises CalibrationError if the result is not good enough
         calibrated: Callable[[Gathered, tuple[str, ...], Tell], Calibrated],
-        show: Show,
+        show: Show,  # called for every pair of images, and with the trouble while there are none
         clock: Clock,
+        # called with the images of every view taken and its number, from 1 on
         keep: Callable[[ImagePair, int], None] = lambda _pair, _number: None,
     ) -> None:
-        """Store the arguments; open nothing yet.
-
-        Args:
-            views: empty collection of views of the board.
-            calibrated: calibrates from views and serials; raises CalibrationError if the result is not good enough.
-            show: called for every pair of images, and with the trouble while there are none.
-            keep: called with the images of every view taken and its number, from 1 on.
-        """
         self._eyes, self._calibrated, self._show, self._keep = eyes, calibrated, show, keep
         self._source = ReconnectingSource(RequiredEyes(eyes, SameAsFirst()), "the cameras", clock)
         self._views = views

@@ -17,7 +17,7 @@ from bodyschema.vision.cluster.tables import chessboard_tables, cluster_tables, 
 from bodyschema.vision.printing import Page
 from bodyschema.vision.tags.config import Dictionary
 
-from .board_pages import write_page
+from .board_pages import printed_scale, write_page
 
 ShapeName = Literal["tags", "plate", "cube", "board", "chessboard"]
 _RUN = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?")
@@ -26,8 +26,6 @@ _MOST_TAGS = 100
 
 @dataclass(frozen=True)
 class Tags:
-    """The tags to print."""
-
     shape: ShapeName = "tags"  # single tags, or one body of them
     ids: str | None = None  # numbers of the tags as in 0-5,9; None: as many as the shape has, from 0 on
     dictionary: Dictionary = "apriltag_36h11"
@@ -79,9 +77,7 @@ def write_tags(tags: Tags, paper: str, out: Path) -> tuple[float, float]:
     Raises:
         ConfigError: there are no such tags, they do not fit, or the file cannot be written.
     """
-    page = sheet(tags, paper)
-    write_page(page, out)
-    return page.rulers_mm
+    return write_page(sheet(tags, paper), out)
 
 
 def sheet(tags: Tags, paper: str) -> Page:
@@ -118,14 +114,5 @@ def tables(tags: Tags) -> str:
 
 
 def as_printed(tags: Tags, drawn_mm: float, measured_mm: float) -> Tags:
-    """Scale the tags to the size at which the ruler of `drawn_mm` measures `measured_mm`.
-
-    ConfigError for another line.
-    """
-    scale = measured_mm / drawn_mm
-    if not 0.5 < scale < 2.0:
-        raise ConfigError(
-            f"--ruler-mm {measured_mm:g}: the ruler across of this page is nominally {drawn_mm:g} mm",
-            remedy="Measure the line below the drawing, from the outer edge of its first tick to that of its last",
-        )
-    return replace(tags, side_mm=scale * tags.side_mm)
+    """Scale the tags to the size at which the ruler of `drawn_mm` measures `measured_mm`; ConfigError for another."""
+    return replace(tags, side_mm=printed_scale(drawn_mm, measured_mm) * tags.side_mm)

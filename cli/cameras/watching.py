@@ -16,6 +16,7 @@ from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError, SourceEnded
 from bodyschema.interfaces.protocols import Clock, Source
 from bodyschema.interfaces.records import ImageArray
+from bodyschema.interfaces.whole_files import writing
 from bodyschema.vision.images import jpeg
 
 
@@ -49,10 +50,8 @@ class Watching:
     @classmethod
     def into(cls, folder: Path, pictures: Pictures, *, every_s: float, count: int | None) -> Self:
         """Write pictures into files 000001.jpg and so on. ConfigError if the folder cannot be created."""
-        try:
+        with writing(folder, what="made", remedy="Give another --out"):
             folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ConfigError(f"cannot be made: {error.strerror}", file=folder, remedy="Give another --out") from error
         numbers = itertools.count(1)
         return cls(
             pictures,
@@ -87,10 +86,8 @@ class Watching:
 
 
 def _write(file: Path, data: bytes) -> None:
-    try:
+    with writing(file, remedy="Give another --out"):
         file.write_bytes(data)
-    except OSError as error:
-        raise ConfigError(f"cannot be written: {error.strerror}", file=file, remedy="Give another --out") from error
 
 
 log = logging.getLogger(__name__)

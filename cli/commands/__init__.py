@@ -1,3 +1,1 @@
 """One module per command; each imports what it needs when it runs, so that `bodyschema --help` stays fast."""
-
-from __future__ import annotations

@@ -1,3 +1,1 @@
 """The demo: a simulated scene, the two real processes, a querying client, an evaluation and a view."""
-
-from __future__ import annotations

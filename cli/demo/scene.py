@@ -15,6 +15,7 @@ import numpy as np
 from bodyschema.daemon.wiring.wiring import demonstration_model
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.interfaces.whole_files import writing
 from bodyschema.robot.description import RobotDescription
 
 if TYPE_CHECKING:
@@ -160,7 +161,7 @@ def prepare(
         ConfigError: the folder is neither empty nor a demo's, or cannot be written.
     """
     model = demonstration_model()
-    try:
+    with writing(folder, remedy="Give another --out or free some space"):
         folder.mkdir(parents=True, exist_ok=True)
         found = sorted(path.name for path in folder.iterdir())
         if found and MARK not in found:
@@ -175,10 +176,6 @@ def prepare(
         scene.robot_file.write_text(
             _described(model, camera) + _own_tables(seed, bus) + _marker(marker, model), encoding="utf-8"
         )
-    except OSError as error:
-        raise ConfigError(
-            f"cannot be written: {error.strerror}", file=folder, remedy="Give another --out or free some space"
-        ) from error
     return scene
 
 

@@ -22,13 +22,9 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.interfaces.servos import EncoderJoints, ServoJoints
 from bodyschema.interfaces.waits import POLL_S
 from bodyschema.robot.description import RobotDescription
-from bodyschema.robot.urdf import chain_between
-from kbmaps import RigidChain
 
 
 class _Settings:
-    """Settings of the watch on joints."""
-
     speed_over_s: float = 0.1
     moved_rad: float = math.radians(3.0)
     still_rad: float = math.radians(0.5)
@@ -44,8 +40,6 @@ WORDS = (("forward", "back"), ("left", "right"), ("up", "down"))  # REP 103: x, 
 
 
 class JointState(msgspec.Struct, frozen=True):
-    """Current state of one joint."""
-
     joint: str
     id: int | None  # ID of its servo; None if it has none
     angle: float  # [rad], as in q of the pairs
@@ -118,7 +112,6 @@ class JointsWatch:
         return [self.look() for _ in self._robot.joints][-1]
 
     def know_temperatures(self) -> None:
-        """Query all temperatures."""
         if self._servos is not None:
             for joint in self._temperatures:
                 self._temperatures[joint] = self._servos.temperature_c(joint)
@@ -167,16 +160,11 @@ def signs_in(*, is_ros2: bool, is_plugin: bool) -> str:
 
 
 class Speeds:
-    """Velocities of joints whose encoders do not report them.
-
-    Attributes:
-        v: over the last tenth of a second or more [rad/s], shape (d,).
-        are_known: True once the joints were observed long enough.
-    """
+    """Velocities of joints whose encoders do not report them."""
 
     def __init__(self, d: int) -> None:
-        self.v: FloatArray = np.zeros(d)
-        self.are_known = False
+        self.v: FloatArray = np.zeros(d)  # over the last tenth of a second or more [rad/s], shape (d,)
+        self.are_known = False  # True once the joints were observed long enough
         self._t, self._q = -math.inf, self.v
 
     def take(self, t: float, q: FloatArray) -> None:
@@ -190,17 +178,15 @@ class Speeds:
 
 
 class SignCheck:
-    """Predicts by the URDF where the marker went when one joint was moved, for the user to compare.
-
-    Attributes:
-        said: the prediction in words, for the joint moved last; empty before.
-    """
+    """Predicts by the URDF where the marker went when one joint was moved, for the user to compare."""
 
     def __init__(self, robot: RobotDescription) -> None:
-        self._robot, self._chain = robot, _from_parent(robot)
+        # from the link that carries the cameras to the marker
+        placed = robot.with_placement(np.eye(4), np.array(robot.robot.marker_xyz))
+        self._robot, self._chain = robot, placed.chain
         self._begin: FloatArray | None = None
         self._rest: tuple[float, FloatArray] | None = None  # since when, and where
-        self.said = ""
+        self.said = ""  # the prediction in words, for the joint moved last; empty before
 
     def take(self, t: float, q: FloatArray) -> None:
         """Add the joint angles `q` (d,) [rad] at `t` [s]."""
@@ -227,20 +213,6 @@ class SignCheck:
         word, sign = WORDS[axis][int(went[axis] < 0)], "+-"[int(went[axis] < 0)]
         parent = self._robot.camera.parent_link
         return f"{joint} {turn}: by the URDF the marker went {word} ({sign}{'xyz'[axis]} of {parent})"
-
-
-def _from_parent(robot: RobotDescription) -> RigidChain:
-    """Return the chain from the link that carries the cameras to the marker."""
-    section = robot.robot
-    return chain_between(
-        robot.tree,
-        section.joints,
-        section.held_at,
-        start=robot.camera.parent_link,
-        end=section.marker_link,
-        T_start_camera=np.eye(4),
-        marker_xyz=np.array(section.marker_xyz),
-    )
 
 
 HINT = "Move one joint at a time. It went the other way? Correct "

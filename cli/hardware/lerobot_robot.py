@@ -17,7 +17,7 @@ from bodyschema.daemon.config import Config
 from bodyschema.daemon.wiring.servos import KnownModel, Servos, known_models, require_servos
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.servos import ScannedBus
-from bodyschema.interfaces.whole_files import free_backup, link_target, replace_kept
+from bodyschema.interfaces.whole_files import free_backup, link_target, replace_kept, writing
 from bodyschema.robot.lerobot import (
     ARMS,
     RAD_PER_TICK,
@@ -42,8 +42,6 @@ Scan = Callable[[Sequence[int]], Sequence[ScannedBus]]
 
 @dataclass(frozen=True, slots=True)
 class LeRobotServo:
-    """The servo of a joint."""
-
     joint: str
     id: int
     model: str
@@ -237,10 +235,8 @@ class CorrectedCalibration:
             backup = free_backup(link_target(self.file))
             noted = f"{digest}\t{backup.name}\t{recording.name}\n"
             beside[RECORDINGS] = (self._noted() + noted).encode(errors="surrogateescape")
-        try:
+        with writing(self.file):
             return replace_kept(self.file, calibration_json(self.motors).encode(), beside)
-        except OSError as error:
-            raise ConfigError(f"cannot be written: {error.strerror}", file=self.file) from error
 
     def _noted(self) -> str:
         """Return a line for each recording whose offsets are in the file: digest, name of the old file, recording."""

@@ -46,7 +46,6 @@ class ScanReport:
 
     @property
     def servos(self) -> list[FoundServo]:
-        """All servos found."""
         return [servo for port in self.ports for servo in port.servos]
 
     @property

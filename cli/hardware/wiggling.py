@@ -18,7 +18,7 @@ from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import RecordingError, SourceEnded, SourceLost
 from bodyschema.interfaces.records import JointReading, MarkerFix, MarkerMiss
 from bodyschema.interfaces.waits import READ_S
-from bodyschema.interfaces.whole_files import write_whole
+from bodyschema.interfaces.whole_files import write_whole, writing
 from bodyschema.robot.limited import read_at_most
 
 LIMIT_S = 30.0  # without a fix
@@ -142,10 +142,8 @@ def write_wiggle(wiggle: Wiggle, joints: Sequence[str], file: Path) -> None:
     writer = csv.writer(text)
     writer.writerow(["t", *joints, *POSITION])
     writer.writerows(row for _, row in sorted(rows, key=lambda each: each[0]))
-    try:
+    with writing(file, RecordingError):
         write_whole({file: text.getvalue().encode()})
-    except OSError as error:
-        raise RecordingError(f"cannot be written: {error.strerror}", file=file) from error
 
 
 def read_wiggle(file: Path, joints: Sequence[str]) -> Wiggle:

@@ -58,8 +58,6 @@ class Entry(msgspec.Struct, frozen=True):
 
 
 class Manifest(msgspec.Struct, frozen=True, kw_only=True):
-    """Contents of a backup."""
-
     robot: Name
     written_utc: str
     version: str
@@ -160,7 +158,6 @@ class Backup:
 
     @property
     def manifest(self) -> Manifest:
-        """Contents of the backup."""
         if self._manifest is None:
             raise BackupError(f"{self.file} is not open; use it in a with statement")
         return self._manifest

@@ -125,8 +125,6 @@ def rules() -> str:
 
 
 class UdevRules(MachineFiles):
-    """The rules file of a machine."""
-
     kind = "udev"
     reload = (("udevadm", "control", "--reload-rules"), ("udevadm", "trigger", "--subsystem-match=tty", "--action=add"))
     is_used = "Plug the adapter in again; `bodyschema doctor` checks it."

@@ -31,8 +31,6 @@ STORE_PARTS = ("", "-wal", "-shm")
 
 @dataclass(frozen=True, slots=True)
 class Restored:
-    """Result of restoring."""
-
     written: list[Path]  # the new files
     aside: list[Path]  # files that were in their places before, under their new names
     elsewhere: dict[str, Path]  # files that robot.toml names outside its folder: new path by original path

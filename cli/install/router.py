@@ -44,8 +44,6 @@ class RouterTables(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class RouterConfig:
-    """A checked router configuration."""
-
     file: Path
     tables: RouterTables
     identity: Identity

@@ -128,8 +128,6 @@ class ServiceFiles(UnitFiles):
 
 
 class RouterFiles(UnitFiles):
-    """The unit of the router."""
-
     kind, stays = "router", "router.toml and keys are where they were."
 
     def __init__(self, root: Path = ROOT, run: Callable[[Command], None] = run_quietly) -> None:

@@ -14,6 +14,7 @@ from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.wire import PairsReply, decode, pair_from_wire
 from bodyschema.interfaces.errors import BusError, RecordingError
 from bodyschema.interfaces.records import Pair
+from bodyschema.interfaces.whole_files import writing
 from bodyschema.recordings import files as recordings
 from bodyschema.recordings.csv_file import write_csv_rows
 from bodyschema.recordings.parquet_file import INTEGER_COLUMNS
@@ -27,19 +28,14 @@ LIVE_WAIT_S = 0.5
 
 
 class History:
-    """The sampler's stored pairs from a sequence number on, page by page. Publications only trigger the next look.
-
-    Attributes:
-        next_seq: sequence number of the next pair.
-        missing: numbers between the pairs so far that the sampler does not have.
-    """
+    """The sampler's stored pairs from a sequence number on, page by page. Publications only trigger the next look."""
 
     def __init__(self, bus: ZenohSession, robot: RobotDescription, from_seq: int) -> None:
         self._bus, self._joints, self._keys = bus, robot.joints, Keys(robot.name)
         self._news = Event()
         self._store: str | None = None
-        self.next_seq = from_seq
-        self.missing = Damage()
+        self.next_seq = from_seq  # sequence number of the next pair
+        self.missing = Damage()  # numbers between the pairs so far that the sampler does not have
         self._begun = False
         bus.subscribe(self._keys.pair, lambda _: self._news.set())
 
@@ -110,12 +106,9 @@ def follow_history(history: History, robot: RobotDescription, out: Path, stopped
         if pairs:
             _write(recordings.from_pairs(pairs, robot.joints), out, robot)
         return len(pairs)
-    try:
-        with out.open("w", encoding="utf-8", newline="\n") as stream:
-            rows = _CsvRows(stream, robot.joints)
-            _follow(history, stopped, rows.add)
-    except OSError as error:
-        raise RecordingError(f"cannot be written: {error.strerror or error}", file=out) from error
+    with writing(out, RecordingError), out.open("w", encoding="utf-8", newline="\n") as stream:
+        rows = _CsvRows(stream, robot.joints)
+        _follow(history, stopped, rows.add)
     if not rows.count:
         out.unlink()
     return rows.count

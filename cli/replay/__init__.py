@@ -1,3 +1,1 @@
 """Replay of a recording through sampler and learner as live, with errors measured on held-out rows."""
-
-from __future__ import annotations

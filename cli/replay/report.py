@@ -50,8 +50,6 @@ class AngleFigures(msgspec.Struct, frozen=True):
 
 
 class ReplayReport(msgspec.Struct, frozen=True, kw_only=True):
-    """Results of a replay."""
-
     recording: str
     robot: str
     rows: int  # in the recording

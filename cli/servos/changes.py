@@ -46,7 +46,6 @@ class Planned:
 
     @property
     def is_needed(self) -> bool:
-        """True if it changes anything."""
         return self.change.now != self.change.then
 
 

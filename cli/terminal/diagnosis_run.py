@@ -31,7 +31,7 @@ from bodyschema.effects import EFFECT_TYPES, write_corrected, write_extended
 from bodyschema.effects.effect_type import CameraEffect
 from bodyschema.interfaces.errors import BodyschemaError, RecordingError, RequestError
 from bodyschema.interfaces.records import FloatArray, Pair
-from bodyschema.interfaces.whole_files import write_whole
+from bodyschema.interfaces.whole_files import write_whole, writing
 from bodyschema.learning.nominal import NominalModel
 from bodyschema.recordings import files as recordings
 from bodyschema.recordings.recording import Recording
@@ -176,7 +176,6 @@ class Found:
 
     @property
     def remedies(self) -> list[str]:
-        """Remedies for the causes found."""
         run = self.diagnosis.extended.run
         torques = np.abs(run.torques).max(axis=0)
         return remedies(self.file, self.robot, ticks(self.source.recording.q), torques)
@@ -246,13 +245,10 @@ def results_in(folder: Path | None) -> Iterator[None]:
 
 def require_writable(folder: Path) -> None:
     """Make the folder; raise RecordingError where nothing can be written to it."""
-    try:
+    with writing(folder, RecordingError, remedy="Give another folder"):
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
-    except OSError as error:
-        told = f"cannot be written: {error.strerror or error}"
-        raise RecordingError(told, file=folder, remedy="Give another folder") from error
 
 
 def written(found: Found, folder: Path) -> None:
@@ -265,9 +261,7 @@ def written(found: Found, folder: Path) -> None:
     # Tolerances alone are put into a URDF where the recording shows them.
     bare = extended if found.diagnosis.tolerated.seen[:2].any() else extended.with_background(())
     write_corrected(bare, folder, heading)
-    try:
+    with writing(folder, RecordingError):
         folder.mkdir(parents=True, exist_ok=True)
         report = page(found.diagnosis, found.file, found.remedies, about)
         write_whole({folder / DIAGNOSIS: f"{found.json}\n".encode(), folder / REPORT: report.encode()})
-    except OSError as error:
-        raise RecordingError(f"cannot be written: {error.strerror or error}", file=folder) from error

@@ -50,11 +50,7 @@ class Answers:
         self._inverse: tuple[LearntModel, InverseKinematics] | None = None
 
     def predict(self, request: Request) -> bytes:
-        """Return positions, 1-sigma and support.
-
-        Raises:
-            RequestError: a bad request, or before there is a model.
-        """
+        """Return positions, 1-sigma and support; raise RequestError for a bad request, or before there is a model."""
         q = joint_angles(decode(request.payload, JointsRequest, request.encoding), self._joints)
         snapshot = self._learning.snapshot
         prediction = snapshot.predict(q)
@@ -72,11 +68,7 @@ class Answers:
         return encode(reply, request.encoding)
 
     def jacobian(self, request: Request) -> bytes:
-        """Return the Jacobians dx/dq.
-
-        Raises:
-            RequestError: as `predict` does.
-        """
+        """Return the Jacobians dx/dq; raise RequestError as `predict` does."""
         q = joint_angles(decode(request.payload, JointsRequest, request.encoding), self._joints)
         snapshot = self._learning.snapshot
         jacobians = snapshot.require_model().jacobian(q)
@@ -146,9 +138,6 @@ class ExpectedMarker:
 
     Nothing is published before there is a model. For subscribers that receive no sigma, nothing is published outside
     the support of the data either.
-
-    Attributes:
-        published: number of positions so far.
     """
 
     def __init__(
@@ -162,7 +151,7 @@ class ExpectedMarker:
         self._joints, self._topic, self._snapshot, self._clock = joints, topic, snapshot, clock
         self._stop = threading.Event()
         self._due = clock.now()
-        self.published = 0
+        self.published = 0  # number of positions so far
 
     @contextmanager
     def publishing(self) -> Iterator[None]:

@@ -64,15 +64,9 @@ class Findings:
         learning: OnlineLearner,
         robot: RobotDescription,
         clock: Clock,
-        robots: int = 1,
-        turns: FindingTurns | None = None,
+        robots: int = 1,  # number of robots that share the background thread
+        turns: FindingTurns | None = None,  # their common time limit
     ) -> None:
-        """Start without findings.
-
-        Args:
-            robots: number of robots that share the background thread.
-            turns: their common time limit.
-        """
         self._learning, self._robot, self._clock = learning, robot, clock
         self._turns = turns or FindingTurns()
         self._parts = SHARE * robots

@@ -138,11 +138,7 @@ def run_learners(configs: Sequence[Config], clock: Clock, wishes: SignalFlags, n
 
 @contextmanager
 def alone(config: Config) -> Iterator[None]:
-    """Keep other learners from the state of this one.
-
-    Raises:
-        StoreError: another learner has it.
-    """
+    """Keep other learners from the state of this one; raise StoreError if another learner has it."""
     try:
         config.state_dir.mkdir(parents=True, exist_ok=True)
         descriptor = lock(config.checkpoint_file, "learner")

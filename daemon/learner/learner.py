@@ -59,23 +59,16 @@ class Learner:
     def __init__(
         self,
         config: Config,
-        solver: Solver,
+        solver: Solver,  # for this robot alone
         bus: ZenohSession,
         clock: Clock,
         service: Service | None = None,
         *,
-        loop: str = LISTENING,
-        robots: int = 1,
-        turns: FindingTurns | None = None,
+        loop: str = LISTENING,  # name of its loop of new pairs for the watchdog
+        robots: int = 1,  # number of robots in the process, including this one
+        turns: FindingTurns | None = None,  # their common time limit for calibration and outlook
     ) -> None:
-        """Restore the learner from its checkpoint; nothing is declared yet.
-
-        Args:
-            solver: for this robot alone.
-            loop: name of its loop of new pairs for the watchdog.
-            robots: number of robots in the process, including this one.
-            turns: their common time limit for calibration and outlook.
-        """
+        """Restore the learner from its checkpoint; nothing is declared yet."""
         self._config, self._bus, self._clock = config, bus, clock
         self._service = Service.nobodys(clock) if service is None else service
         self._loop = loop

@@ -58,22 +58,16 @@ class SolverPool:
 
 
 class PooledSolver:
-    """A `Solver` of one robot, in a process shared with others.
-
-    Attributes:
-        asked: True if a solution is wanted that the process does not work on yet.
-        answers: answers not fetched yet.
-    """
+    """A `Solver` of one robot, in a process shared with others."""
 
     def __init__(self, shared: SolverPool, process: SolverProcess, robot: int) -> None:
         self._shared, self._process, self._robot = shared, process, robot
         self._orders: deque[Callable[[], None]] = deque()
         self._pairs = self._new = self._had_turn = 0
-        self.asked = False
-        self.answers: deque[Solved] = deque()
+        self.asked = False  # True if a solution is wanted that the process does not work on yet
+        self.answers: deque[Solved] = deque()  # answers not fetched yet
 
     def start(self, task: Task) -> None:
-        """Discard all pairs and start a new task."""
         self.clear()
         self._orders.append(lambda: self._process.start(task, self._robot))
 
@@ -89,7 +83,6 @@ class PooledSolver:
         self.asked = True
 
     def poll(self) -> Solved | None:
-        """Return the next solution that has arrived, without waiting."""
         self._shared.attend()
         return self.answers.popleft() if self.answers else None
 

@@ -28,29 +28,19 @@ class JointBuffer:
     is full, `put` waits for room, because a recording can be read faster than its frames are stored. With live encoders
     it forgets the oldest reading instead, because the thread that reads them may also hold up the arm and must not
     block.
-
-    Attributes:
-        max_gap_s: readings around a frame may be this far apart [s].
     """
 
     def __init__(
         self,
         prismatic: NDArray[np.bool_],
         max_gap_s: float,
-        capacity: int = CAPACITY,
+        capacity: int = CAPACITY,  # number of readings that are kept at most
         *,
-        live: bool = False,
-        kept_s: float = 0.0,
+        live: bool = False,  # `put` never waits
+        kept_s: float = 0.0,  # readings up to this long before the frame are kept [s]
     ) -> None:
-        """Start with an empty buffer.
-
-        Args:
-            capacity: number of readings that are kept at most.
-            live: `put` never waits.
-            kept_s: readings up to this long before the frame are kept [s].
-        """
         self._prismatic = prismatic
-        self.max_gap_s = max_gap_s
+        self.max_gap_s = max_gap_s  # readings around a frame may be this far apart [s]
         self._capacity = capacity
         self._live, self._kept_s = live, kept_s
         self._readings: deque[JointReading] = deque(maxlen=capacity if live else None)

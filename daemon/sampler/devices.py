@@ -44,12 +44,7 @@ class KeepsRecord(Protocol):
 
 
 class DeviceWatch:
-    """Records in the store which devices read the joints, and detects changes.
-
-    Attributes:
-        kept: the record of this session; empty before there is one.
-        changes: differences from the devices of earlier pairs, with remedies.
-    """
+    """Records in the store which devices read the joints, and detects changes."""
 
     def __init__(self, joints: JointSource, store: PairStore, wall: Clock) -> None:
         """Store the settings; nothing is queried yet.
@@ -61,8 +56,8 @@ class DeviceWatch:
         self._store, self._wall = store, wall
         stored = store.reader.devices()
         self._before: Sequence[Device] = stored[-1].record if stored else ()
-        self.kept: Sequence[Device] = ()
-        self.changes: list[str] = []
+        self.kept: Sequence[Device] = ()  # the record of this session; empty before there is one
+        self.changes: list[str] = []  # differences from the devices of earlier pairs, with remedies
 
     def look(self) -> bool:
         """Store the record if it is new; return True if pairs from now on differ from earlier ones."""
@@ -143,13 +138,8 @@ class SamplerRules:
         *,
         gate: Gate,
         buffer: JointBuffer,
-        deciding: threading.Lock,
+        deciding: threading.Lock,  # held while a pair is decided on and stored, so that no pair sees half of a change
     ) -> None:
-        """Start with the rules of `config`.
-
-        Args:
-            deciding: held while a pair is decided on and stored, so that no pair sees half of a change.
-        """
         self._config, self._store, self._devices, self._wall = config, store, devices, wall
         self._gate, self._buffer, self._deciding = gate, buffer, deciding
         self._one_at_a_time = threading.Lock()
@@ -216,7 +206,6 @@ def complaints_of(joints: JointSource) -> list[str]:
 
 
 def servos_of(joints: JointSource) -> dict[str, ServoStatus]:
-    """Return each joint's servo."""
     return dict(joints.servo_health) if isinstance(joints, Servos) else {}
 
 

@@ -34,16 +34,13 @@ class Gate:
     there in the elapsed time, or after `segment_gap_s`.
 
     With `any_step`, neither step nor speed is checked: a static recording has no path between its poses.
-
-    Attributes:
-        segment: number of the current segment; 0 before the first.
     """
 
     def __init__(self, rules: DaemonConfig, prismatic: NDArray[np.bool_], last: Pair | None = None) -> None:
         """Start after `last`, the newest pair in the store."""
         self._prismatic = prismatic
         self.follow(rules)
-        self.segment = 0 if last is None else last.segment
+        self.segment = 0 if last is None else last.segment  # number of the current segment; 0 before the first
         self._q: FloatArray | None = None if last is None else last.q
         self._t: float | None = None
         self._broken = True

@@ -35,16 +35,12 @@ Predict = Callable[[bytes], bytes]
 
 
 class HandModel:
-    """Hand position in the measurement frame, by the best available model.
-
-    Attributes:
-        source: learnt or nominal: the model used last.
-    """
+    """Hand position in the measurement frame, by the best available model."""
 
     def __init__(self, robot: RobotDescription, predict: Predict, clock: Clock) -> None:
         self._chain, self._predict, self._clock = robot.chain, predict, clock
         self._ask_s = -math.inf
-        self.source = "nominal"
+        self.source = "nominal"  # learnt or nominal: the model used last
 
     def positions(self, q: FloatArray) -> FloatArray:
         """Return marker positions (n, 3) [m] at q (n, d) [rad], all by one model, which the first row selects."""

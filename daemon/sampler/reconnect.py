@@ -42,13 +42,9 @@ class ReconnectingSource(Generic[R_co]):
         name: str,
         wall: Clock,
         sleep: Callable[[float], None] = time.sleep,
+        # returns a device that this process will never be allowed to open, or None
         forbidden: Callable[[], str | None] = lambda: None,
     ) -> None:
-        """Store the settings; nothing is opened yet.
-
-        Args:
-            forbidden: returns a device that this process will never be allowed to open, or None.
-        """
         self._forbidden = forbidden
         self._source, self._name, self._wall, self._sleep = source, name, wall, sleep
         self._opened = ExitStack()
@@ -69,7 +65,6 @@ class ReconnectingSource(Generic[R_co]):
 
     @property
     def health(self) -> tuple[str, ...]:
-        """The problem with the source, if there is one."""
         return () if self.trouble is None else (self.trouble,)
 
     def read(self, timeout_s: float) -> R_co | None:

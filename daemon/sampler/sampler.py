@@ -20,8 +20,6 @@ from bodyschema.daemon.sampler.devices import (
     complaints_of,
     servos_of,
 )
-from bodyschema.daemon.sampler.reconnect import ResilientWriter
-from bodyschema.daemon.sampler.sources import answer_simulation
 from bodyschema.daemon.service.service import Service, with_health
 from bodyschema.daemon.service.signals import tell_parent_serving
 from bodyschema.daemon.transport.bus import Request, ZenohSession
@@ -41,8 +39,8 @@ from .gate import Gate
 from .gaze_loop import gaze_of
 from .history import LARGEST_REPLY, answer_pairs
 from .powered import asked
-from .reconnect import ReconnectingSource
-from .sources import Sources
+from .reconnect import ReconnectingSource, ResilientWriter
+from .sources import Sources, answer_simulation
 
 log = logging.getLogger(__name__)
 
@@ -66,14 +64,11 @@ class Sampler:
         bus: ZenohSession,
         store: PairStore,
         *,
-        exit_at_end: bool = False,
+        exit_at_end: bool = False,  # return from `run` when the sources end, instead of continuing to serve the history
+        # is notified once everything is up, that `LOOPS` work, and of the sampler's state
         service: Service | None = None,
     ) -> None:
         """Prepare a sampler over an open bus and an open store; `run` opens the sources.
-
-        Args:
-            exit_at_end: return from `run` when the sources end, instead of continuing to serve the history.
-            service: is notified once everything is up, that `LOOPS` work, and of the sampler's state.
 
         Raises:
             ConfigError: the encoders' joints differ from robot.toml's.

@@ -158,33 +158,22 @@ class MarkerTopic(Source, Protocol):
 
 
 class ToolRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Mounts another tool on the simulated hand. An empty request returns the truth instead.
+    """Mounts another tool on the simulated hand. An empty request returns the truth instead."""
 
-    Attributes:
-        tool: marker position in `marker_link`, at most 2 m from the hand [m].
-    """
-
-    tool: tuple[float, float, float]
+    tool: tuple[float, float, float]  # marker position in `marker_link`, at most 2 m from the hand [m]
 
 
 class TruthReply(msgspec.Struct, frozen=True):
     """The simulated robot's ground truth: the exact chain from measurement frame to marker over the encoders' angles.
 
     For evaluation only.
-
-    Attributes:
-        fixed: transform before each joint, and last the marker's [m], (d + 1) × 4 × 4.
-        axes: unit axis of each joint, d × 3.
-        prismatic: d booleans.
-        t: simulated time [s].
-        turn: marker orientation in the chain's last frame, 3 × 3.
     """
 
-    fixed: list[list[list[float]]]
-    axes: list[list[float]]
-    prismatic: list[bool]
-    t: float
-    turn: list[list[float]]
+    fixed: list[list[list[float]]]  # transform before each joint, and last the marker's [m], (d + 1) × 4 × 4
+    axes: list[list[float]]  # unit axis of each joint, d × 3
+    prismatic: list[bool]  # d booleans
+    t: float  # simulated time [s]
+    turn: list[list[float]]  # marker orientation in the chain's last frame, 3 × 3
     schema: int = SCHEMA
 
 

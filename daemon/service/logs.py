@@ -29,7 +29,6 @@ class PlainFormatter(logging.Formatter):
     """Prints commands in the form in which the user has to type them."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the formatted record."""
         return as_typed(super().format(record))
 
 

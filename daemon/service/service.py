@@ -30,18 +30,13 @@ class Service:
     def __init__(
         self,
         notifier: Notifier,
-        loops: Collection[str],
+        loops: Collection[str],  # names of the loops that have to keep running
         clock: Clock,
         *,
-        devices: Sequence[str] = (),
+        devices: Sequence[str] = (),  # devices that the service was allowed at its start; access(2) respects this, too
         may_open: Callable[[str], bool] = lambda device: os.access(device, os.R_OK | os.W_OK),
     ) -> None:
-        """Start in the state "not ready".
-
-        Args:
-            loops: names of the loops that have to keep running.
-            devices: devices that the service was allowed at its start; access(2) respects this, too.
-        """
+        """Start in the state "not ready"."""
         self._devices = devices if notifier.is_heard else ()
         self._may_open, self._forbidden_since = may_open, math.inf
         self._notifier, self._clock = notifier, clock

@@ -31,19 +31,13 @@ _MESSAGES: dict[Deed, tuple[tuple[str, ...], tuple[str, ...]]] = {
 
 
 class Names(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Names per role: common names of certificates, or user names where passwords are required.
+    """Names per role: common names of certificates, or user names where passwords are required."""
 
-    Attributes:
-        viewer: asks for predictions, pairs, the model and states, and receives pairs and states.
-        operator: a viewer who may give commands, see the cameras' picture, and change the simulated robot's tool.
-        sampler: the process of that name: publishes pairs, answers from its store.
-        learner: the process of that name: receives pairs, answers predictions.
-    """
-
-    viewer: tuple[str, ...] = ()
+    viewer: tuple[str, ...] = ()  # asks for predictions, pairs, the model and states, and receives pairs and states
+    # a viewer who may give commands, see the cameras' picture, and change the simulated robot's tool
     operator: tuple[str, ...] = ()
-    sampler: tuple[str, ...] = ()
-    learner: tuple[str, ...] = ()
+    sampler: tuple[str, ...] = ()  # the process of that name: publishes pairs, answers from its store
+    learner: tuple[str, ...] = ()  # the process of that name: receives pairs, answers predictions
 
 
 ROLES = tuple(field.name for field in msgspec.structs.fields(Names))

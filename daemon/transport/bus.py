@@ -66,17 +66,13 @@ class ZenohSession:
         *,
         listen: str | None = None,
         connect: str | Route | None = None,
-        client: bool = False,
+        client: bool = False,  # connect at once or fail; otherwise keep trying in the background
+        # further zenoh configuration, as returned by `Config.zenoh_settings` for a process
         settings: Mapping[str, Any] | None = None,
+        # time allowed for the process that accepts the connection to speak zenoh
         open_timeout_s: float = OPEN_TIMEOUT_S,
     ) -> None:
-        """Open a session that listens on `listen` and connects to `connect` when a process listens there.
-
-        Args:
-            client: connect at once or fail; otherwise keep trying in the background.
-            settings: further zenoh configuration, as returned by `Config.zenoh_settings` for a process.
-            open_timeout_s: time allowed for the process that accepts the connection to speak zenoh.
-        """
+        """Open a session that listens on `listen` and connects to `connect` when a process listens there."""
         self._listen, self._client, self._settings = listen, client, dict(settings or {})
         self._route = Route((connect,)) if isinstance(connect, str) else connect
         self._open_timeout_s = open_timeout_s

@@ -18,28 +18,19 @@ READ_BY_OTHERS = stat.S_IROTH
 
 
 class TlsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A table `tls`; PEM files, relative to the file that names them.
+    """A table `tls`; PEM files, relative to the file that names them."""
 
-    Attributes:
-        ca: certificate of the authority that signed all certificates.
-        certificate, key: those of this machine or person; needed to listen, and to connect without a password.
-    """
-
-    ca: str
+    ca: str  # certificate of the authority that signed all certificates
+    # certificate, key: those of this machine or person; needed to listen, and to connect without a password
     certificate: str | None = None
     key: str | None = None
 
 
 class LoginConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A table `login`: name and password in place of a client certificate.
+    """A table `login`: name and password in place of a client certificate."""
 
-    Attributes:
-        user: name.
-        password_file: its first line is the password; relative to the file that names it.
-    """
-
-    user: str
-    password_file: str
+    user: str  # name
+    password_file: str  # its first line is the password; relative to the file that names it
 
 
 @dataclass(frozen=True)
@@ -81,7 +72,6 @@ class Identity:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """All files that it was read from."""
         named = (self.ca, self.certificate, self.key, self.password_file, self.users_file)
         return tuple(path for path in named if path is not None)
 

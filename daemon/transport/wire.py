@@ -35,33 +35,21 @@ _msgpack_encoder = msgspec.msgpack.Encoder()
 
 
 class PairMessage(msgspec.Struct, frozen=True):
-    """One training pair, published once, after it was stored.
+    """One training pair, published once, after it was stored."""
 
-    Attributes:
-        store: UUID of the store that numbered it.
-        seq: its number in that store, from 1, without gaps.
-        segment: shared by a run of pairs, each one step from its predecessor.
-        t: frame time on the sampler's monotonic clock [s]; may restart with the sampler.
-        utc: wall-clock time of acceptance, ISO 8601.
-        q: joint angles at `t` [rad], d numbers.
-        x: marker position [m].
-        cov: its covariance [m²].
-        R: marker orientation, a unit quaternion; null for a ball.
-        cov_R: covariance of a small rotation about the axes [rad²]; null if unknown.
-        pose: `x` and `R` with their covariances once more, in the form of all messages; null from a sampler of an
-            earlier version.
-    """
-
-    store: str
-    seq: Annotated[int, Meta(ge=1)]
-    segment: int
-    t: float
-    utc: str
-    q: list[float]
-    x: tuple[float, float, float]
-    cov: tuple[float, float, float, float, float, float]
-    R: tuple[float, float, float, float] | None = None
+    store: str  # UUID of the store that numbered it
+    seq: Annotated[int, Meta(ge=1)]  # its number in that store, from 1, without gaps
+    segment: int  # shared by a run of pairs, each one step from its predecessor
+    t: float  # frame time on the sampler's monotonic clock [s]; may restart with the sampler
+    utc: str  # wall-clock time of acceptance, ISO 8601
+    q: list[float]  # joint angles at `t` [rad], d numbers
+    x: tuple[float, float, float]  # marker position [m]
+    cov: tuple[float, float, float, float, float, float]  # its covariance [m²]
+    R: tuple[float, float, float, float] | None = None  # marker orientation, a unit quaternion; null for a ball
+    # covariance of a small rotation about the axes [rad²]; null if unknown
     cov_R: tuple[float, float, float, float, float, float] | None = None
+    # `x` and `R` with their covariances once more, in the form of all messages; null from a sampler of an earlier
+    # version
     pose: MarkerPose | None = None
     schema: int = SCHEMA
 
@@ -70,86 +58,58 @@ class PairsReply(msgspec.Struct, frozen=True):
     """Stored pairs in order, at most 1000; `from` and `to` are inclusive and optional.
 
     A reply that begins after `from` means that older pairs were deleted (`[daemon] keep_days`, `keep_mb`).
-
-    Attributes:
-        store: UUID of the store.
-        last_seq: newest pair in the store, 0 if empty.
-        pairs: continue from where they end.
     """
 
-    store: str
-    last_seq: int
-    pairs: list[PairMessage]
+    store: str  # UUID of the store
+    last_seq: int  # newest pair in the store, 0 if empty
+    pairs: list[PairMessage]  # continue from where they end
     schema: int = SCHEMA
 
 
 class JointsRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Joint angles, of one configuration or of several.
+    """Joint angles, of one configuration or of several."""
 
-    Attributes:
-        q: joint angles [rad]: d numbers, or up to 10,000 such lists.
-    """
-
-    q: list[float | list[float]]
+    q: list[float | list[float]]  # joint angles [rad]: d numbers, or up to 10,000 such lists
 
 
 class PredictReply(msgspec.Struct, frozen=True):
     """One row for each of the n rows of the request, also for a single vector.
 
     Sigmas are errors against the truth, without the measurement's noise.
-
-    Attributes:
-        x: marker positions [m], n × 3.
-        sigma: 1-sigma per axis [m], n × 3.
-        in_support: false where extrapolated, away from all data.
-        model: hash of the answering model.
-        pairs: pairs that it has learnt.
-        age_s: age of the newest learnt pair: from it to the newest pair known to be stored, plus the time since the
-            learner heard of that one [s]; null before any pair.
-        R: marker orientations, n × 4; null where no pair with the present tool had one.
-        sigma_R: 1-sigma of a small rotation about each axis [rad], n × 3; null with `R`.
-        poses: the rows once more, in the form of all messages, with the covariances of `sigma` and `sigma_R`; null from
-            a learner of an earlier version.
     """
 
-    x: list[list[float]]
-    sigma: list[list[float]]
-    in_support: list[bool]
-    model: str
-    pairs: int
+    x: list[list[float]]  # marker positions [m], n × 3
+    sigma: list[list[float]]  # 1-sigma per axis [m], n × 3
+    in_support: list[bool]  # false where extrapolated, away from all data
+    model: str  # hash of the answering model
+    pairs: int  # pairs that it has learnt
+    # age of the newest learnt pair: from it to the newest pair known to be stored, plus the time since the learner
+    # heard of that one [s]; null before any pair
     age_s: float | None
-    R: list[list[float]] | None = None
-    sigma_R: list[list[float]] | None = None
+    R: list[list[float]] | None = None  # marker orientations, n × 4; null where no pair with the present tool had one
+    sigma_R: list[list[float]] | None = None  # 1-sigma of a small rotation about each axis [rad], n × 3; null with `R`
+    # the rows once more, in the form of all messages, with the covariances of `sigma` and `sigma_R`; null from a
+    # learner of an earlier version
     poses: list[MarkerPose] | None = None
     schema: int = SCHEMA
 
 
 class JacobianReply(msgspec.Struct, frozen=True):
-    """Jacobians dx/dq of the marker position.
+    """Jacobians dx/dq of the marker position."""
 
-    Attributes:
-        J: a 3 × d matrix for each row of the request [m/rad].
-        model: hash of the answering model.
-        pairs: pairs that it has learnt.
-    """
-
-    J: list[list[list[float]]]
-    model: str
-    pairs: int
+    J: list[list[list[float]]]  # a 3 × d matrix for each row of the request [m/rad]
+    model: str  # hash of the answering model
+    pairs: int  # pairs that it has learnt
     schema: int = SCHEMA
 
 
 class IkRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The requested marker position.
+    """The requested marker position."""
 
-    Attributes:
-        x: wanted marker position [m].
-        start: present joint angles [rad]; tried first, so that the answer is close to them if possible.
-        posture: preferred angles as far as `x` leaves a choice [rad], or "middle" of the limits.
-    """
-
-    x: tuple[float, float, float]
+    x: tuple[float, float, float]  # wanted marker position [m]
+    # present joint angles [rad]; tried first, so that the answer is close to them if possible
     start: list[float] | None = None
+    # preferred angles as far as `x` leaves a choice [rad], or "middle" of the limits
     posture: Literal["middle"] | list[float] | None = None
 
 
@@ -158,64 +118,40 @@ class IkReply(msgspec.Struct, frozen=True):
 
     If the position is unreachable, `q` is the nearest configuration found. Collisions are not checked, and nothing
     moves.
-
-    Attributes:
-        q: joint angles [rad], d numbers.
-        x: predicted marker position there [m].
-        distance: from it to the requested one [m].
-        converged: `distance` is at most 1e-7 m.
-        reason: `reached`, `out_of_reach` (a local minimum from every start) or `steps_ran_out`.
-        sigma: 1-sigma of `x` per axis against the truth [m].
-        in_support: `q` lies where data was.
-        model: hash of the answering model.
-        pairs: pairs that it has learnt.
-        pose: the predicted pose at `q`, as `predict` has it; null from a learner of an earlier version.
     """
 
-    q: list[float]
-    x: list[float]
-    distance: float
-    converged: bool
-    reason: str
-    sigma: list[float]
-    in_support: bool
-    model: str
-    pairs: int
+    q: list[float]  # joint angles [rad], d numbers
+    x: list[float]  # predicted marker position there [m]
+    distance: float  # from it to the requested one [m]
+    converged: bool  # `distance` is at most 1e-7 m
+    reason: str  # `reached`, `out_of_reach` (a local minimum from every start) or `steps_ran_out`
+    sigma: list[float]  # 1-sigma of `x` per axis against the truth [m]
+    in_support: bool  # `q` lies where data was
+    model: str  # hash of the answering model
+    pairs: int  # pairs that it has learnt
+    # the predicted pose at `q`, as `predict` has it; null from a learner of an earlier version
     pose: MarkerPose | None = None
     schema: int = SCHEMA
 
 
 class CommandRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A command to one of the processes.
+    """A command to one of the processes."""
 
-    Attributes:
-        command: its name.
-    """
-
-    command: CommandName
+    command: CommandName  # its name
 
 
 class CommandReply(msgspec.Struct, frozen=True):
-    """Confirmation of a command.
+    """Confirmation of a command."""
 
-    Attributes:
-        command: the command, which was carried out.
-        message: its effect, for people.
-    """
-
-    command: str
-    message: str
+    command: str  # the command, which was carried out
+    message: str  # its effect, for people
     schema: int = SCHEMA
 
 
 class ErrorReply(msgspec.Struct, frozen=True):
-    """Zenoh's error reply to a query that could not be carried out. Nothing was changed.
+    """Zenoh's error reply to a query that could not be carried out. Nothing was changed."""
 
-    Attributes:
-        error: the error and its remedy, for people.
-    """
-
-    error: str
+    error: str  # the error and its remedy, for people
     schema: int = SCHEMA
 
 

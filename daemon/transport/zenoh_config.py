@@ -18,25 +18,19 @@ HOW_TO = "docs/security.md shows how"
 
 
 class ZenohConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [zenoh].
+    """The table [zenoh]."""
 
-    Attributes:
-        sampler, learner: endpoints of the two processes. Beyond this machine only with `tls` and `access`.
-        router: endpoint where machines meet: both processes connect to it too, and clients that do not find them on
-            this machine ask there; empty if there is none.
-        tls: certificates; required for every endpoint beyond this machine.
-        login: name and password for a router or a process that asks for them.
-        users_file: lines `user:password` of users who may connect to the processes, in place of certificates.
-        access: roles at the processes, if they listen beyond this machine.
-    """
-
+    # sampler, learner: endpoints of the two processes. Beyond this machine only with `tls` and `access`.
     sampler: str = "tcp/127.0.0.1:7447"
     learner: str = "tcp/127.0.0.1:7448"
+    # endpoint where machines meet: both processes connect to it too, and clients that do not find them on this machine
+    # ask there; empty if there is none
     router: str = ""
-    tls: TlsConfig | None = None
-    login: LoginConfig | None = None
+    tls: TlsConfig | None = None  # certificates; required for every endpoint beyond this machine
+    login: LoginConfig | None = None  # name and password for a router or a process that asks for them
+    # lines `user:password` of users who may connect to the processes, in place of certificates
     users_file: str | None = None
-    access: Names | None = None
+    access: Names | None = None  # roles at the processes, if they listen beyond this machine
 
     def endpoint(self, process: str) -> str:
         """Return the endpoint of `sampler` or `learner`."""

@@ -31,6 +31,7 @@ from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.extras import install_command, no_pybullet
 from bodyschema.interfaces.protocols import JointSource
 from bodyschema.interfaces.records import JointReading
+from bodyschema.interfaces.whole_files import writing
 from bodyschema.robot.limited import read_at_most
 from bodyschema.robot.toml_file import read_toml
 from bodyschema.robot.toml_text import toml_text
@@ -182,12 +183,10 @@ def bench_robot_file(config: Config, bench: DryRun, port: Path) -> Path:
     tables.setdefault("daemon", {})["state_dir"] = str(port.with_name(f"{port.name}.state").absolute())
     if "unexplained" in tables:
         tables["unexplained"]["model"] = str((config.file.parent / tables["unexplained"]["model"]).resolve())
-    try:
+    with writing(file, remedy="Give another --port"):
         if file.exists() and not read_at_most(file).startswith(MARK.encode()):
             raise ConfigError("is there already, and no bench wrote it", file=file, remedy="Give another --port")
         file.write_text(f"{MARK}\n{toml_text(tables)}", encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"cannot be written: {error.strerror}", file=file, remedy="Give another --port") from error
     return file
 
 

@@ -117,7 +117,6 @@ def entry_of(joint: str, id: int, model: Model) -> ServoConfig:
 
 
 def settings_by_name(workbench: EepromEditor, model: Model) -> Mapping[str, Setting]:
-    """Return the writable settings of a model."""
     return {setting.name: setting for setting in workbench.make.settings(model)}
 
 

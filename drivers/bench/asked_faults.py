@@ -41,8 +41,6 @@ class FaultKinds:
 
 @dataclass(frozen=True, slots=True)
 class AskedFault:
-    """One requested fault."""
-
     kind: str  # its name
     joint: str | None  # joint whose servo or encoder is affected; None: all
     share: float  # the probability that an answer is affected, for faults on the wire

@@ -63,7 +63,6 @@ class EmulatedServo(ABC):
 
     @property
     def id(self) -> int:
-        """ID on the bus."""
         return self["id"]
 
     @property
@@ -85,19 +84,15 @@ class ServoChain(OnlyAnswers, ABC, Generic[ServoT]):
     When several servos are asked at once, each waits for the end of the answer before its own, or for as long as that
     answer would have taken. Each samples its position when its turn comes. Servos that share an ID talk at the same
     time: where their bytes differ, the zeros win.
-
-    Attributes:
-        servos: in the order of the cable.
-        samplings: by ID, time and angle of the last position sent.
     """
 
     overhead: int
     """Bytes of a status packet apart from its data."""
 
     def __init__(self, servos: Iterable[ServoT], faults: Faults = no_faults) -> None:
-        self.servos = list(servos)
+        self.servos = list(servos)  # in the order of the cable
         self.faults = faults
-        self.samplings: dict[int, Sampling] = {}
+        self.samplings: dict[int, Sampling] = {}  # by ID, time and angle of the last position sent
         self.instructions = 0
         self._stream = bytearray()
         self._last_byte_s = 0.0

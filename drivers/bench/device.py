@@ -57,7 +57,6 @@ class OnlyAnswers:
     speaks_at = math.inf
 
     def speak(self, until: float, baud: int) -> list[Reply]:
-        """Return an empty list."""
         del until, baud
         return []
 

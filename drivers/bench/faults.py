@@ -60,7 +60,6 @@ class Planned:
         self._plan[id] = (fault, times)
 
     def clear(self) -> None:
-        """Remove all faults."""
         self._plan.clear()
 
     def __call__(self, reply: Reply) -> Reply:

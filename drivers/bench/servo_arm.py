@@ -12,19 +12,16 @@ from typing import Any, ClassVar, Generic, TypeVar
 import msgspec
 import numpy as np
 
-from bodyschema.drivers.bench.dry_run import GLITCH_TICKS
 from bodyschema.drivers.servos.config import ServoConfig, ServosConfig
 from bodyschema.interfaces.records import FloatArray, frozen_array
 
 from .asked_faults import AskedFault, FaultKinds, WireFaults
 from .chain import ServoChain, ServoT
 from .device import Angle, Faults
-from .dry_run import BenchArm
+from .dry_run import GLITCH_TICKS, BenchArm
 
 
 class _Settings:
-    """Settings of the emulated arm."""
-
     # period of the slowest swing
     slowest_s: float = 20.0
     # between neighbours: the golden angle, so that no two joints move together
@@ -71,11 +68,7 @@ ConfigT = TypeVar("ConfigT", bound=ServosConfig[Any])
 
 
 class ServoArm(BenchArm, Generic[ServoT, ConfigT]):
-    """Servos as configured, one chain per bus.
-
-    Attributes:
-        chains: by name of the bus.
-    """
+    """Servos as configured, one chain per bus."""
 
     unit: ClassVar[str] = "packets understood"
     kinds: ClassVar[FaultKinds]
@@ -85,21 +78,16 @@ class ServoArm(BenchArm, Generic[ServoT, ConfigT]):
     def __init__(
         self,
         config: ConfigT,
-        angles: Mapping[str, Angle],
+        angles: Mapping[str, Angle],  # by joint, its angle as a function of time [rad]
         *,
         faults: Sequence[AskedFault] = (),
         return_delay_s: float = 0.0,
         seed: int = 0,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Create the servos with their power on.
-
-        Args:
-            angles: by joint, its angle as a function of time [rad].
-        """
         self._config, self._return_delay_s, self._rng, self._now = config, return_delay_s, Random(seed), now
         self._servos: dict[str, ServoT] = {}
-        self.chains: dict[str, ServoChain[ServoT]] = {}
+        self.chains: dict[str, ServoChain[ServoT]] = {}  # by name of the bus
         for name in config.buses:
             fitted = [entry for entry in config.servos if config.bus_of(entry) == name]
             for entry in fitted:

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from bodyschema.drivers.dynamixel.models import BY_NUMBER, HARDWARE_ERRORS, UNSUPPORTED
-from bodyschema.drivers.dynamixel.packets import BROADCAST, PACKETS2, Version
 from bodyschema.drivers.echo import HOST_S, Port
 from bodyschema.drivers.servos.bus import BITS_PER_BYTE, Answer, Exchange, Request, Trouble, spare_after
 from bodyschema.drivers.servos.bus import Bus as ServoBus
@@ -14,8 +12,8 @@ from bodyschema.drivers.servos.packets import Packets
 from bodyschema.drivers.servos.scan import IDS, Kind, PingScanner, heard
 from bodyschema.interfaces.protocols import Clock
 
-from .models import FAST_HEADER, FASTEST1, PING_SLOT_S
-from .packets import packets_of
+from .models import BY_NUMBER, FAST_HEADER, FASTEST1, HARDWARE_ERRORS, PING_SLOT_S, UNSUPPORTED
+from .packets import BROADCAST, PACKETS2, Version, packets_of
 
 __all__ = ["Answer", "Bus", "Exchange", "Request", "Trouble", "sync_request"]
 
@@ -35,7 +33,6 @@ class Bus(ServoBus):
 
     @staticmethod
     def packets_of(protocol: int) -> Packets:
-        """Return the packet codec of the protocol."""
         return packets_of(protocol)
 
     def sync_write(self, register: Register, values: Mapping[int, int]) -> None:

@@ -24,35 +24,25 @@ Baud = Literal[9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000]
 
 
 class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [drivers.dynamixel.buses.<name>]: a port with servos behind it.
+    """The table [drivers.dynamixel.buses.<name>]: a port with servos behind it."""
 
-    Attributes:
-        port: best one of /dev/serial/by-id, which stays the same when it is plugged in again.
-        baud: as the servos are set [bit/s].
-        latency_ms: how long the adapter holds bytes back; without this key the system's value is used.
-        fast_sync_read: `auto` tests once if the servos support it.
-    """
-
-    port: str
-    baud: Baud = 1_000_000
+    port: str  # best one of /dev/serial/by-id, which stays the same when it is plugged in again
+    baud: Baud = 1_000_000  # as the servos are set [bit/s]
+    # how long the adapter holds bytes back; without this key the system's value is used
     latency_ms: NonNegative | None = None
-    fast_sync_read: Literal["auto", "never"] = "auto"
+    fast_sync_read: Literal["auto", "never"] = "auto"  # `auto` tests once if the servos support it
 
 
 class DynamixelConfig(ServosConfig[BusConfig], frozen=True, forbid_unknown_fields=True):
-    """The table [drivers.dynamixel]. MX-28 speaks Protocol 1.0, MX-28(2.0) speaks 2.0.
-
-    Attributes:
-        zero_force: joints that carry the arm's weight on request. Without this table none ever does.
-        gaze: joints that turn the cameras to the hand on request.
-    """
+    """The table [drivers.dynamixel]. MX-28 speaks Protocol 1.0, MX-28(2.0) speaks 2.0."""
 
     table: ClassVar[str] = "drivers.dynamixel"
     models: ClassVar[Mapping[str, Model]] = BY_NAME
     unsupported: ClassVar[Collection[str]] = tuple(UNSUPPORTED.values())
 
+    # joints that carry the arm's weight on request. Without this table none ever does.
     zero_force: ZeroForceConfig | None = None
-    gaze: GazeConfig | None = None
+    gaze: GazeConfig | None = None  # joints that turn the cameras to the hand on request
 
     def check(self, joints: Sequence[str], file: Path, text: str) -> None:
         """Raise ConfigError if servos, zero-force or gaze do not fit `joints` or each other; see `ServosConfig`."""

@@ -13,7 +13,6 @@ from typing import get_args
 from bodyschema.drivers.device_clock import DeviceClock
 from bodyschema.drivers.dynamixel.bus import Bus, sync_request
 from bodyschema.drivers.dynamixel.config import Baud, BusConfig, DynamixelConfig
-from bodyschema.drivers.dynamixel.models import BY_NUMBER, HARDWARE_ERRORS, LAYOUT_MX1, TICK_S, TICKS, baud_value
 from bodyschema.drivers.dynamixel.packets import ALERT
 from bodyschema.drivers.servos.bus import Answer
 from bodyschema.drivers.servos.bus import Bus as ServoBus
@@ -34,7 +33,20 @@ from bodyschema.drivers.servos.settings import (
 )
 from bodyschema.drivers.servos.vendor import ServoVendor, Way, one_by_one
 
-from .models import BAUDS1, CURRENT_MODES, MODES, NEAR_OFFSET, NUMBER1, SIGN1
+from .models import (
+    BAUDS1,
+    BY_NUMBER,
+    CURRENT_MODES,
+    HARDWARE_ERRORS,
+    LAYOUT_MX1,
+    MODES,
+    NEAR_OFFSET,
+    NUMBER1,
+    SIGN1,
+    TICK_S,
+    TICKS,
+    baud_value,
+)
 
 FARTHEST_OFFSET = 1_044_479  # 255 turns
 

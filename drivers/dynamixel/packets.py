@@ -159,7 +159,6 @@ def _sync_read(ids: tuple[int, ...], address: int, size: int, fast: bool) -> byt
 
 
 def packets_of(protocol: int) -> Packets:
-    """Return the packet codec of the protocol."""
     return PACKETS2 if protocol == 2 else PACKETS1
 
 

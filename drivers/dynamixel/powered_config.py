@@ -24,31 +24,22 @@ Mistake = tuple[tuple[str, ...], str, str]
 
 
 class FloatingJoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [drivers.dynamixel.zero_force.joints.<joint>]: a joint that carries its part of the arm's weight.
+    """The table [drivers.dynamixel.zero_force.joints.<joint>]: a joint that carries its part of the arm's weight."""
 
-    Attributes:
-        current_limit_a: upper limit of the current [A].
-        torque_constant: torque at the joint per current, including any gear [N·m/A]; without this key the model's
-            value,
-    if the manual's figures are known.
-    """
-
-    current_limit_a: Positive
+    current_limit_a: Positive  # upper limit of the current [A]
+    # torque at the joint per current, including any gear [N·m/A]; without this key the model's value, if the manual's
+    # figures are known
     torque_constant: Positive | None = None
 
 
 class PoweredConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Settings common to both.
+    """Settings common to both."""
 
-    Attributes:
-        heartbeat_ms: a control loop slower than this switches torque off, and a servo that hears nothing for this long
-            stops by itself (Bus Watchdog, steps of 20 ms).
-        max_temperature_c: torque goes off when a servo is hotter.
-        doubtful_cycles: torque goes off after this many consecutive rejected readings.
-    """
-
+    # a control loop slower than this switches torque off, and a servo that hears nothing for this long stops by itself
+    # (Bus Watchdog, steps of 20 ms)
     heartbeat_ms: Heartbeat = 100.0
-    max_temperature_c: Annotated[float, Meta(gt=0, le=80)] = 65.0
+    max_temperature_c: Annotated[float, Meta(gt=0, le=80)] = 65.0  # torque goes off when a servo is hotter
+    # torque goes off after this many consecutive rejected readings
     doubtful_cycles: Annotated[int, Meta(ge=1, le=100)] = 10
 
     @property
@@ -63,21 +54,15 @@ class PoweredConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
 
 class ZeroForceConfig(PoweredConfig, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The table [drivers.dynamixel.zero_force]: the servos carry the arm's weight for hand guiding.
+    """The table [drivers.dynamixel.zero_force]: the servos carry the arm's weight for hand guiding."""
 
-    Attributes:
-        joints: those that carry the arm; the torque of the others stays off.
-        max_speed_deg_s: torque goes off when a joint turns faster.
-        ramp_s: duration of the ramp of the currents.
-        overcurrent_s: torque goes off when a current exceeds its limit for this long.
-        share: share of the arm's weight that is carried.
-    """
-
+    # those that carry the arm; the torque of the others stays off
     joints: Annotated[dict[str, FloatingJoint], Meta(min_length=1)]
-    max_speed_deg_s: Annotated[float, Meta(gt=0, le=360)] = 90.0
-    ramp_s: Annotated[float, Meta(ge=0.2, le=10)] = 1.0
+    max_speed_deg_s: Annotated[float, Meta(gt=0, le=360)] = 90.0  # torque goes off when a joint turns faster
+    ramp_s: Annotated[float, Meta(ge=0.2, le=10)] = 1.0  # duration of the ramp of the currents
+    # torque goes off when a current exceeds its limit for this long
     overcurrent_s: Annotated[float, Meta(gt=0, le=5)] = 0.5
-    share: Annotated[float, Meta(gt=0, le=1)] = 1.0
+    share: Annotated[float, Meta(gt=0, le=1)] = 1.0  # share of the arm's weight that is carried
 
     def torque_constant_of(self, servo: ServoConfig) -> float:
         """Return the torque constant of a joint's servo [N·m/A]; checked to be known."""
@@ -108,20 +93,13 @@ class ZeroForceConfig(PoweredConfig, frozen=True, forbid_unknown_fields=True, kw
 
 
 class GazeConfig(PoweredConfig, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The table [drivers.dynamixel.gaze]: joints that turn the cameras to the hand.
+    """The table [drivers.dynamixel.gaze]: joints that turn the cameras to the hand."""
 
-    Attributes:
-        joints: those of the head; each is also one of [robot] joints.
-        limits_deg: by joint, narrower limits than the URDF's [°].
-        max_speed_deg_s: of the head's joints.
-        stale_s: without a newer target for this long, the head stands still.
-        blocked_s, blocked_deg: torque goes off when the head stays this far from its command for this long.
-    """
-
-    joints: Annotated[tuple[str, ...], Meta(min_length=1)]
-    limits_deg: dict[str, tuple[float, float]] = {}
-    max_speed_deg_s: Annotated[float, Meta(gt=0, le=180)] = 30.0
-    stale_s: Annotated[float, Meta(gt=0, le=5)] = 0.5
+    joints: Annotated[tuple[str, ...], Meta(min_length=1)]  # those of the head; each is also one of [robot] joints
+    limits_deg: dict[str, tuple[float, float]] = {}  # by joint, narrower limits than the URDF's [°]
+    max_speed_deg_s: Annotated[float, Meta(gt=0, le=180)] = 30.0  # of the head's joints
+    stale_s: Annotated[float, Meta(gt=0, le=5)] = 0.5  # without a newer target for this long, the head stands still
+    # blocked_s, blocked_deg: torque goes off when the head stays this far from its command for this long
     blocked_s: Positive = 1.0
     blocked_deg: Positive = 15.0
 

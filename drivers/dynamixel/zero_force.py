@@ -39,7 +39,6 @@ class ZeroForce(PoweredJoints):
         torques: HoldingTorques,
         clock: Clock,
     ) -> None:
-        """Start with torque off."""
         floating = [joint for joint in joints if joint in zero_force.joints]
         servos = {servo.joint: servo for servo in config.servos}
         limit = frozen_array([zero_force.joints[joint].current_limit_a for joint in floating])

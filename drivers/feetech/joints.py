@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator, Sequence
 
 from bodyschema.drivers.feetech.config import BusConfig, FeetechConfig
-from bodyschema.drivers.feetech.models import BAUDS, BY_NUMBER, HARDWARE_ERRORS, STS
 from bodyschema.drivers.servos.bus import Answer, Request, spare_after
 from bodyschema.drivers.servos.bus import Bus as ServoBus
 from bodyschema.drivers.servos.channel import Channel as ServoChannel
@@ -28,7 +27,7 @@ from bodyschema.drivers.servos.settings import (
 )
 from bodyschema.drivers.servos.vendor import ServoVendor, Way, one_by_one
 
-from .models import MODES, PING, READ, SYNC_READ, WRITE
+from .models import BAUDS, BY_NUMBER, HARDWARE_ERRORS, MODES, PING, READ, STS, SYNC_READ, WRITE
 
 BROADCAST = 0xFE
 

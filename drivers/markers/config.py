@@ -31,26 +31,16 @@ Mistake = tuple[str, str, str]
 
 
 class SourceTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True, tag_field="kind"):
-    """Keys that all kinds of marker source share.
+    """Keys that all kinds of marker source share."""
 
-    Attributes:
-        name: in messages; the kind without it.
-        body: the body whose positions are used; without it, only one may be sent.
-        unit: of the positions and their covariances that are sent.
-        sigma_m: 1-sigma per axis of a position that comes without a covariance [m].
-        latency_s: from the measurement to its time stamp [s]; `bodyschema calibrate latency` measures it.
-        latency_sigma_s: its 1-sigma [s].
-        max_delay_s: a message is rejected if it arrives this much later than the fastest one.
-        xyz, rpy: pose of the source's frame in the measurement frame [m], [rad]; for several sources.
-    """
-
-    name: str = ""
-    body: str | int | None = None
-    unit: Literal["m", "mm"] = "m"
-    sigma_m: Positive = 1e-3
-    latency_s: float = 0.0
-    latency_sigma_s: NonNegative | None = None
-    max_delay_s: Positive = 0.1
+    name: str = ""  # in messages; the kind without it
+    body: str | int | None = None  # the body whose positions are used; without it, only one may be sent
+    unit: Literal["m", "mm"] = "m"  # of the positions and their covariances that are sent
+    sigma_m: Positive = 1e-3  # 1-sigma per axis of a position that comes without a covariance [m]
+    latency_s: float = 0.0  # from the measurement to its time stamp [s]; `bodyschema calibrate latency` measures it
+    latency_sigma_s: NonNegative | None = None  # its 1-sigma [s]
+    max_delay_s: Positive = 0.1  # a message is rejected if it arrives this much later than the fastest one
+    # xyz, rpy: pose of the source's frame in the measurement frame [m], [rad]; for several sources
     xyz: Vector3 = (0.0, 0.0, 0.0)
     rpy: Vector3 = (0.0, 0.0, 0.0)
 
@@ -92,17 +82,12 @@ class SourceTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 class UdpTable(SourceTable, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="udp"):
-    """kind = "udp": JSON datagrams to a port of this machine.
+    """kind = "udp": JSON datagrams to a port of this machine."""
 
-    Attributes:
-        host: address to listen on: 127.0.0.1 takes them from this machine only, 0.0.0.0 from the network.
-        port: to listen on.
-        sender: the only address that datagrams are taken from; without it, any.
-    """
-
+    # address to listen on: 127.0.0.1 takes them from this machine only, 0.0.0.0 from the network
     host: str = "127.0.0.1"
-    port: Port = PORT
-    sender: str | None = None
+    port: Port = PORT  # to listen on
+    sender: str | None = None  # the only address that datagrams are taken from; without it, any
 
     @property
     def endpoint(self) -> str:
@@ -116,15 +101,12 @@ class NatnetTable(SourceTable, frozen=True, forbid_unknown_fields=True, kw_only=
     """kind = "natnet": OptiTrack Motive, which streams NatNet 3 or 4.
 
     Attributes:
-        server: address of the machine that runs Motive.
-        local: address of this machine's network interface to it, for multicast.
-        command_port: where Motive answers.
         body: name or streaming ID of the rigid body.
     """
 
-    server: str = "127.0.0.1"
-    local: str = "0.0.0.0"
-    command_port: Port = 1510
+    server: str = "127.0.0.1"  # address of the machine that runs Motive
+    local: str = "0.0.0.0"  # address of this machine's network interface to it, for multicast
+    command_port: Port = 1510  # where Motive answers
     sigma_m: Positive = 3e-4
 
     # Motive's clock dates the middle of the exposure.
@@ -139,15 +121,10 @@ class NatnetTable(SourceTable, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 class ZenohTable(SourceTable, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="zenoh"):
-    """kind = "zenoh": the same JSON as by UDP, published on a zenoh key.
+    """kind = "zenoh": the same JSON as by UDP, published on a zenoh key."""
 
-    Attributes:
-        router: endpoint of the zenoh router or peer.
-        key: that is published on.
-    """
-
-    router: str = "tcp/127.0.0.1:7447"
-    key: str = "marker"
+    router: str = "tcp/127.0.0.1:7447"  # endpoint of the zenoh router or peer
+    key: str = "marker"  # that is published on
 
     @property
     def endpoint(self) -> str:
@@ -160,25 +137,16 @@ class ZenohTable(SourceTable, frozen=True, forbid_unknown_fields=True, kw_only=T
 
 
 class Ros2Table(SourceTable, frozen=True, forbid_unknown_fields=True, kw_only=True, tag="ros2"):
-    """kind = "ros2": a topic with the marker's pose or point, or a transform of TF.
+    """kind = "ros2": a topic with the marker's pose or point, or a transform of TF."""
 
-    Attributes:
-        router: where rmw_zenohd, or the zenoh bridge, listens.
-        via: rmw_zenoh, or zenoh-bridge-ros2dds for robots on DDS.
-        domain: ROS_DOMAIN_ID, for rmw_zenoh.
-        topic: name of the topic.
-        message: its type; `tf` reads the transform from `frame` to `child` in tf2_msgs/TFMessage.
-        frame: the frame the positions are given in; without it, the frame of the first message.
-        child: the marker's frame, for `tf`.
-    """
-
-    router: str = "tcp/127.0.0.1:7447"
-    via: Literal["rmw_zenoh", "ros2dds"] = "rmw_zenoh"
-    domain: Annotated[int, Meta(ge=0, le=232)] = 0
-    topic: str = "/marker"
+    router: str = "tcp/127.0.0.1:7447"  # where rmw_zenohd, or the zenoh bridge, listens
+    via: Literal["rmw_zenoh", "ros2dds"] = "rmw_zenoh"  # rmw_zenoh, or zenoh-bridge-ros2dds for robots on DDS
+    domain: Annotated[int, Meta(ge=0, le=232)] = 0  # ROS_DOMAIN_ID, for rmw_zenoh
+    topic: str = "/marker"  # name of the topic
+    # its type; `tf` reads the transform from `frame` to `child` in tf2_msgs/TFMessage
     message: Literal["pose", "point", "pose_with_covariance", "transform", "tf"] = "pose"
-    frame: str | None = None
-    child: str | None = None
+    frame: str | None = None  # the frame the positions are given in; without it, the frame of the first message
+    child: str | None = None  # the marker's frame, for `tf`
 
     @property
     def endpoint(self) -> str:

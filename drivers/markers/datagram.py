@@ -17,27 +17,19 @@ Row = tuple[float, ...]
 
 
 class Datagram(msgspec.Struct, frozen=True):
-    """One position. Keys that are not named here are ignored.
+    """One position. Keys that are not named here are ignored."""
 
-    Attributes:
-        schema: name and version of this layout.
-        position: of the marker, in m unless robot.toml says mm; null where it is not tracked.
-        stamp: time of the measurement on any steady clock of the sender [s].
-        seq: grows by one with each datagram, whatever its body.
-        quaternion: (x, y, z, w) of the marker in the frame of the positions.
-        covariance: of the position (3 × 3), or of position and rotation (6 × 6), as rows or flat.
-        body: name of the body.
-        tracked: false where the position is not a measurement.
-    """
-
-    schema: str
+    schema: str  # name and version of this layout
+    # of the marker, in m unless robot.toml says mm; null where it is not tracked
     position: tuple[float, float, float] | None = None
-    stamp: float | None = None
-    seq: int | None = None
+    stamp: float | None = None  # time of the measurement on any steady clock of the sender [s]
+    seq: int | None = None  # grows by one with each datagram, whatever its body
+    # (x, y, z, w) of the marker in the frame of the positions
     quaternion: tuple[float, float, float, float] | None = None
+    # of the position (3 × 3), or of position and rotation (6 × 6), as rows or flat
     covariance: list[float | Row] | None = None
-    body: str | None = None
-    tracked: bool = True
+    body: str | None = None  # name of the body
+    tracked: bool = True  # false where the position is not a measurement
 
 
 _decode = msgspec.json.Decoder(Datagram).decode

@@ -24,8 +24,6 @@ log = logging.getLogger(__name__)
 
 
 class _Settings:
-    """Settings of the fusion of several marker sources."""
-
     # of waiting for one source before the next is asked
     slice_s: float = 0.004
     # without a position from it, another source leads
@@ -84,7 +82,6 @@ class Member:
         self.forget()
 
     def forget(self) -> None:
-        """Forget all positions."""
         self.fixes: deque[MarkerFix] = deque(maxlen=KEPT)
         self.waiting: deque[tuple[MarkerFix, float]] = deque(maxlen=KEPT)
         self.newest_t = self.fixed_at = -math.inf
@@ -161,7 +158,6 @@ class FusedMarkers:
     """
 
     def __init__(self, members: Sequence[Member], clock: Clock) -> None:
-        """Prepare without opening anything."""
         self.members, self._clock = list(members), clock
         self._opened = ExitStack()
         self._last_t = -math.inf

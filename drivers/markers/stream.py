@@ -23,8 +23,6 @@ from bodyschema.interfaces.waits import POLL_S, RIVAL_AFTER_S, SILENT_AFTER_S
 
 
 class _Settings:
-    """Settings of the checks of a stream of positions."""
-
     lately_s: float = 10.0
     bucket_s: float = 1.0
     # A share of faulty messages below this costs no pairs worth a message to a person.
@@ -107,11 +105,7 @@ class Receiver(Protocol):
     """The wire that messages come over."""
 
     def open(self) -> None:
-        """Open it.
-
-        Raises:
-            SourceError: that is not possible.
-        """
+        """Open it; raise SourceError if that is not possible."""
 
     def close(self) -> None:
         """Close it; again does no harm."""
@@ -136,7 +130,6 @@ class MarkerStream:
     """
 
     def __init__(self, table: SourceTable, receiver: Receiver, decode: Decode, clock: Clock) -> None:
-        """Prepare without opening anything."""
         self._table, self._receiver, self._decode, self._clock = table, receiver, decode, clock
         self.name = table.label
         self._is_open = False

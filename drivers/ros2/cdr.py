@@ -115,7 +115,6 @@ class CdrWriter:
         self._data += raw
 
     def strings(self, texts: tuple[str, ...]) -> None:
-        """Write a sequence of strings."""
         self.uint32(len(texts))
         for text in texts:
             self.string(text)
@@ -131,7 +130,6 @@ class CdrWriter:
         self._numbers("d", 8, values)
 
     def to_bytes(self) -> bytes:
-        """Return the message."""
         return bytes(self._data)
 
     def _numbers(self, kind: str, size: int, values: tuple[float, ...]) -> None:

@@ -19,48 +19,31 @@ TOPIC = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 
 
 class MarkerTopic(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [drivers.ros2.marker]: the topic where the learner publishes the predicted marker position.
+    """The table [drivers.ros2.marker]: the topic where the learner publishes the predicted marker position."""
 
-    Attributes:
-        frame: name of the measurement frame in ROS, in which the positions are given.
-        topic: name of the topic.
-        message: `point` is geometry_msgs/PointStamped, `pose` geometry_msgs/PoseWithCovarianceStamped.
-        rate_hz: highest rate.
-    """
-
-    frame: str
-    topic: str = "/bodyschema/marker"
+    frame: str  # name of the measurement frame in ROS, in which the positions are given
+    topic: str = "/bodyschema/marker"  # name of the topic
+    # `point` is geometry_msgs/PointStamped, `pose` geometry_msgs/PoseWithCovarianceStamped
     message: Literal["point", "pose"] = "point"
-    rate_hz: Positive = 30.0
+    rate_hz: Positive = 30.0  # highest rate
 
 
 class Ros2Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [drivers.ros2].
+    """The table [drivers.ros2]."""
 
-    Attributes:
-        router: where rmw_zenohd, or the zenoh bridge, listens.
-        via: rmw_zenoh, or zenoh-bridge-ros2dds for robots on DDS.
-        domain: ROS_DOMAIN_ID of the robot, for rmw_zenoh.
-        topic: the joint states.
-        names: the name of a joint in ROS, by its name in [robot] joints; joints left out have the same name.
-        max_delay_s: a message is rejected if it arrives this much later than the fastest one.
-        max_gap_s: if several nodes publish the joints, no position is interpolated between two messages farther apart
-            than this.
-        max_speed_deg_s: fastest plausible motion of a joint; a position that would need more is rejected.
-        max_speed_m_s: the same for prismatic joints.
-        marker: publish predictions.
-    """
-
-    router: str = "tcp/127.0.0.1:7447"
-    via: Literal["rmw_zenoh", "ros2dds"] = "rmw_zenoh"
-    domain: Annotated[int, Meta(ge=0, le=232)] = 0
-    topic: str = "/joint_states"
+    router: str = "tcp/127.0.0.1:7447"  # where rmw_zenohd, or the zenoh bridge, listens
+    via: Literal["rmw_zenoh", "ros2dds"] = "rmw_zenoh"  # rmw_zenoh, or zenoh-bridge-ros2dds for robots on DDS
+    domain: Annotated[int, Meta(ge=0, le=232)] = 0  # ROS_DOMAIN_ID of the robot, for rmw_zenoh
+    topic: str = "/joint_states"  # the joint states
+    # the name of a joint in ROS, by its name in [robot] joints; joints left out have the same name
     names: dict[str, str] = {}
-    max_delay_s: Positive = 0.1
+    max_delay_s: Positive = 0.1  # a message is rejected if it arrives this much later than the fastest one
+    # if several nodes publish the joints, no position is interpolated between two messages farther apart than this
     max_gap_s: Positive = 0.1
+    # fastest plausible motion of a joint; a position that would need more is rejected
     max_speed_deg_s: Positive = 600.0
-    max_speed_m_s: Positive = 3.0
-    marker: MarkerTopic | None = None
+    max_speed_m_s: Positive = 3.0  # the same for prismatic joints
+    marker: MarkerTopic | None = None  # publish predictions
 
     def ros_names(self, joints: Sequence[str]) -> tuple[str, ...]:
         """Return the names of `joints` in ROS."""

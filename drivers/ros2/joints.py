@@ -194,19 +194,13 @@ class Ros2Joints:
 
     def __init__(
         self,
-        config: Ros2Config,
+        config: Ros2Config,  # checked; see `Ros2Config.check`
         joints: Sequence[str],
         clock: Clock,
         *,
-        prismatic: Sequence[bool] | None = None,
+        prismatic: Sequence[bool] | None = None,  # True for each prismatic joint; none by default
         open_link: OpenLink = open_zenoh,
     ) -> None:
-        """Prepare without opening anything.
-
-        Args:
-            config: checked; see `Ros2Config.check`.
-            prismatic: True for each prismatic joint; none by default.
-        """
         self._config, self.joints, self._clock, self._open_link = config, tuple(joints), clock, open_link
         self._wanted = config.ros_names(joints)
         slides = [False] * len(joints) if prismatic is None else list(prismatic)

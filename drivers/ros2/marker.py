@@ -26,7 +26,6 @@ class MarkerPublisher:
     """Publisher like a node of rmw_zenoh, visible in `ros2 topic list`. It resumes when the router comes back."""
 
     def __init__(self, config: Ros2Config, marker: MarkerTopic) -> None:
-        """Prepare without opening anything."""
         self._config, self._marker = config, marker
         self._kind = POINT_STAMPED if marker.message == "point" else POSE_WITH_COVARIANCE_STAMPED
         self._session: zenoh.Session | None = None

@@ -15,8 +15,6 @@ TICK_S = 1e-9
 
 
 class _Settings:
-    """Settings of the fit of a sender's clock."""
-
     # 146 years: stamps do not wrap
     ticks: int = 1 << 62
     # a message may be faster than all before by this much

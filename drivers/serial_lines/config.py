@@ -18,20 +18,13 @@ TABLE = "drivers.serial_lines"
 
 
 class EncoderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """An entry [[drivers.serial_lines.encoders]]: the encoder of one joint.
+    """An entry [[drivers.serial_lines.encoders]]: the encoder of one joint."""
 
-    Attributes:
-        joint: its name in [robot] joints.
-        encoder: its name in the board's header; by default the joint's.
-        direction: −1 where the joint counts against the encoder.
-        zero_ticks: the encoder's position where the joint is at 0.
-        ticks_per_turn: value expected in the header; without this key the header's value is used.
-    """
-
-    joint: str
-    encoder: str | None = None
-    direction: Literal[1, -1] = 1
-    zero_ticks: int = 0
+    joint: str  # its name in [robot] joints
+    encoder: str | None = None  # its name in the board's header; by default the joint's
+    direction: Literal[1, -1] = 1  # −1 where the joint counts against the encoder
+    zero_ticks: int = 0  # the encoder's position where the joint is at 0
+    # value expected in the header; without this key the header's value is used
     ticks_per_turn: Annotated[int, Meta(gt=1)] | None = None
 
     @property
@@ -41,25 +34,16 @@ class EncoderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SerialLinesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [drivers.serial_lines].
+    """The table [drivers.serial_lines]."""
 
-    Attributes:
-        port: best one of /dev/serial/by-id, which stays the same when it is plugged in again.
-        encoders: one for each joint.
-        baud: of the board's UART [bit/s].
-        native_usb: the microcontroller has USB itself, so that lines take no time on a wire.
-        delay_ms: from the middle of a measurement to the first byte of its line on the wire.
-        max_speed_deg_s: fastest plausible motion of a joint; a position that would need more is rejected.
-        max_move_deg: how far a joint may move while the board is disconnected, where only the nearest turn determines
-            it.
-    """
-
-    port: str
-    encoders: Annotated[tuple[EncoderConfig, ...], Meta(min_length=1)]
-    baud: Annotated[int, Meta(ge=9600, le=4_000_000)] = 115_200
-    native_usb: bool = False
-    delay_ms: NonNegative = 0.0
+    port: str  # best one of /dev/serial/by-id, which stays the same when it is plugged in again
+    encoders: Annotated[tuple[EncoderConfig, ...], Meta(min_length=1)]  # one for each joint
+    baud: Annotated[int, Meta(ge=9600, le=4_000_000)] = 115_200  # of the board's UART [bit/s]
+    native_usb: bool = False  # the microcontroller has USB itself, so that lines take no time on a wire
+    delay_ms: NonNegative = 0.0  # from the middle of a measurement to the first byte of its line on the wire
+    # fastest plausible motion of a joint; a position that would need more is rejected
     max_speed_deg_s: Positive = 600.0
+    # how far a joint may move while the board is disconnected, where only the nearest turn determines it
     max_move_deg: Annotated[float, Meta(gt=0, lt=180)] = 30.0
 
     def check(self, joints: Sequence[str], file: Path, text: str) -> None:

@@ -12,7 +12,6 @@ from typing import Self
 from bodyschema.drivers.checks import MANY_TROUBLES, READ_S, Check, aligned, warned
 from bodyschema.drivers.echo import BITS_PER_BYTE, Port, close_quietly
 from bodyschema.drivers.serial_line import RETRY_S, SerialLine
-from bodyschema.drivers.serial_lines.config import SerialLinesConfig
 from bodyschema.drivers.turn_count import LOST_AFTER_S, TurnCount
 from bodyschema.drivers.turns import SpeedGate
 from bodyschema.interfaces.errors import SourceError, SourceLost
@@ -20,15 +19,13 @@ from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import JointReading, frozen_array
 
 from .board import Board, Counts, Timed
-from .config import TABLE, EncoderConfig
+from .config import TABLE, EncoderConfig, SerialLinesConfig
 from .lines import ASK_HEADER, Header
 
 log = logging.getLogger(__name__)
 
 
 class _Settings:
-    """Settings of the reading of an encoder board."""
-
     # an Arduino restarts when its port is opened, which takes two seconds
     header_s: float = 4.0
     anchor_s: float = 2.0
@@ -58,12 +55,10 @@ class Encoder:
 
     @property
     def joint(self) -> str:
-        """The joint's name."""
         return self.config.joint
 
     @property
     def label(self) -> str:
-        """Name of the encoder, for messages."""
         return f"encoder {self.config.name!r}"
 
     @property
@@ -72,11 +67,9 @@ class Encoder:
         return 2 * math.pi / self.ticks_per_turn
 
     def angle(self, ticks: int) -> float:
-        """Return the joint angle [rad] at a position with its turns [ticks]."""
         return self.config.direction * (ticks - self.config.zero_ticks) * self.rad_per_tick
 
     def ticks(self, angle: float) -> float:
-        """Return the position [ticks] at a joint angle [rad]."""
         return self.config.zero_ticks + self.config.direction * angle / self.rad_per_tick
 
 
@@ -96,21 +89,15 @@ class SerialLineJoints:
 
     def __init__(
         self,
-        config: SerialLinesConfig,
+        config: SerialLinesConfig,  # checked; see `SerialLinesConfig.check`
         joints: Sequence[str],
         clock: Clock,
         *,
+        # of each joint [rad]; a range below one turn determines the turn
         limits: Sequence[tuple[float, float]] | None = None,
-        last_pose: Sequence[float] | None = None,
+        last_pose: Sequence[float] | None = None,  # last joint angles [rad], shape (d,), from which turns are counted
         open_port: OpenPort = open_serial,
     ) -> None:
-        """Prepare without opening anything.
-
-        Args:
-            config: checked; see `SerialLinesConfig.check`.
-            limits: of each joint [rad]; a range below one turn determines the turn.
-            last_pose: last joint angles [rad], shape (d,), from which turns are counted.
-        """
         self._config, self.joints, self._clock, self._open_port = config, tuple(joints), clock, open_port
         by_joint = {encoder.joint: encoder for encoder in config.encoders}
         self._wanted = [by_joint[joint] for joint in joints]

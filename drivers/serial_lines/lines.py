@@ -31,8 +31,6 @@ class GarbledLine(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """Header of a board."""
-
     boot: int  # a new random number at each start
     encoders: dict[str, int]  # by name, ticks after which the reading repeats
 

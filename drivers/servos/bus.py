@@ -22,8 +22,6 @@ LARGEST_RETURN_DELAY_S = 0xFF * RETURN_DELAY_UNIT_S
 
 
 class _Settings:
-    """Settings of the timing of a servo bus."""
-
     # an answer within this share of its time on the wire belongs to another request
     too_early: float = 0.9
     quiet_s: float = 2e-3
@@ -92,7 +90,6 @@ class Counts:
     troubles: dict[Trouble, int] = field(default_factory=dict)
 
     def add(self, trouble: Trouble | None) -> None:
-        """Count one exchange."""
         self.exchanges += 1
         if trouble is not None:
             self.troubles[trouble] = self.troubles.get(trouble, 0) + 1
@@ -187,7 +184,6 @@ class Bus(ABC):
         return self.tell(model.protocol, self.packets_of(model.protocol).write(id, register.address, data), id)
 
     def ping(self, model: Model, id: int) -> Exchange:
-        """Ping a servo."""
         packets = self.packets_of(model.protocol)
         return self.ask(Request(lambda _: packets.ping(id), (id,), packets.ping_size, model.protocol))
 

@@ -10,16 +10,13 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Protocol
 
-from bodyschema.drivers.servos.bus import Bus
 from bodyschema.drivers.servos.handshake import IdentifiedServo
 from bodyschema.interfaces.records import JointReading
 
-from .bus import Answer
+from .bus import Answer, Bus
 
 
 class _Settings:
-    """Settings of the checks of one servo's readings."""
-
     # A position this far off the extrapolated one is requested again. Rounding of three positions alone makes two
     # ticks.
     surprise_rad: float = math.radians(0.35)
@@ -56,19 +53,13 @@ class Sample:
 
 
 class Channel(ABC):
-    """The answers of one servo since the bus was opened.
-
-    Attributes:
-        newest: the last accepted sample.
-        doubts: number of consecutive rejected answers.
-        surprising: the newest sample deviates from the trend of the two before it.
-    """
+    """The answers of one servo since the bus was opened."""
 
     def __init__(self, servo: IdentifiedServo) -> None:
         self.servo = servo
-        self.newest: Sample | None = None
-        self.doubts = 0
-        self.surprising = True
+        self.newest: Sample | None = None  # the last accepted sample
+        self.doubts = 0  # number of consecutive rejected answers
+        self.surprising = True  # the newest sample deviates from the trend of the two before it
         self._trend: tuple[float, float, float] | None = None
         self._speed = 0.0
         self._off_course = max(_Settings.surprise_rad / servo.model.rad_per_tick, _Settings.surprise_ticks)

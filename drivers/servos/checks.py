@@ -10,7 +10,6 @@ from typing import Any
 
 from bodyschema.drivers.checks import MANY_TROUBLES, READ_S, Check, warned
 from bodyschema.drivers.echo import without_echo
-from bodyschema.drivers.servos.vendor import plans_of
 from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.protocols import Clock
 
@@ -18,7 +17,7 @@ from .bus import Bus, Request
 from .config import ServosConfig
 from .handshake import Finding, IdentifiedServo, ask_again, identify
 from .joints import OpenPort, open_serial
-from .vendor import ServoVendor
+from .vendor import ServoVendor, plans_of
 
 IDENTIFY_S = 1.0  # servos not yet asked by then are not asked any more
 FEW_PER_S = 100.0

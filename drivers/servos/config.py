@@ -43,45 +43,29 @@ def require_each(joints: Sequence[str], given: Sequence[str], what: str, table: 
 
 
 class ServoConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """An entry of servos: the servo of one joint.
+    """An entry of servos: the servo of one joint."""
 
-    Attributes:
-        joint: its name in [robot] joints.
-        id: the servo's number on its bus.
-        model: as its maker writes it; it tells the protocol.
-        bus: needed where there are several.
-        direction: −1 where the joint counts against the servo.
-        zero_ticks: the servo's position where the joint is at 0, also between two ticks; by default the middle of its
-            range.
-    """
-
-    joint: str
-    id: Annotated[int, Meta(ge=0, le=252)]
-    model: str
-    bus: str | None = None
-    direction: Literal[1, -1] = 1
+    joint: str  # its name in [robot] joints
+    id: Annotated[int, Meta(ge=0, le=252)]  # the servo's number on its bus
+    model: str  # as its maker writes it; it tells the protocol
+    bus: str | None = None  # needed where there are several
+    direction: Literal[1, -1] = 1  # −1 where the joint counts against the servo
+    # the servo's position where the joint is at 0, also between two ticks; by default the middle of its range
     zero_ticks: int | float | None = None
 
 
 class ServosConfig(msgspec.Struct, Generic[BusT], frozen=True, forbid_unknown_fields=True):
-    """The table of a make.
-
-    Attributes:
-        rate_hz: readings are not asked for more often than this.
-        max_speed_deg_s: no joint moves faster; a position that would need it is not believed.
-        max_move_deg: how far a joint may have been moved while the bus was away, where only the nearest turn tells.
-        restore_torque: switch torque on again at the end where it was on at the start, holding the pose of the end.
-    """
-
     table: ClassVar[str]
     models: ClassVar[Mapping[str, Model]]
     unsupported: ClassVar[Collection[str]] = ()
 
     buses: dict[str, BusT]
     servos: Annotated[tuple[ServoConfig, ...], Meta(min_length=1)]
-    rate_hz: Positive = 250.0
-    max_speed_deg_s: Positive = 600.0
+    rate_hz: Positive = 250.0  # readings are not asked for more often than this
+    max_speed_deg_s: Positive = 600.0  # no joint moves faster; a position that would need it is not believed
+    # how far a joint may have been moved while the bus was away, where only the nearest turn tells
     max_move_deg: Annotated[float, Meta(gt=0, lt=180)] = 30.0
+    # switch torque on again at the end where it was on at the start, holding the pose of the end
     restore_torque: bool = False
 
     def bus_of(self, servo: ServoConfig) -> str:
@@ -89,7 +73,6 @@ class ServosConfig(msgspec.Struct, Generic[BusT], frozen=True, forbid_unknown_fi
         return next(iter(self.buses)) if servo.bus is None else servo.bus
 
     def model_of(self, servo: ServoConfig) -> Model:
-        """Return the configured model of the servo."""
         return self.models[servo.model]
 
     def check(self, joints: Sequence[str], file: Path, text: str) -> None:

@@ -27,8 +27,6 @@ SCAN = "`bodyschema scan --robot robot.toml` looks for them at all rates and IDs
 
 @dataclass(frozen=True, slots=True)
 class IdentifiedServo:
-    """A servo as it was found."""
-
     joint: str  # whose angle it tells
     bus: str  # the name of its bus
     id: int

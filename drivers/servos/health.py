@@ -6,15 +6,13 @@ import logging
 from collections.abc import Iterable, Mapping, Sequence
 
 from bodyschema.drivers.servos.bus import Bus, Exchange, Request
-from bodyschema.drivers.servos.channel import Drive
-from bodyschema.drivers.servos.handshake import IdentifiedServo
 from bodyschema.drivers.servos.scan import VOLT_PER_UNIT
 from bodyschema.interfaces.errors import SourceLost
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.servos import ServoStatus
 
-from .channel import Sample
-from .handshake import Finding
+from .channel import Drive, Sample
+from .handshake import Finding, IdentifiedServo
 from .model import Register
 
 log = logging.getLogger(__name__)

@@ -14,9 +14,6 @@ from typing import Any, Self
 
 from bodyschema.drivers.echo import Port, close_quietly, without_echo
 from bodyschema.drivers.serial_line import SerialLine, adapter_latency_s
-from bodyschema.drivers.servos.channel import Drive
-from bodyschema.drivers.servos.health import Inspection
-from bodyschema.drivers.servos.vendor import Plan, plans_of
 from bodyschema.drivers.turn_count import LOST_AFTER_S, TurnCount
 from bodyschema.drivers.turns import SpeedGate
 from bodyschema.interfaces.errors import SourceError, SourceLost
@@ -25,18 +22,16 @@ from bodyschema.interfaces.records import JointReading, frozen_array
 from bodyschema.interfaces.servos import BusStatus, ServoStatus
 
 from .bus import Bus, Counts, Request
-from .channel import Channel, Punctuality, Sample, middle
+from .channel import Channel, Drive, Punctuality, Sample, middle
 from .config import AnyBus, ServosConfig
 from .handshake import RETRY_S, IdentifiedServo, identify, require_all, restore_torque, switch_torque_off
-from .health import Health
-from .vendor import ServoVendor
+from .health import Health, Inspection
+from .vendor import Plan, ServoVendor, plans_of
 
 log = logging.getLogger(__name__)
 
 
 class _Settings:
-    """Settings of the reading of servos."""
-
     # this many must fail as well: the program itself may have been delayed
     few_polls: int = 3
     # consecutive implausible answers after which the servo was restarted
@@ -77,23 +72,16 @@ class ServoJoints:
 
     def __init__(
         self,
-        config: ServosConfig[Any],
+        config: ServosConfig[Any],  # checked; see `ServosConfig.check`
         joints: Sequence[str],
         clock: Clock,
         *,
         open_port: OpenPort = open_serial,
+        # of each joint [rad]; a range below one turn determines the turn
         limits: Sequence[tuple[float, float]] | None = None,
-        last_pose: Sequence[float] | None = None,
-        drives: Sequence[Drive] = (),
+        last_pose: Sequence[float] | None = None,  # last joint angles [rad], shape (d,), from which turns are counted
+        drives: Sequence[Drive] = (),  # may move joints on request; without any, torque stays off
     ) -> None:
-        """Prepare without opening anything.
-
-        Args:
-            config: checked; see `ServosConfig.check`.
-            limits: of each joint [rad]; a range below one turn determines the turn.
-            last_pose: last joint angles [rad], shape (d,), from which turns are counted.
-            drives: may move joints on request; without any, torque stays off.
-        """
         self._config, self.joints, self._clock = config, tuple(joints), clock
         self._open_port, self.drives = open_port, tuple(drives)
         by_joint = {servo.joint: servo for servo in config.servos}

@@ -78,8 +78,6 @@ class Layout:
 
 @dataclass(frozen=True, slots=True)
 class Model:
-    """One model of servo."""
-
     number: int  # its model number
     name: str  # as its maker writes it
     series: str  # the series it belongs to

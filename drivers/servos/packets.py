@@ -37,17 +37,11 @@ class Packets(Protocol):
     is_weak: bool
     pinged_only: str
 
-    def ping(self, id: int) -> bytes:
-        """Build PING."""
-        ...
+    def ping(self, id: int) -> bytes: ...
 
-    def read(self, id: int, address: int, size: int) -> bytes:
-        """Build READ."""
-        ...
+    def read(self, id: int, address: int, size: int) -> bytes: ...
 
-    def write(self, id: int, address: int, data: bytes) -> bytes:
-        """Build WRITE."""
-        ...
+    def write(self, id: int, address: int, data: bytes) -> bytes: ...
 
     def take(self, received: bytes | bytearray, at: int) -> Status | None:
         """Return the status packet that begins at `at`; None when it is incomplete.

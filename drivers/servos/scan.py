@@ -38,7 +38,6 @@ class Kind:
 
     @property
     def packets(self) -> Packets:
-        """The packet codec."""
         return self.bus.packets_of(self.version)
 
     def told(self, head: bytes, id: int) -> Identity | None:
@@ -72,7 +71,6 @@ class PingScanner:
     """
 
     def __init__(self, *kinds: Kind) -> None:
-        """Scan for `kinds`."""
         self._kinds, self._packets = kinds, kinds[0].packets
         self._ping_sizes = (len(self._packets.ping(0)), self._packets.overhead + self._packets.ping_size)
 
@@ -214,7 +212,6 @@ def heard(port: Port, clock: Clock, end: float, enough: int | None = None) -> by
 
 
 def open_line(port: str, baud: int, clock: Clock) -> Port:
-    """Open a real port."""
     return SerialLine.open(port, baud, clock.now)
 
 

@@ -7,11 +7,10 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from bodyschema.drivers.servos.bus import Bus, Request
-from bodyschema.drivers.servos.handshake import ATTEMPTS
 
 from .channel import Channel
 from .config import ServosConfig
-from .handshake import IdentifiedServo
+from .handshake import ATTEMPTS, IdentifiedServo
 from .model import Model
 from .settings import Setting
 
@@ -77,8 +76,6 @@ def one_by_one(bus: Bus, servos: Sequence[IdentifiedServo]) -> Way:
 
 @dataclass(frozen=True, slots=True)
 class ServoVendor:
-    """A servo vendor."""
-
     table: str  # its table in robot.toml
     models: Mapping[int, Model] = field(repr=False)  # by number
     errors: Mapping[int, str]  # meaning and remedy of each bit of the hardware error

@@ -27,8 +27,6 @@ OpenAt = Callable[[str, int], tuple[Port, float]]
 
 
 class Outcome(StrEnum):
-    """Outcome of a change."""
-
     WRITTEN = "written"
     KEPT = "not written"
     OTHER = "something else stands there"
@@ -190,7 +188,6 @@ class EepromEditor:
             self._tell(bus, servo, servo.model.layout[LOCK], 0)
 
     def _locked(self, bus: Bus, done: Done) -> Done:
-        """Lock the EEPROM again, if it has a lock."""
         servo = done.change.servo
         if LOCK not in servo.model.layout or done.outcome is Outcome.UNKNOWN:
             return done

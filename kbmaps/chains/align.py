@@ -18,8 +18,6 @@ from kbmaps.rotations import cross_matrix, exponentials, nearest_rotation, rotat
 
 
 class _Settings:
-    """Settings of the alignment."""
-
     rounds: int = 60
     start_pairs: int = 300
     step_tolerance: float = 1e-12

@@ -15,8 +15,6 @@ from kbmaps.rotations import cross_matrix, exponentials, rotation_vectors
 
 
 class _Settings:
-    """Settings of the fit of a placement."""
-
     steps: int = 30
     # Weights start nearly as in least squares; their scale halves with each step down to this many sigma.
     first_reach: float = 32.0

@@ -27,8 +27,6 @@ _EYE = np.eye(3)
 
 
 class _Settings:
-    """Settings of the filter."""
-
     tool_unit = 0.1  # scale of the marker's position where its tolerance is 0, so that a tool change can loosen it [m]
     # Relinearise, at most this often, while the last step's curvature may move the marker by this share of the noise.
     iterations, small_bend = 5, 0.1

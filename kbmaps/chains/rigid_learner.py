@@ -33,8 +33,6 @@ from kbmaps.variance_components import error_covariances, inverse_roots, tells_d
 
 
 class _Settings:
-    """Settings of the learner's steps."""
-
     # A direction is open if at least this share of the prior's variance remains.
     open: float = 0.5
     # No step along a direction changes a parameter by more than this [rad, m]: beyond, the second order does not hold.
@@ -352,11 +350,7 @@ class RigidLearner(Model):
         return arrays | {"shape": self._shape} if self._shaped else arrays
 
     def restore(self, arrays: Mapping[str, FloatArray]) -> None:
-        """Resume with stored pairs.
-
-        Raises:
-            ModelFormatError: they are missing, or not pairs.
-        """
+        """Resume with stored pairs."""
         self._q, self._x, self._sigma = stored_pairs(arrays, self.joints)
         shape = arrays.get("shape", np.broadcast_to(np.eye(3), (self.pairs, 3, 3)))
         if shape.shape != (self.pairs, 3, 3) or not np.isfinite(shape).all():

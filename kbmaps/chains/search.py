@@ -18,8 +18,6 @@ from kbmaps.rotations import cross_matrix
 
 
 class _Settings:
-    """Settings of the search for a chain."""
-
     steps: int = 150
     first_damping: float = 1e-2
     least_damping: float = 1e-14

@@ -16,8 +16,6 @@ from kbmaps.robust import CLIPPED_SIGMAS
 
 
 class _Settings:
-    """Settings of the model of bends."""
-
     # Correlation length of a bend [rad of all joints together], its size over the noise of a pair, the marker's motion
     # from a joint's own error over that noise, and the noise over its nominal value. All are equally probable, except
     # an arm without bends and such errors, which is as probable as all others together.

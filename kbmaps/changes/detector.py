@@ -19,8 +19,6 @@ from kbmaps.variance_components import inverse_roots
 
 
 class _Settings:
-    """Settings of the detector of changes."""
-
     # Each of the newest pairs may be the first of a change; older onsets are thinned to this share of their age.
     spacing: float = 0.15
     slots: int = 96

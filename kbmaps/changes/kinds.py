@@ -68,7 +68,6 @@ def change_kinds(parameters: ChainParameters, distance_m: float) -> tuple[Change
     """Return the kinds tool, camera, and each joint's offset, equally probable; the joints share one third.
 
     Args:
-        parameters: of the chain.
         distance_m: usual distance from the camera to the marker [m].
     """
     camera = np.r_[parameters.base_turn, parameters.base_shift]

@@ -52,7 +52,6 @@ def explanations(
 
     Args:
         before: posterior of the chain from the pairs before the change.
-        kinds: the kinds of change.
         q: pairs since then, joint values (n, d) [rad, m].
         x: the part of the measured positions (n, 3) [m] that the chain shall explain.
         noise_m: 1-sigma of a coordinate [m].

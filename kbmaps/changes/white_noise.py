@@ -91,8 +91,6 @@ def _outer(derivatives: FloatArray) -> FloatArray:
 
 
 class _Settings:
-    """Settings of the estimate of shared noise."""
-
     # Default number of neighbours of a path that share a model's error: 20 degrees of it.
     usually_shared: int = 10
     # Sums over longer lags than this, or than this share of the series, would be dominated by noise.

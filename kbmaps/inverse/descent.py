@@ -14,8 +14,6 @@ _ROUNDS_A_JOINT = 6
 
 
 class _Settings:
-    """Settings of the descent."""
-
     # The damping is this share of the error's square, times a factor adapted to the gain of the last steps.
     first_share: float = 0.1
     least_share: float = 1e-4

@@ -60,8 +60,6 @@ class PoseGoal:
 
 
 class _Settings:
-    """Settings of the inverse kinematics."""
-
     samples: int = 4096
     starts: int = 16
     pose_starts: int = 48

@@ -200,10 +200,7 @@ class KernelFit:
         self._multipliers = multipliers + self._gram.solve(remaining)
 
     def _explain_exactly(self) -> None:
-        """Compute the smallest coefficients that explain the errors.
-
-        Iterated Tikhonov, as `ExactLearner` without λ.
-        """
+        """Compute the smallest coefficients that explain the errors. Iterated Tikhonov, as `ExactLearner` without λ."""
         errors = self._seen.errors
         ridge = _Settings.vanishing_ridge * self._gram.trace
         while not self._gram.factorise(ridge):

@@ -104,11 +104,7 @@ class KeptPairs:
         return len(self.q)
 
     def checked(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return checked pairs for `add`.
-
-        Raises:
-            ShapeError, NonFiniteError, SettingError: it is no such array.
-        """
+        """Return checked pairs for `add`; raise ShapeError, NonFiniteError, SettingError for other arrays."""
         return checked_pairs(q, x, sigma, self.q.shape[1])
 
     def add(self, q: FloatArray, x: FloatArray, sigma: FloatArray, model: Predictor) -> None:

@@ -289,11 +289,7 @@ def learning_bases(
 
 
 def check_bases(bases: Sequence[JointBasis], prismatic: Sequence[bool]) -> None:
-    """Check bases for joints of these kinds.
-
-    Raises:
-        BasisError: wrong number of bases, or one of the wrong kind.
-    """
+    """Check bases for joints of these kinds; raise BasisError for a wrong number of bases, or one of the wrong kind."""
     if len(bases) != len(prismatic):
         raise BasisError(f"need {len(prismatic)} bases, one a joint; got {len(bases)}")
     for k, (basis, slides) in enumerate(zip(bases, prismatic, strict=True)):

@@ -20,8 +20,6 @@ from kbmaps.maps.stack import BasisStack
 
 
 class _Settings:
-    """Settings of the choice by blocks."""
-
     most_blocks: int = 20
     # Precision used while there are too few pairs for blocks.
     first_precision: float = 1e-3

@@ -23,8 +23,6 @@ from kbmaps.robust import VARIANCE_FLOOR
 
 
 class _Settings:
-    """Settings of the exact least squares."""
-
     # Below this reciprocal condition number a triangular solve would return rounding errors.
     smallest_rcond: float = 1e-13
     # The same for a Gram matrix, of which the refinement through the pairs needs only the first digits.

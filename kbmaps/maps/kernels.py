@@ -71,7 +71,6 @@ class FilterKernel(Protocol):
 
     def linearise(self, change: FloatArray, q: FloatArray, x: FloatArray, jacobian: FloatArray | None, /) -> None:
         """Write positions to x (n, 3), and derivatives by the active parameters to jacobian (n, 3, p) unless None."""
-        ...
 
 
 class _Compiled(Protocol):

@@ -44,10 +44,7 @@ class BasisStack:
 
     @property
     def tables(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Constant inputs of `joint_weights`.
-
-        Half phases (2, d), mixing matrices (d, 3, 3), 1 where prismatic (d,).
-        """
+        """Constant inputs of `joint_weights`. Half phases (2, d), mixing matrices (d, 3, 3), 1 where prismatic (d,)."""
         return np.ascontiguousarray(self._half_phases), self._mix, self._slides.astype(np.float64)
 
     # Tables of 3^(d/2) entries per joint, built on first use: a tensor train of 30 joints does not need them.

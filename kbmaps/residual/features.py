@@ -25,8 +25,6 @@ SMOOTH_GROUPS = ("one joint", "two joints", "three joints")
 
 
 class _Settings:
-    """Settings of the residual's features."""
-
     # Larger groups are left out: arms of many joints then use the lower orders only.
     most_features: int = 500
     # With more joints, loads are lumped into two points: the marker and the middle of all joints beyond.

@@ -114,8 +114,6 @@ _FITTED = ("z", "sure", "used", "information", "absorbed")
 
 
 class _Settings:
-    """Settings of the learner's searches."""
-
     # Initial noise of the first fit around a prior, relative to the residuals under the prior.
     first_noise: float = 0.1
     # A refit with this many times the noise of the fit before has diverged, and the search starts again.

@@ -21,8 +21,6 @@ _STDS = np.geomspace(1e-5, 1e-1, 17)
 
 
 class _Settings:
-    """Settings of the posterior of the cores."""
-
     sweeps: int = 2
     rounding: float = 1e-10
     # Minimum of twice the gain in log evidence for a kind of errors; one arm in twelve reaches it by chance.

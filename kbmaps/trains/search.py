@@ -19,8 +19,6 @@ from kbmaps.trains.train import TensorTrain
 
 
 class _Settings:
-    """Settings of the search for cores."""
-
     # Relative to the spread of the positions: smaller residuals are rounding.
     noise_floor: float = 1e-13
     # With residuals below this share of the positions' spread, no further start is needed.

@@ -21,17 +21,11 @@ OTHER_TOOL_M = 0.25
 
 @dataclass(frozen=True, eq=False)
 class KnownArm:
-    """Current knowledge of the arm.
+    """Current knowledge of the arm."""
 
-    Attributes:
-        chain: posterior as a rigid chain.
-        tolerances: those of its prior.
-        residual: posterior as a chain with deviations; None if there is none.
-    """
-
-    chain: ChainBelief
-    tolerances: ChainTolerances
-    residual: ResidualModel | None = None
+    chain: ChainBelief  # posterior as a rigid chain
+    tolerances: ChainTolerances  # those of its prior
+    residual: ResidualModel | None = None  # posterior as a chain with deviations; None if there is none
 
     @classmethod
     def from_bytes(cls, chain: bytes, tolerances: ChainTolerances, residual: bytes | None) -> KnownArm:
@@ -60,8 +54,6 @@ class KnownArm:
 
 
 class _Settings:
-    """Settings of the adaptation to a change."""
-
     # An unnamed change widens every kind at least this probable.
     improbable: float = 0.02
     # 1-sigma of the changed part: this multiple of its most probable change, and at least this many noises.
@@ -77,17 +69,11 @@ class _Settings:
 
 @dataclass(frozen=True, eq=False)
 class Adapted:
-    """State from which learning continues.
+    """State from which learning continues."""
 
-    Attributes:
-        prior: the map to learn on top of.
-        arm: prior of the arm before the first pair since the change.
-        belief: posterior of the chain after these pairs.
-    """
-
-    prior: KBMap
-    arm: KnownArm
-    belief: ChainBelief
+    prior: KBMap  # the map to learn on top of
+    arm: KnownArm  # prior of the arm before the first pair since the change
+    belief: ChainBelief  # posterior of the chain after these pairs
 
 
 class Origin:

@@ -19,8 +19,6 @@ from kbmaps.variance_components import inverse_roots
 
 
 class _Settings:
-    """Settings of the monitor of changes."""
-
     # Minimum number of pairs of a reference model: with fewer it may be too far off.
     fewest_known: int = 100
     # A newer model replaces the reference after half as many pairs as it knows, within these limits. It would absorb a
@@ -44,30 +42,19 @@ LOOK_AGAIN, GROWN_ODDS = 1.25, 4.0
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """Model fitted to none of the monitored pairs, with its posterior.
+    """Model fitted to none of the monitored pairs, with its posterior."""
 
-    Attributes:
-        model: the answering model.
-        map: the best KB-Map.
-        belief: posterior of the chain.
-        wide: the same without the selection of narrower tolerances.
-        residual: posterior of the arm beyond that; None without any.
-        claim: predictive uncertainty of the model.
-        known: number of pairs it knows.
-        q, x: some of the last of these, in their order (n, d) [rad] and (n, 3) [m].
-        variance: of these measurements, as claimed (3,) [m²].
-    """
-
-    model: LearntModel
-    map: KBMap
-    belief: ChainBelief
-    wide: ChainBelief
-    residual: ResidualModel | None
-    claim: PredictiveUncertainty
-    known: int
+    model: LearntModel  # the answering model
+    map: KBMap  # the best KB-Map
+    belief: ChainBelief  # posterior of the chain
+    wide: ChainBelief  # the same without the selection of narrower tolerances
+    residual: ResidualModel | None  # posterior of the arm beyond that; None without any
+    claim: PredictiveUncertainty  # predictive uncertainty of the model
+    known: int  # number of pairs it knows
+    # q, x: some of the last of these, in their order (n, d) [rad] and (n, 3) [m]
     q: FloatArray
     x: FloatArray
-    variance: FloatArray
+    variance: FloatArray  # of these measurements, as claimed (3,) [m²]
 
     def beyond_chain(self, q: FloatArray) -> FloatArray:
         """Return positions (n, 3) [m] of the model at q (n, d) [rad] minus those of the chain."""
@@ -107,35 +94,21 @@ class Reference:
 
 @dataclass(frozen=True, eq=False)
 class DetectedChange:
-    """Detected change.
-
-    Attributes:
-        reference: the model before it.
-        kinds: the possible kinds.
-        noise_m: 1-sigma of a coordinate of one measurement around the model [m].
-        shared: number of neighbours that carry as much information as one independent pair.
-        first: the most probable first pair since the change, of those monitored.
-        earliest, latest: its 95 % interval.
-        seqs: sequence numbers of the monitored pairs (n,).
-        kept: True for each of them (n,) that was learnt, not an outlier.
-        q, x: the monitored pairs, (n, d) [rad] and (n, 3) [m].
-        cov: their covariances (n, 3, 3) [m²], as claimed.
-        turns: their orientations, quaternions (n, 4), NaN where a pair has none.
-    """
-
-    reference: Reference
-    kinds: tuple[ChangeKind, ...]
-    noise_m: float
-    shared: float
-    first: int
+    reference: Reference  # the model before it
+    kinds: tuple[ChangeKind, ...]  # the possible kinds
+    noise_m: float  # 1-sigma of a coordinate of one measurement around the model [m]
+    shared: float  # number of neighbours that carry as much information as one independent pair
+    first: int  # the most probable first pair since the change, of those monitored
+    # earliest, latest: its 95 % interval
     earliest: int
     latest: int
-    seqs: tuple[int, ...]
-    kept: tuple[bool, ...]
+    seqs: tuple[int, ...]  # sequence numbers of the monitored pairs (n,)
+    kept: tuple[bool, ...]  # True for each of them (n,) that was learnt, not an outlier
+    # q, x: the monitored pairs, (n, d) [rad] and (n, 3) [m]
     q: FloatArray
     x: FloatArray
-    cov: FloatArray
-    turns: FloatArray
+    cov: FloatArray  # their covariances (n, 3, 3) [m²], as claimed
+    turns: FloatArray  # their orientations, quaternions (n, 4), NaN where a pair has none
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,16 +123,11 @@ class _Watched:
 
 @dataclass(frozen=True, eq=False)
 class _Shown:
-    """Distances of pairs from models that did not know them.
+    """Distances of pairs from models that did not know them."""
 
-    Attributes:
-        q: configurations (n, d) [rad].
-        claimed: covariances of the measurements (n, 3, 3) [m²].
-        off: each against the prediction from the pairs before it (n, 3) [m], without the model's own uncertainty.
-    """
-
-    q: FloatArray
-    claimed: FloatArray
+    q: FloatArray  # configurations (n, d) [rad]
+    claimed: FloatArray  # covariances of the measurements (n, 3, 3) [m²]
+    # each against the prediction from the pairs before it (n, 3) [m], without the model's own uncertainty
     off: FloatArray
 
     def with_newer(self, other: _Shown) -> _Shown:

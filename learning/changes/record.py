@@ -12,38 +12,24 @@ NAMED_WITHIN = 500
 
 
 class KindOfChange(msgspec.Struct, frozen=True):
-    """Kind of change with its probability.
+    """Kind of change with its probability."""
 
-    Attributes:
-        name: `tool`, `camera`, `joint` or `other`.
-        joint: index of the joint (from 0) whose offset changed; None for other kinds.
-        probability: of this kind.
-    """
-
-    name: str
-    joint: int | None
-    probability: float
+    name: str  # `tool`, `camera`, `joint` or `other`
+    joint: int | None  # index of the joint (from 0) whose offset changed; None for other kinds
+    probability: float  # of this kind
 
 
 class ChangeRecord(msgspec.Struct, frozen=True, kw_only=True):
-    """Last change.
+    """Last change."""
 
-    Attributes:
-        first_seq: sequence number of the most probable first pair after it.
-        earliest_seq, latest_seq: 95 % interval of that number.
-        noticed_seq: the pair at which it was detected; of a reported change, the last one before it.
-        found: True if it was detected in the pairs, False if it was reported.
-        kinds: possible kinds, the most probable first.
-        moved_m: motion of the marker at the pairs since, root mean square [m]; None if unknown.
-    """
-
-    first_seq: int
+    first_seq: int  # sequence number of the most probable first pair after it
+    # earliest_seq, latest_seq: 95 % interval of that number
     earliest_seq: int
     latest_seq: int
-    noticed_seq: int
-    found: bool
-    kinds: list[KindOfChange]
-    moved_m: float | None = None
+    noticed_seq: int  # the pair at which it was detected; of a reported change, the last one before it
+    found: bool  # True if it was detected in the pairs, False if it was reported
+    kinds: list[KindOfChange]  # possible kinds, the most probable first
+    moved_m: float | None = None  # motion of the marker at the pairs since, root mean square [m]; None if unknown
 
     @property
     def named(self) -> KindOfChange | None:

@@ -38,19 +38,11 @@ ENTRY_OF_TURN = 0.8165
 
 @dataclass(frozen=True)
 class OrientationSolution:
-    """Solution for all orientations so far.
-
-    Attributes:
-        pairs: number of pairs with an orientation.
-        chain: the rigid chain.
-        map: 12 planes, of which those of e1, e2, e3 count; None if a map would be too large, or the pairs too few.
-        map_noise: 1-sigma of an orientation about one axis around the map [rad].
-    """
-
-    pairs: int
-    chain: OrientedChain
+    pairs: int  # number of pairs with an orientation
+    chain: OrientedChain  # the rigid chain
+    # 12 planes, of which those of e1, e2, e3 count; None if a map would be too large, or the pairs too few
     map: KBMap | None = None
-    map_noise: float = 0.0
+    map_noise: float = 0.0  # 1-sigma of an orientation about one axis around the map [rad]
 
 
 class OrientationSolver:

@@ -38,8 +38,6 @@ LARGEST_NET = 2187
 
 
 class _Settings:
-    """Settings of the solver."""
-
     # Growth of the number of pairs before the next search for the prior's precision.
     retune: float = 1.25
     # Number of pairs that a chain is fitted to, evenly spread.
@@ -60,50 +58,29 @@ FOLDED = _Settings.fitted
 
 @dataclass(frozen=True)
 class Task:
-    """Task of a solver.
-
-    Attributes:
-        number: identifies it.
-        prior: the map to start from, in the bases of the learnt maps.
-        belief: prior of the chain before the first pair of this task.
-        residual: prior of the arm beyond that; None without any.
-        prior_stays: True if the exact map keeps to `prior`, not to the rigid chain: it stands for pairs that are no
-            longer kept.
-        tolerances: those of `belief`, if the pairs may select narrower ones; None: they may not.
-    """
-
-    number: int
-    prior: KBMap
-    belief: ChainBelief
-    residual: ResidualModel | None = None
+    number: int  # identifies it
+    prior: KBMap  # the map to start from, in the bases of the learnt maps
+    belief: ChainBelief  # prior of the chain before the first pair of this task
+    residual: ResidualModel | None = None  # prior of the arm beyond that; None without any
+    # True if the exact map keeps to `prior`, not to the rigid chain: it stands for pairs that are no longer kept
     prior_stays: bool = False
+    # those of `belief`, if the pairs may select narrower ones; None: they may not
     tolerances: ChainTolerances | None = None
 
 
 @dataclass(frozen=True)
 class Solved:
-    """Solution for one model.
+    """Solution for one model."""
 
-    Attributes:
-        task: number of the task it belongs to.
-        pairs: number of pairs of the solution.
-        name: the model; empty if these pairs have no solution.
-        model: None if these pairs have no solution.
-        belief: new posterior of the arm; None if unchanged.
-        last: True if this is the last result of one `solve`.
-        wide: of a rigid chain, its posterior without the selection of narrower tolerances, the one to update with other
-            pairs.
-        orientation: solution for the orientations; None: nothing new.
-    """
-
-    task: int
-    pairs: int
-    name: str = ""
-    model: LearntModel | None = None
-    belief: ChainBelief | ResidualModel | None = None
-    last: bool = True
+    task: int  # number of the task it belongs to
+    pairs: int  # number of pairs of the solution
+    name: str = ""  # the model; empty if these pairs have no solution
+    model: LearntModel | None = None  # None if these pairs have no solution
+    belief: ChainBelief | ResidualModel | None = None  # new posterior of the arm; None if unchanged
+    last: bool = True  # True if this is the last result of one `solve`
+    # of a rigid chain, its posterior without the selection of narrower tolerances, the one to update with other pairs
     wide: ChainBelief | None = None
-    orientation: OrientationSolution | None = None
+    orientation: OrientationSolution | None = None  # solution for the orientations; None: nothing new
 
 
 class Solver(Protocol):
@@ -111,7 +88,6 @@ class Solver(Protocol):
 
     def start(self, task: Task) -> None:
         """Forget all pairs and begin a new task."""
-        ...
 
     def learn(
         self, q: FloatArray, x: FloatArray, cov: FloatArray | None = None, turns: FloatArray | None = None
@@ -124,15 +100,12 @@ class Solver(Protocol):
             cov: their covariances (n, 3, 3) [m²], NaN where a pair has none; None where no pair has any.
             turns: their orientations, quaternions (n, 4), likewise.
         """
-        ...
 
     def solve(self) -> None:
         """Request the solutions of all pairs so far; `poll` returns them one by one, perhaps later."""
-        ...
 
     def poll(self) -> Solved | None:
         """Return the next answer to a `solve`, without waiting."""
-        ...
 
 
 class DirectSolver:
@@ -180,7 +153,6 @@ class DirectSolver:
             self._q, self._x, self._cov = self._q[FOLDED:], self._x[FOLDED:], self._cov[FOLDED:]
 
     def solve(self) -> None:
-        """Solve for all models."""
         self._solved += self.solutions()
 
     def poll(self) -> Solved | None:

@@ -26,15 +26,10 @@ LIKELY = 1.0 / 3.0
 
 @dataclass(frozen=True)
 class Tolerances:
-    """Candidate tolerances of an arm, with their probability.
+    """Candidate tolerances of an arm, with their probability."""
 
-    Attributes:
-        tolerances: of the nominal chain.
-        share: their probability.
-    """
-
-    tolerances: ChainTolerances
-    share: float
+    tolerances: ChainTolerances  # of the nominal chain
+    share: float  # their probability
 
 
 def workmanship(belief: ChainBelief, tolerances: ChainTolerances, q: FloatArray) -> list[Tolerances]:

@@ -108,18 +108,13 @@ class PairReader:
     """Reads a pair store, also while a sampler writes it. Use as a context manager; any thread may read.
 
     Rows that the disk corrupted, or that SQLite cannot read, are skipped.
-
-    Attributes:
-        identity: UUID of the store.
-        joints: names in the order of q.
-        damage: numbers of pairs that could not be read so far.
     """
 
     def __init__(self, file: Path) -> None:
         self.file = file
-        self.identity = ""
-        self.joints: tuple[str, ...] = ()
-        self.damage = Damage()
+        self.identity = ""  # UUID of the store
+        self.joints: tuple[str, ...] = ()  # names in the order of q
+        self.damage = Damage()  # numbers of pairs that could not be read so far
         self._connection: sqlite3.Connection | None = None
         self._columns, self._with_checksums, self._given_up_to = "", True, 0
         self._lock = Lock()

@@ -18,8 +18,6 @@ from bodyschema.sim_backend.rendering.raster import EmptyWorld, Grid, Raster
 
 
 class _Settings:
-    """Settings of the rendered images."""
-
     ball_ambient: float = 0.55
     ball_diffuse: float = 0.4
     specular: float = 0.12

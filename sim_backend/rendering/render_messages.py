@@ -32,12 +32,10 @@ class Setup(msgspec.Struct, frozen=True, tag=True):
 
     @property
     def calibration(self) -> StereoCalibration:
-        """The eyes."""
         return StereoCalibration(self.focal_px, self.principal_point_px, self.baseline_m, self.image_size_px)
 
     @property
     def eyes(self) -> int:
-        """Number of eyes."""
         return len(self.calibration.eyes_m)
 
 

@@ -49,18 +49,13 @@ class Region:
 
 @dataclass(frozen=True, slots=True)
 class Patch:
-    """Connected pixels of the marker's colour.
+    """Connected pixels of the marker's colour."""
 
-    Attributes:
-        box: the pixels' bounding box in the image.
-        centre_px, radius_px: the rough circle, shape (2,) and float [px].
-        fill: share of the enclosing circle that the patch fills.
-    """
-
-    box: Region
+    box: Region  # the pixels' bounding box in the image
+    # centre_px, radius_px: the rough circle, shape (2,) and float [px]
     centre_px: FloatArray
     radius_px: float
-    fill: float
+    fill: float  # share of the enclosing circle that the patch fills
 
     @property
     def is_whole(self) -> bool:
@@ -70,22 +65,14 @@ class Patch:
 
 @dataclass(frozen=True, slots=True)
 class Disc:
-    """The image of a ball.
+    """The image of a ball."""
 
-    Attributes:
-        centre_px: centre of its ellipse, shape (2,) [px].
-        radius_px: radius of the circle of the same area [px].
-        cov_px: covariance of the centre, shape (2, 2) [px²].
-        radius_sigma_px: 1-sigma of the radius [px].
-        level: mean amount of the marker's colour on it [grey levels].
-        unrest: roughness of its contour: deviation from the ellipse in variances of its samples; 0 if not computed.
-    """
-
-    centre_px: FloatArray
-    radius_px: float
-    cov_px: FloatArray
-    radius_sigma_px: float
-    level: float
+    centre_px: FloatArray  # centre of its ellipse, shape (2,) [px]
+    radius_px: float  # radius of the circle of the same area [px]
+    cov_px: FloatArray  # covariance of the centre, shape (2, 2) [px²]
+    radius_sigma_px: float  # 1-sigma of the radius [px]
+    level: float  # mean amount of the marker's colour on it [grey levels]
+    # roughness of its contour: deviation from the ellipse in variances of its samples; 0 if not computed
     unrest: float = 0.0
 
     def is_same_as(self, other: Disc) -> bool:

@@ -36,11 +36,9 @@ class Gate(Protocol):
 
     def follow(self, pixels: ImageArray) -> None:
         """Learn from BGR pixels (height, width, 3) of the middle of a ball that was accepted."""
-        ...
 
     def reset(self) -> None:
         """Forget the learned colour."""
-        ...
 
 
 class ColourGate:

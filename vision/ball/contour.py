@@ -31,21 +31,13 @@ _NOTHING = np.finfo(np.float64).tiny  # keeps from dividing by information that 
 
 @dataclass(frozen=True, slots=True)
 class Limb:
-    """The ball's edge, ray by ray.
+    """The ball's edge, ray by ray."""
 
-    Attributes:
-        rays: cosine and sine of their directions, and 1, shape (n, 3).
-        offset_px: distance of the edge outside the assumed outline, shape (n,) [px].
-        weight: inverse variances of `offset_px`, shape (n,) [1/px²]; 0 where a ray gives no estimate.
-        blur_px: blur of lens and interpolation (1-sigma), estimated from the edge [px].
-        excess: variance of the channels' disagreement relative to that from pixel noise; 1 or more.
-    """
-
-    rays: FloatArray
-    offset_px: FloatArray
-    weight: FloatArray
-    blur_px: float
-    excess: float
+    rays: FloatArray  # cosine and sine of their directions, and 1, shape (n, 3)
+    offset_px: FloatArray  # distance of the edge outside the assumed outline, shape (n,) [px]
+    weight: FloatArray  # inverse variances of `offset_px`, shape (n,) [1/px²]; 0 where a ray gives no estimate
+    blur_px: float  # blur of lens and interpolation (1-sigma), estimated from the edge [px]
+    excess: float  # variance of the channels' disagreement relative to that from pixel noise; 1 or more
 
     @property
     def evenness(self) -> float:

@@ -27,21 +27,15 @@ from .settings import LimbSettings as _Settings
 
 @dataclass(frozen=True, slots=True)
 class Filters:
-    """One filter for each of k textures of the background, over m samples of a ray in units of their noise.
+    """One filter for each of k textures of the background, over m samples of a ray in units of their noise."""
 
-    Attributes:
-        matrix: what samples (n, m) are multiplied by, shape (m, l + 3k). The squares of the first l columns' results
-            make the likelihoods. Then there are k filters for the edge's shift times the contrast and its information,
-            k for the blur's error times the same, and k for the contrast, ball less background at the edge.
-        groups: 1 where a square belongs to a texture, else 0, shape (l, k).
-        log_ratio: logarithms of the covariances' determinants less that of the first texture, shape (k,).
-        information: inverse variances of shift and blur for a contrast of 1, shape (2, k) [1/px²].
-    """
-
+    # what samples (n, m) are multiplied by, shape (m, l + 3k). The squares of the first l columns' results make the
+    # likelihoods. Then there are k filters for the edge's shift times the contrast and its information, k for the
+    # blur's error times the same, and k for the contrast, ball less background at the edge.
     matrix: Float32Array
-    groups: Float32Array
-    log_ratio: Float32Array
-    information: FloatArray
+    groups: Float32Array  # 1 where a square belongs to a texture, else 0, shape (l, k)
+    log_ratio: Float32Array  # logarithms of the covariances' determinants less that of the first texture, shape (k,)
+    information: FloatArray  # inverse variances of shift and blur for a contrast of 1, shape (2, k) [1/px²]
 
     def apply(self, samples: Float32Array) -> tuple[Float32Array, Float32Array]:
         """Return the textures' log-likelihoods (n, k) for samples (n, m), and what the filters find (n, 3, k)."""

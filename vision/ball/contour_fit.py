@@ -18,42 +18,28 @@ from .settings import LimbSettings as _Settings
 
 @dataclass(frozen=True, slots=True)
 class Circle:
-    """Circle whose image under the ellipse's shape is the limb.
+    """Circle whose image under the ellipse's shape is the limb."""
 
-    Attributes:
-        centre_px: shape (2,) [px].
-        radius_px: [px].
-        cov_px: covariance of the centre, shape (2, 2) [px²].
-        radius_sigma_px: 1-sigma of the radius [px].
-        unrest: deviation of the limb from the circle, in slow and quick waves, in variances of its samples; 0 if it is
-            as round as usual.
-        aliased: True if the image was not anti-aliased, so that the fit is unreliable.
-    """
-
-    centre_px: FloatArray
-    radius_px: float
-    cov_px: FloatArray
-    radius_sigma_px: float
+    centre_px: FloatArray  # shape (2,) [px]
+    radius_px: float  # [px]
+    cov_px: FloatArray  # covariance of the centre, shape (2, 2) [px²]
+    radius_sigma_px: float  # 1-sigma of the radius [px]
+    # deviation of the limb from the circle, in slow and quick waves, in variances of its samples; 0 if it is as round
+    # as usual
     unrest: float
-    aliased: bool
+    aliased: bool  # True if the image was not anti-aliased, so that the fit is unreliable
 
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """Result of one fit.
+    """Result of one fit."""
 
-    Attributes:
-        solution: change of the circle's centre and of its radius (3,) [px].
-        inverse: inverse normal matrix (3, 3) [px²].
-        used, weight: weights of the rays (n,) in this fit and in one that would follow [1/px²].
-        residual: of the rays (n,) [px].
-    """
-
-    solution: FloatArray
-    inverse: FloatArray
+    solution: FloatArray  # change of the circle's centre and of its radius (3,) [px]
+    inverse: FloatArray  # inverse normal matrix (3, 3) [px²]
+    # used, weight: weights of the rays (n,) in this fit and in one that would follow [1/px²]
     used: FloatArray
     weight: FloatArray
-    residual: FloatArray
+    residual: FloatArray  # of the rays (n,) [px]
 
 
 def fit_limb(

@@ -19,17 +19,11 @@ from .settings import LimbSettings as _Settings
 
 @dataclass(frozen=True, slots=True)
 class Waves:
-    """Variances per point, in the square of the residuals' unit.
+    """Variances per point, in the square of the residuals' unit."""
 
-    Attributes:
-        slow: in the slowest waves that the fit left in.
-        quick: in those that are quicker.
-        count: effective number of slow waves.
-    """
-
-    slow: float
-    quick: float
-    count: float
+    slow: float  # in the slowest waves that the fit left in
+    quick: float  # in those that are quicker
+    count: float  # effective number of slow waves
 
     @property
     def mean(self) -> float:

@@ -23,11 +23,7 @@ class OneEyeBallTracker:
     """
 
     def __init__(self, calibration: StereoCalibration, config: VisionConfig | None = None) -> None:
-        """Prepare for images of `calibration`.
-
-        Raises:
-            ConfigError: it describes no camera.
-        """
+        """Prepare for images of `calibration`; raise ConfigError if it describes no camera."""
         check_calibration(calibration)
         self.calibration = calibration
         self.config = config or VisionConfig()

@@ -34,66 +34,40 @@ _TRIPLES = np.array(list(combinations(range(_Settings.arcs), 3)))
 
 @dataclass(frozen=True, slots=True)
 class Outline:
-    """A ball's outline, fitted.
+    """A ball's outline, fitted."""
 
-    Attributes:
-        centre_px: centre of the ellipse, shape (2,) [px].
-        radius_px: radius of the circle of the same area [px].
-        cov_px: covariance of the centre, shape (2, 2) [px²].
-        radius_sigma_px: 1-sigma of the radius [px].
-        visible: share of the outline that is not occluded.
-        uneven: share of the outline with a background too uneven to show the edge.
-        off: share of the fit's weights where the outline leaves the ellipse in whole arcs.
-        unrest: deviation of the limb from the ellipse, in variances of its samples; 0 if it was not checked.
-    """
-
-    centre_px: FloatArray
-    radius_px: float
-    cov_px: FloatArray
-    radius_sigma_px: float
-    visible: float
-    uneven: float
-    off: float
-    unrest: float = 0.0
+    centre_px: FloatArray  # centre of the ellipse, shape (2,) [px]
+    radius_px: float  # radius of the circle of the same area [px]
+    cov_px: FloatArray  # covariance of the centre, shape (2, 2) [px²]
+    radius_sigma_px: float  # 1-sigma of the radius [px]
+    visible: float  # share of the outline that is not occluded
+    uneven: float  # share of the outline with a background too uneven to show the edge
+    off: float  # share of the fit's weights where the outline leaves the ellipse in whole arcs
+    unrest: float = 0.0  # deviation of the limb from the ellipse, in variances of its samples; 0 if it was not checked
 
 
 @dataclass(frozen=True, slots=True)
 class _Edges:
-    """Edge of the ball on each ray, in the frame in which the outline is a circle around the rough centre.
+    """Edge of the ball on each ray, in the frame in which the outline is a circle around the rough centre."""
 
-    Attributes:
-        rays: cosine and sine of the rays' directions, and 1, shape (n, 3).
-        distance_px: distance of the edge from the rough centre, shape (n,) [px].
-        weight: weight of each ray, 0..1, shape (n,); 0 if the ray shows no edge.
-        covered: mask (n,) of rays on which something else shows just inside the rough outline.
-        uneven: mask (n,) of rays whose background is too uneven to rule out that an edge elsewhere is the ball's.
-    """
-
-    rays: FloatArray
-    distance_px: FloatArray
-    weight: FloatArray
-    covered: BoolArray
+    rays: FloatArray  # cosine and sine of the rays' directions, and 1, shape (n, 3)
+    distance_px: FloatArray  # distance of the edge from the rough centre, shape (n,) [px]
+    weight: FloatArray  # weight of each ray, 0..1, shape (n,); 0 if the ray shows no edge
+    covered: BoolArray  # mask (n,) of rays on which something else shows just inside the rough outline
+    # mask (n,) of rays whose background is too uneven to rule out that an edge elsewhere is the ball's
     uneven: BoolArray
 
 
 @dataclass(frozen=True, slots=True)
 class _Fit:
-    """Circle through the edges.
-
-    Attributes:
-        solution: shift of its centre and its radius, shape (3,) [px].
-        inverse: inverse normal matrix (3, 3), without the noise's variance.
-        residual: of each ray, shape (n,) [px].
-        used: weight of each ray, 0..1, shape (n,).
-        apart: mask (n,) of rays whose edge is too far off.
-    """
+    """Circle through the edges."""
 
     edges: _Edges
-    solution: FloatArray
-    inverse: FloatArray
-    residual: FloatArray
-    used: FloatArray
-    apart: BoolArray
+    solution: FloatArray  # shift of its centre and its radius, shape (3,) [px]
+    inverse: FloatArray  # inverse normal matrix (3, 3), without the noise's variance
+    residual: FloatArray  # of each ray, shape (n,) [px]
+    used: FloatArray  # weight of each ray, 0..1, shape (n,)
+    apart: BoolArray  # mask (n,) of rays whose edge is too far off
 
 
 def fit_outline(

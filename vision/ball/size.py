@@ -23,7 +23,6 @@ class BallSize:
     """The ball's radius as a share of the configured one."""
 
     def __init__(self, calibration: StereoCalibration) -> None:
-        """Start with the configured radius."""
         self._calibration = calibration
         self._shares: deque[tuple[float, float]] = deque(maxlen=_Settings.memory)
         self._known = self._estimated()

@@ -24,16 +24,11 @@ _LARGEST_ANGLE = math.radians(80.0)
 
 @dataclass(frozen=True, slots=True)
 class Ellipse:
-    """Image of a sphere.
+    """Image of a sphere."""
 
-    Attributes:
-        centre_px: centre of the ellipse, shape (2,) [px].
-        radius_px: radius of the circle of the same area [px].
-        shape: symmetric matrix of determinant 1, shape (2, 2), that turns the circle of that radius into the ellipse.
-    """
-
-    centre_px: FloatArray
-    radius_px: float
+    centre_px: FloatArray  # centre of the ellipse, shape (2,) [px]
+    radius_px: float  # radius of the circle of the same area [px]
+    # symmetric matrix of determinant 1, shape (2, 2), that turns the circle of that radius into the ellipse
     shape: FloatArray
 
 

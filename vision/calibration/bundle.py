@@ -21,26 +21,19 @@ UNDETERMINED = "the views do not determine the lenses. Take more views, tilted a
 
 @dataclass(frozen=True)
 class Bundle:
-    """A solution.
+    """A solution."""
 
-    Attributes:
-        model: the lenses' model.
-        vector: the rig's parameters, as `StereoRig.vector` has them.
-        poses: the board's pose in the left eye's frame for each view, as rotation vector [rad] and position [m],
-            shape (views, 6).
-        residuals: per view, measured minus predicted, shape (corners, 2) [px], the left eye's before the right one's.
-        weights: per view and corner, shape (corners,), of `corner_weights`; 0 for rejected corners.
-        normal: the normal matrix of `vector` with the poses eliminated, for residuals of 1 px.
-        prior: precision of each parameter about 0 before the views, in the same units, shape (p,); 0: none.
-    """
-
-    model: Model
-    vector: FloatArray
+    model: Model  # the lenses' model
+    vector: FloatArray  # the rig's parameters, as `StereoRig.vector` has them
+    # the board's pose in the left eye's frame for each view, as rotation vector [rad] and position [m], shape (views,
+    # 6)
     poses: FloatArray
+    # per view, measured minus predicted, shape (corners, 2) [px], the left eye's before the right one's
     residuals: tuple[FloatArray, ...]
+    # per view and corner, shape (corners,), of `corner_weights`; 0 for rejected corners
     weights: tuple[FloatArray, ...]
-    normal: FloatArray
-    prior: FloatArray
+    normal: FloatArray  # the normal matrix of `vector` with the poses eliminated, for residuals of 1 px
+    prior: FloatArray  # precision of each parameter about 0 before the views, in the same units, shape (p,); 0: none
 
     @property
     def kept(self) -> tuple[FloatArray, ...]:

@@ -34,22 +34,16 @@ _NUMBERS = re.compile(r"-?\d+(\.\d+)?")
 
 @dataclass(frozen=True)
 class Asked:
-    """Request for a calibration.
+    """Request for a calibration."""
 
-    Attributes:
-        image_size_px, serials: of the eyes.
-        date: ISO 8601 in UTC.
-        model: lens model; `auto` takes the simplest that fits, or one that predicts held-out views clearly better.
-        scale_sigma: relative 1-sigma of the board's size.
-        baseline_m: baseline measured by hand, for a check [m].
-    """
-
+    # image_size_px, serials: of the eyes
     image_size_px: tuple[int, int]
     serials: tuple[str, ...]
-    date: str
+    date: str  # ISO 8601 in UTC
+    # lens model; `auto` takes the simplest that fits, or one that predicts held-out views clearly better
     model: ModelChoice = "auto"
-    scale_sigma: float = 0.001
-    baseline_m: float | None = None
+    scale_sigma: float = 0.001  # relative 1-sigma of the board's size
+    baseline_m: float | None = None  # baseline measured by hand, for a check [m]
 
     @property
     def eyes(self) -> tuple[Eye, ...]:
@@ -78,21 +72,14 @@ class Fitted:
 
 @dataclass(frozen=True)
 class Calibrated:
-    """A calibration with the data it was made from.
+    """A calibration with the data it was made from."""
 
-    Attributes:
-        rig: the calibration.
-        fitted: the selected model.
-        rivals_px: held-out error of each candidate model that fits the cameras [px].
-        coverage: image coverage of the views.
-        focal_spread: relative 1-sigma of the focal lengths over the views; None if nothing shows that a lens refocused.
-    """
-
-    rig: Rig
+    rig: Rig  # the calibration
     board: Board
-    fitted: Fitted
-    rivals_px: dict[Model, float]
-    coverage: Coverage
+    fitted: Fitted  # the selected model
+    rivals_px: dict[Model, float]  # held-out error of each candidate model that fits the cameras [px]
+    coverage: Coverage  # image coverage of the views
+    # relative 1-sigma of the focal lengths over the views; None if nothing shows that a lens refocused
     focal_spread: float | None
 
 

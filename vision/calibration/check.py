@@ -29,28 +29,21 @@ class _Settings:
 
 @dataclass(frozen=True)
 class Check:
-    """Result of a check with one view.
+    """Result of a check with one view."""
 
-    Attributes:
-        corners: number of corners seen by both eyes.
-        epipolar_px: RMS difference of the rows at which the two rectified images show a corner [px].
-        rows_px, rows_sigma_px: mean of the differences, and its 1-sigma from calibration and noise [px].
-        roll_deg, roll_sigma_deg: rotation of one eye about its line of sight, from the differences [deg].
-        square_m, square_sigma_m: measured side of the board's squares [m].
-        nominal_m: true side of the board's squares [m].
-        wrong: messages for what no longer holds; empty if the calibration holds.
-    """
-
-    corners: int
-    epipolar_px: float
+    corners: int  # number of corners seen by both eyes
+    epipolar_px: float  # RMS difference of the rows at which the two rectified images show a corner [px]
+    # rows_px, rows_sigma_px: mean of the differences, and its 1-sigma from calibration and noise [px]
     rows_px: float
     rows_sigma_px: float
+    # roll_deg, roll_sigma_deg: rotation of one eye about its line of sight, from the differences [deg]
     roll_deg: float
     roll_sigma_deg: float
+    # square_m, square_sigma_m: measured side of the board's squares [m]
     square_m: float
     square_sigma_m: float
-    nominal_m: float
-    wrong: tuple[str, ...]
+    nominal_m: float  # true side of the board's squares [m]
+    wrong: tuple[str, ...]  # messages for what no longer holds; empty if the calibration holds
 
     @property
     def holds(self) -> bool:

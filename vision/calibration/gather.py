@@ -39,19 +39,14 @@ class Unusable:
 
 @dataclass
 class Gathered:
-    """Views, their images, and the images that could not be used.
-
-    Attributes:
-        image_size_px: of each eye; (0, 0) before the first image.
-        eyes: the eyes in use.
-    """
+    """Views, their images, and the images that could not be used."""
 
     board: Board
-    image_size_px: tuple[int, int] = (0, 0)
+    image_size_px: tuple[int, int] = (0, 0)  # of each eye; (0, 0) before the first image
     views: list[View] = field(default_factory=list)
     images: dict[str, ImagePair] = field(default_factory=dict)
     unusable: list[Unusable] = field(default_factory=list)
-    eyes: tuple[Eye, ...] = EYES
+    eyes: tuple[Eye, ...] = EYES  # the eyes in use
 
     def coverage(self) -> Coverage:
         """Return the image coverage of the views."""

@@ -26,22 +26,15 @@ WANTED_VIEWS = 20
 
 @dataclass(frozen=True)
 class Coverage:
-    """Coverage of the image, of tilts and of distances by the views.
+    """Coverage of the image, of tilts and of distances by the views."""
 
-    Attributes:
-        whole_views: number of views seen by all eyes.
-        cells: corners in each cell of a 3×3 grid, for each eye, shape (eyes, 3, 3).
-        tilts_deg: rough tilt of the board in each whole view about the image's vertical and horizontal axes, shape
-            (n, 2); right edge away and lower edge away are positive.
-        extents: extent of the board in each whole view, as a share of the image.
-        eyes: the eyes in use.
-    """
-
-    whole_views: int
-    cells: NDArray[np.int64]
+    whole_views: int  # number of views seen by all eyes
+    cells: NDArray[np.int64]  # corners in each cell of a 3×3 grid, for each eye, shape (eyes, 3, 3)
+    # rough tilt of the board in each whole view about the image's vertical and horizontal axes, shape (n, 2); right
+    # edge away and lower edge away are positive
     tilts_deg: FloatArray
-    extents: FloatArray
-    eyes: tuple[Eye, ...] = EYES
+    extents: FloatArray  # extent of the board in each whole view, as a share of the image
+    eyes: tuple[Eye, ...] = EYES  # the eyes in use
 
     @classmethod
     def of(

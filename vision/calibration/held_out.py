@@ -19,15 +19,10 @@ from .weights import weighed
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Errors of each view when it was held out, except for its own pose.
+    """Errors of each view when it was held out, except for its own pose."""
 
-    Attributes:
-        squares: sum of squared residuals of each view [px²].
-        freedom: image coordinates of each view minus those its pose takes.
-    """
-
-    squares: FloatArray
-    freedom: NDArray[np.int64]
+    squares: FloatArray  # sum of squared residuals of each view [px²]
+    freedom: NDArray[np.int64]  # image coordinates of each view minus those its pose takes
 
     @property
     def rms_px(self) -> float:

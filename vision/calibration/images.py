@@ -84,11 +84,7 @@ def pair_files(
 
 
 def read_pairs(pairs: list[PairFiles], *, side_by_side: bool) -> Iterator[ImagePair]:
-    """Yield the images, one pair after the other.
-
-    Raises:
-        CalibrationError: a file is no image, or the sizes differ.
-    """
+    """Yield the images, one pair after the other; raise CalibrationError if a file is no image, or the sizes differ."""
     first: tuple[str, tuple[int, int]] | None = None
     for files in pairs:
         left = _read(files.left)
@@ -182,27 +178,17 @@ def write_pair(pair: ImagePair, folder: Path, number: int) -> None:
 
 @dataclass(frozen=True)
 class Images:
-    """Location of the images.
+    """Location of the images."""
 
-    Attributes:
-        folder: the folder.
-        left, right: patterns of the eyes' files.
-        side_by_side: each image shows both eyes.
-        one: all images are of one camera.
-    """
-
-    folder: Path
+    folder: Path  # the folder
+    # left, right: patterns of the eyes' files
     left: str | None = None
     right: str | None = None
-    side_by_side: bool = False
-    one: bool = False
+    side_by_side: bool = False  # each image shows both eyes
+    one: bool = False  # all images are of one camera
 
     def files(self) -> list[PairFiles]:
-        """Return the files that belong together.
-
-        Raises:
-            CalibrationError: there are none.
-        """
+        """Return the files that belong together; raise CalibrationError if there are none."""
         if self.one and (self.right is not None or self.side_by_side):
             raise ConfigError("--one is of one camera alone", remedy="Leave --right and --side-by-side away")
         if (self.left is None) != (self.right is None) and not self.one:

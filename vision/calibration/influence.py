@@ -16,17 +16,11 @@ from .view import View
 
 @dataclass(frozen=True)
 class Influence:
-    """Influence of one view's corners, the left eye's before the right one's.
+    """Influence of one view's corners, the left eye's before the right one's."""
 
-    Attributes:
-        residual: measured minus predicted, shape (corners, 2) [px].
-        by_pose: Jacobian of the prediction by the board's pose, shape (2 corners, 6).
-        free: share of its variance that the fit leaves each corner, shape (corners,).
-    """
-
-    residual: FloatArray
-    by_pose: FloatArray
-    free: FloatArray
+    residual: FloatArray  # measured minus predicted, shape (corners, 2) [px]
+    by_pose: FloatArray  # Jacobian of the prediction by the board's pose, shape (2 corners, 6)
+    free: FloatArray  # share of its variance that the fit leaves each corner, shape (corners,)
 
 
 def influences(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> Iterator[Influence]:

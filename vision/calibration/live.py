@@ -30,38 +30,26 @@ class Outcome(StrEnum):
 
 @dataclass(frozen=True)
 class Look:
-    """Result for one pair of images.
+    """Result for one pair of images."""
 
-    Attributes:
-        outcome: taken as a view; the board moved; a similar view was taken before; or an eye does not see the board and
-            the other one shows nothing new.
-        view: the corners in it.
-        unusable: the eyes that do not see the board, with the reason.
-        pair: the images.
-    """
-
+    # taken as a view; the board moved; a similar view was taken before; or an eye does not see the board and the other
+    # one shows nothing new
     outcome: Outcome
-    view: View
-    unusable: tuple[Unusable, ...]
-    pair: ImagePair
+    view: View  # the corners in it
+    unusable: tuple[Unusable, ...]  # the eyes that do not see the board, with the reason
+    pair: ImagePair  # the images
 
 
 class LiveViews:
     """Selection of views from a stream of image pairs.
 
     A view is taken when both eyes see the board, it has been still for two frames, and no similar view was taken. A
-    view
-    of a single eye is taken if it shows the board in a part of the image that is not covered yet.
-
-    Attributes:
-        found: the views taken, and their images.
-        coverage: image coverage of these views.
+    view of a single eye is taken if it shows the board in a part of the image that is not covered yet.
     """
 
     def __init__(self, board: Board, detector: Detector | None = None, eyes: tuple[Eye, ...] = EYES) -> None:
-        """Start without views."""
-        self.found = Gathered(board, eyes=eyes)
-        self.coverage = self.found.coverage()
+        self.found = Gathered(board, eyes=eyes)  # the views taken, and their images
+        self.coverage = self.found.coverage()  # image coverage of these views
         self._detector = BoardDetector(board) if detector is None else detector
         self._tilts: list[tuple[float, float]] = []
         self._before: View | None = None

@@ -24,13 +24,9 @@ def image_of(eye: Eye, eyes: Sequence[Eye]) -> str:
 
 @dataclass(frozen=True)
 class View:
-    """The board's corners in both eyes' images of one instant; one eye's may be missing.
+    """The board's corners in both eyes' images of one instant; one eye's may be missing."""
 
-    Attributes:
-        name: name of the images.
-    """
-
-    name: str
+    name: str  # name of the images
     left: Corners | None
     right: Corners | None
 

@@ -1,10 +1,9 @@
 """Weights of the corners in the joint fit.
 
 Corners are found to 0.01 px where squares are large, and to 0.1 px where they are small or seen obliquely: far away,
-and
-towards the border of a fisheye image, which determines its lens. With equal weights, the accurate corners would count
-too little. The variance of a corner is therefore estimated from the residuals of corners whose squares are as wide,
-multiplied by the relative level of its own image's residuals.
+and towards the border of a fisheye image, which determines its lens. With equal weights, the accurate corners would
+count too little. The variance of a corner is therefore estimated from the residuals of corners whose squares are as
+wide, multiplied by the relative level of its own image's residuals.
 """
 
 from __future__ import annotations

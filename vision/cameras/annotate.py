@@ -24,16 +24,12 @@ MAGNIFIED = 10  # the row difference is a fraction of a pixel
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """One patch of the marker's colour in one eye.
+    """One patch of the marker's colour in one eye."""
 
-    Attributes:
-        centre_px, radius_px: of the disc, or roughly of the patch if it is no disc.
-        reason: reason why it is no disc, or None.
-    """
-
+    # centre_px, radius_px: of the disc, or roughly of the patch if it is no disc
     centre_px: tuple[float, float]
     radius_px: float
-    reason: Reason | None
+    reason: Reason | None  # reason why it is no disc, or None
 
 
 class Annotator:

@@ -18,17 +18,12 @@ AXES = ((60, 60, 255), (60, 220, 60), (255, 140, 60))  # x, y, z
 
 @dataclass(frozen=True, slots=True)
 class TagSight:
-    """A tag in one eye's image.
-
-    Attributes:
-        corners_px: shape (4, 2), rough if it was refused.
-        reason: reason why it is not measured, or None. is_wanted: True if it belongs to the marker.
-    """
+    """A tag in one eye's image."""
 
     id: int
-    corners_px: FloatArray
-    reason: Reason | None
-    is_wanted: bool
+    corners_px: FloatArray  # shape (4, 2), rough if it was refused
+    reason: Reason | None  # reason why it is not measured, or None
+    is_wanted: bool  # True if it belongs to the marker
 
 
 class TagDrawing:

@@ -26,50 +26,33 @@ ENUMERATED = re.compile(r"\d+|/dev/video\d+")
 
 
 class UvcSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Settings written to a camera when it is opened, and read back afterwards.
+    """Settings written to a camera when it is opened, and read back afterwards."""
 
-    Attributes:
-        image_size_px: width and height of each eye's image.
-        fps: frames per second.
-        fourcc: transfer format: MJPG (compressed) or YUYV (about five times as much).
-        buffers: kernel buffers. A camera that loses every second frame with 1 needs 2.
-        exposure_s: exposure time; without it the camera chooses, and the ball's brightness drifts.
-        gain: in the camera's units, as `v4l2-ctl -l` shows them; without it unchanged.
-        white_balance_k: colour temperature [K]; without it the camera chooses.
-        focus: in the camera's units; without it unchanged. A lens that refocuses changes the calibration.
-    """
-
-    image_size_px: tuple[Side, Side]
-    fps: Positive = 30.0
-    fourcc: Literal["MJPG", "YUYV"] = "MJPG"
+    image_size_px: tuple[Side, Side]  # width and height of each eye's image
+    fps: Positive = 30.0  # frames per second
+    fourcc: Literal["MJPG", "YUYV"] = "MJPG"  # transfer format: MJPG (compressed) or YUYV (about five times as much)
+    # kernel buffers. A camera that loses every second frame with 1 needs 2.
     buffers: Annotated[int, Meta(ge=1, le=10)] = 1
-    exposure_s: Positive | None = None
-    gain: NonNegative | None = None
-    white_balance_k: Positive | None = None
+    exposure_s: Positive | None = None  # exposure time; without it the camera chooses, and the ball's brightness drifts
+    gain: NonNegative | None = None  # in the camera's units, as `v4l2-ctl -l` shows them; without it unchanged
+    white_balance_k: Positive | None = None  # colour temperature [K]; without it the camera chooses
+    # in the camera's units; without it unchanged. A lens that refocuses changes the calibration.
     focus: NonNegative | None = None
 
 
 class OneConfig(UvcSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The table [vision.cameras.one]: a single camera.
+    """The table [vision.cameras.one]: a single camera."""
 
-    Attributes:
-        device: its name in /dev/v4l/by-id or by-path.
-    """
-
-    device: str
+    device: str  # its name in /dev/v4l/by-id or by-path
 
 
 class TwoConfig(UvcSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The table [vision.cameras.two]: one free-running camera for each eye.
+    """The table [vision.cameras.two]: one free-running camera for each eye."""
 
-    Attributes:
-        left, right: the devices, by their names in /dev/v4l/by-id or by-path.
-        max_apart_s: largest time difference of a pair; 0.6 of the frame time without it.
-    """
-
+    # left, right: the devices, by their names in /dev/v4l/by-id or by-path
     left: str
     right: str
-    max_apart_s: Positive | None = None
+    max_apart_s: Positive | None = None  # largest time difference of a pair; 0.6 of the frame time without it
 
     @property
     def longest_apart_s(self) -> float:
@@ -78,90 +61,59 @@ class TwoConfig(UvcSettings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
 
 class SideBySideConfig(UvcSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The table [vision.cameras.side_by_side]: one camera with both eyes in its image, the left one on the left.
+    """The table [vision.cameras.side_by_side]: one camera with both eyes in its image, the left one on the left."""
 
-    Attributes:
-        device: its name in /dev/v4l/by-id or by-path.
-    """
-
-    device: str
+    device: str  # its name in /dev/v4l/by-id or by-path
 
 
 class RealsenseConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The table [vision.cameras.realsense]: the infra-red eyes of a RealSense camera, by the extra `realsense`.
+    """The table [vision.cameras.realsense]: the infra-red eyes of a RealSense camera, by the extra `realsense`."""
 
-    Attributes:
-        serial: its serial number; needed where several are connected.
-        image_size_px: width and height of each eye's image.
-        fps: frames per second.
-        exposure_s: exposure time; without it the camera chooses.
-        gain: in the camera's units; without it unchanged.
-        emitter: keep the projector on. Its dots disturb the tracker.
-        depth_check: compare the marker's depth with the depth image.
-    """
-
-    serial: str | None = None
-    image_size_px: tuple[Side, Side] = (848, 480)
-    fps: Positive = 30.0
-    exposure_s: Positive | None = None
-    gain: NonNegative | None = None
-    emitter: bool = False
-    depth_check: bool = True
+    serial: str | None = None  # its serial number; needed where several are connected
+    image_size_px: tuple[Side, Side] = (848, 480)  # width and height of each eye's image
+    fps: Positive = 30.0  # frames per second
+    exposure_s: Positive | None = None  # exposure time; without it the camera chooses
+    gain: NonNegative | None = None  # in the camera's units; without it unchanged
+    emitter: bool = False  # keep the projector on. Its dots disturb the tracker.
+    depth_check: bool = True  # compare the marker's depth with the depth image
 
 
 class ImagesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The table [vision.cameras.images]: image files instead of cameras, sorted by name.
+    """The table [vision.cameras.images]: image files instead of cameras, sorted by name."""
 
-    Attributes:
-        left, right: patterns relative to robot.toml, such as "left/*.png"; only `left` for a single camera.
-        times: a text file with the time of each pair [s], one a line; or
-        name_ticks_per_s: the last number in each name is its time, in ticks of this rate (1e9: nanoseconds); or
-        fps: gives the time between two.
-        speed: 1 as recorded, 2 twice as fast, 0 as fast as they are read.
-    """
-
+    # left, right: patterns relative to robot.toml, such as "left/*.png"; only `left` for a single camera
     left: str
     right: str | None = None
-    times: str | None = None
+    times: str | None = None  # a text file with the time of each pair [s], one a line
+    # in its place: the last number in each name is its time, in ticks of this rate (1e9: nanoseconds)
     name_ticks_per_s: Positive | None = None
-    fps: Positive | None = None
-    speed: NonNegative = 1.0
+    fps: Positive | None = None  # in the place of both: the rate [1/s]
+    speed: NonNegative = 1.0  # 1 as recorded, 2 twice as fast, 0 as fast as they are read
 
 
 class VideosConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The table [vision.cameras.videos]: video files instead of cameras.
+    """The table [vision.cameras.videos]: video files instead of cameras."""
 
-    Attributes:
-        left, right: a file for each eye, relative to robot.toml; only `left` for a single camera; or
-        side_by_side: one file with both eyes' images in each frame, the left one on the left.
-        times: a text file with the time of each frame [s], one a line; without it the times follow from
-        fps: and without that from the rate in the file.
-        speed: 1 as recorded, 2 twice as fast, 0 as fast as it is read.
-    """
-
+    # left, right: a file for each eye, relative to robot.toml; only `left` for a single camera
     left: str | None = None
     right: str | None = None
-    side_by_side: str | None = None
-    times: str | None = None
-    fps: Positive | None = None
-    speed: NonNegative = 1.0
+    side_by_side: str | None = None  # in their place: one file with both eyes' images in each frame, left and right
+    times: str | None = None  # a text file with the time of each frame [s], one a line
+    fps: Positive | None = None  # in its place: the rate [1/s]; without either that in the file
+    speed: NonNegative = 1.0  # 1 as recorded, 2 twice as fast, 0 as fast as it is read
 
 
 class CamerasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The table [vision.cameras]: source of the images. Exactly one of the six layouts is given.
+    """The table [vision.cameras]: source of the images. Exactly one of the six layouts is given."""
 
-    Attributes:
-        calibration: the file that `bodyschema calibrate cameras` wrote, relative to robot.toml. Without it the
-            images are assumed to be rectified, as [camera] describes.
-        latency_s: time from mid-exposure to the time stamp [s]; `bodyschema calibrate latency` measures it.
-        latency_sigma_s: its 1-sigma; without it 15 ms for devices, 0 for files.
-        readout_s: time from the first to the last row of a rolling shutter [s]; 0 is a global shutter. Without it
-            any from 0 to the time of a frame is allowed for: moving markers are measured with wider claims.
-    """
-
+    # the file that `bodyschema calibrate cameras` wrote, relative to robot.toml. Without it the images are assumed to
+    # be rectified, as [camera] describes.
     calibration: str | None = None
+    # time from mid-exposure to the time stamp [s]; `bodyschema calibrate latency` measures it
     latency_s: Annotated[float, Meta(ge=-1, le=1)] = 0.0
-    latency_sigma_s: NonNegative | None = None
+    latency_sigma_s: NonNegative | None = None  # its 1-sigma; without it 15 ms for devices, 0 for files
+    # time from the first to the last row of a rolling shutter [s]; 0 is a global shutter. Without it any from 0 to the
+    # time of a frame is allowed for: moving markers are measured with wider claims.
     readout_s: Annotated[float, Meta(ge=0, le=0.1)] | None = None
     one: OneConfig | None = None
     two: TwoConfig | None = None
@@ -251,14 +203,10 @@ class CamerasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
 
 class FurtherCameras(CamerasConfig, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A table [[vision.further_cameras]]: cameras that see the same marker from elsewhere.
+    """A table [[vision.further_cameras]]: cameras that see the same marker from elsewhere."""
 
-    Attributes:
-        name: in messages.
-        xyz, rpy: pose of their left optical frame in the measurement frame, that of [vision.cameras] [m], [rad].
-    """
-
-    name: str
+    name: str  # in messages
+    # xyz, rpy: pose of their left optical frame in the measurement frame, that of [vision.cameras] [m], [rad]
     xyz: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rpy: tuple[float, float, float] = (0.0, 0.0, 0.0)
 

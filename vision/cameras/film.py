@@ -40,7 +40,6 @@ class Roll(Protocol):
 
     def open(self, place: int) -> None:
         """Prepare to read the pair at `place`."""
-        ...
 
     def close(self) -> None: ...
 
@@ -55,34 +54,28 @@ class Film:
     At a speed above 0 the times are the clock's, the first pair is due when the film is opened, and pairs not read in
     time are skipped, as with a camera. At speed 0 the times are those of the recording, pairs follow each other as fast
     as they are read, and none is skipped.
-
-    Attributes:
-        dropped: number of skipped pairs.
     """
 
     def __init__(
         self,
+        # creates the roll when it is first needed; ConfigError or SourceError where files are missing or wrong
         roll: Callable[[], Roll],
         clock: Clock,
         *,
         speed: float,
+        # latency_s, sigma_s: subtracted from the times [s], and 1-sigma added to theirs
         latency_s: float = 0.0,
         sigma_s: float = 0.0,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        """Prepare the playback without opening files.
-
-        Args:
-            roll: creates the roll when it is first needed; ConfigError or SourceError where files are missing or wrong.
-            latency_s, sigma_s: subtracted from the times [s], and 1-sigma added to theirs.
-        """
+        """Prepare the playback without opening files."""
         self._make, self._clock, self._sleep = roll, clock, sleep
         self._speed, self._latency_s, self._sigma_s = speed, latency_s, sigma_s
         self._roll: Roll | None = None
         self._is_open = False
         self._next, self._start_s = 0, 0.0
         self._shown: tuple[ImageArray, ...] = ()
-        self.dropped = 0
+        self.dropped = 0  # number of skipped pairs
 
     @property
     def image_size_px(self) -> tuple[int, int]:

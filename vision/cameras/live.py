@@ -30,29 +30,19 @@ MANY_APART = 10
 
 @dataclass(frozen=True, slots=True)
 class CameraFigures:
-    """State of one camera.
-
-    Attributes:
-        frames: number received since it was opened.
-        fps: measured frame rate; None while too few frames have arrived.
-        stamps: "kernel" or "arrival"; None before any.
-        damaged, doubted: numbers of images with a missing part, and with an implausible time.
-    """
+    """State of one camera."""
 
     name: str
-    frames: int
-    fps: float | None
-    stamps: str | None
+    frames: int  # number received since it was opened
+    fps: float | None  # measured frame rate; None while too few frames have arrived
+    stamps: str | None  # "kernel" or "arrival"; None before any
+    # damaged, doubted: numbers of images with a missing part, and with an implausible time
     damaged: int
     doubted: int
 
 
 class LiveEyes:
-    """`StereoEyes` of devices. Each is read in its own thread; only the newest images are kept.
-
-    Attributes:
-        dropped: number of stereo images that were not read in time.
-    """
+    """`StereoEyes` of devices. Each is read in its own thread; only the newest images are kept."""
 
     def __init__(
         self,
@@ -73,7 +63,7 @@ class LiveEyes:
         self._last_t = -math.inf
         self._opened = ExitStack()
         self._is_open = False
-        self.dropped = 0
+        self.dropped = 0  # number of stereo images that were not read in time
 
     @property
     def image_size_px(self) -> tuple[int, int]:

@@ -29,18 +29,14 @@ def of_image(image: ImageArray, name: str) -> str | None:
 
 
 class Look:
-    """Monitor of one camera's images, fed by the capturing thread and queried by others.
-
-    Attributes:
-        frames: number of images received.
-    """
+    """Monitor of one camera's images, fed by the capturing thread and queried by others."""
 
     def __init__(self, name: str, fps: float) -> None:
         self._name, self._fps = name, fps
         self._times: deque[float] = deque()
         self._light: str | None = None
         self._looked_s = -np.inf
-        self.frames = 0
+        self.frames = 0  # number of images received
         self.fps: float | None = None
 
     def see(self, t: float, image: ImageArray) -> None:

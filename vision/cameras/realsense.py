@@ -29,11 +29,7 @@ FindDevice = Callable[[str | None], Any]
 
 
 def sdk() -> Any:
-    """Return the module pyrealsense2.
-
-    Raises:
-        ModuleNotFoundError: the extra `realsense` is not installed.
-    """
+    """Return the module pyrealsense2; raise ModuleNotFoundError if the extra `realsense` is not installed."""
     import pyrealsense2  # pyright: ignore[reportMissingImports]: an extra
 
     return pyrealsense2
@@ -74,15 +70,10 @@ class RealsenseCamera:
         self,
         config: CamerasConfig,
         settings: RealsenseConfig,
-        clock: Clock,
-        find: FindDevice = connected_device,
+        clock: Clock,  # the machine's monotonic one
+        find: FindDevice = connected_device,  # returns the device with a serial number
     ) -> None:
-        """Prepare; the device is looked for when it is opened, or asked for its calibration.
-
-        Args:
-            clock: the machine's monotonic one.
-            find: returns the device with a serial number.
-        """
+        """Prepare; the device is looked for when it is opened, or asked for its calibration."""
         self._config, self._settings, self._clock, self._find = config, settings, clock, find
         self._calibration: StereoCalibration | None = None
         self._serial = settings.serial or ""

@@ -28,7 +28,6 @@ class WatchedCamera:
     """
 
     def __init__(self, camera: StereoCamera, config: VisionConfig) -> None:
-        """Nothing is opened yet."""
         self._camera = camera
         self._tracker = tracker_of(camera.calibration, config)
         self._annotator = Annotator(camera.calibration, config)
@@ -73,16 +72,11 @@ class WatchedCamera:
 
 
 class PlainEyes:
-    """Frames of cameras without a calibration: nothing is searched for in them.
-
-    Attributes:
-        frames: number of frames read.
-    """
+    """Frames of cameras without a calibration: nothing is searched for in them."""
 
     def __init__(self, eyes: StereoEyes) -> None:
-        """Nothing is opened yet."""
         self._eyes = eyes
-        self.frames = 0
+        self.frames = 0  # number of frames read
 
     def __enter__(self) -> Self:
         self._eyes.__enter__()

@@ -50,38 +50,25 @@ class ClusterView:
 
 @dataclass(frozen=True)
 class MeasuredTag:
-    """A tag on the cluster, in the frame of the first one.
+    """A tag on the cluster, in the frame of the first one."""
 
-    Attributes:
-        placed: its pose.
-        xyz_sigma_m, turn_sigma_rad: 1-sigma of its position along the axes and its rotation about them, each (3,).
-        views: number of views that show it.
-    """
-
-    placed: PlacedTag
+    placed: PlacedTag  # its pose
+    # xyz_sigma_m, turn_sigma_rad: 1-sigma of its position along the axes and its rotation about them, each (3,)
     xyz_sigma_m: FloatArray
     turn_sigma_rad: FloatArray
-    views: int
+    views: int  # number of views that show it
 
 
 @dataclass(frozen=True)
 class MeasuredCluster:
-    """A measured cluster.
+    """A measured cluster."""
 
-    Attributes:
-        tags: in the order of their numbers, the first one at the origin.
-        views: number of image pairs used.
-        misfit: RMS of the residuals, in units of the corners' own sigmas.
-        left_out: names of views, and numbers of the tags in them that did not fit.
-        unused: names of views that do not show two tags to both eyes.
-        grown, grown_sigma: relative excess of the printed squares' size over the given one, and its 1-sigma.
-    """
-
-    tags: tuple[MeasuredTag, ...]
-    views: int
-    misfit: float
-    left_out: tuple[tuple[str, int], ...]
-    unused: tuple[str, ...]
+    tags: tuple[MeasuredTag, ...]  # in the order of their numbers, the first one at the origin
+    views: int  # number of image pairs used
+    misfit: float  # RMS of the residuals, in units of the corners' own sigmas
+    left_out: tuple[tuple[str, int], ...]  # names of views, and numbers of the tags in them that did not fit
+    unused: tuple[str, ...]  # names of views that do not show two tags to both eyes
+    # grown, grown_sigma: relative excess of the printed squares' size over the given one, and its 1-sigma
     grown: float
     grown_sigma: float
 
@@ -179,19 +166,13 @@ def _only(view: ClusterView, is_kept: Callable[[int], bool]) -> ClusterView:
 
 @dataclass(frozen=True)
 class _Block:
-    """Measurements of one eye in one view.
+    """Measurements of one eye in one view."""
 
-    Attributes:
-        view: number of the view.
-        eye: position (3,) of the eye in the left eye's frame [m].
-        root: matrix that whitens the residuals.
-    """
-
-    view: int
-    eye: FloatArray
+    view: int  # number of the view
+    eye: FloatArray  # position (3,) of the eye in the left eye's frame [m]
     ids: tuple[int, ...]
     pixels: FloatArray
-    root: FloatArray
+    root: FloatArray  # matrix that whitens the residuals
 
 
 @dataclass(frozen=True)

@@ -27,30 +27,19 @@ _STEPS: dict[Cell, tuple[FloatArray, FloatArray]] = {
 
 @dataclass(frozen=True)
 class Face:
-    """A face with its tag.
+    """A face with its tag."""
 
-    Attributes:
-        cell: column and row on the sheet, from its upper left.
-        rotation: (3, 3), from the face's frame (x right, y up, z out of the print) to the body's.
-        centre: (3,) in the body's frame [faces' widths].
-    """
-
-    cell: Cell
-    rotation: FloatArray
-    centre: FloatArray
+    cell: Cell  # column and row on the sheet, from its upper left
+    rotation: FloatArray  # (3, 3), from the face's frame (x right, y up, z out of the print) to the body's
+    centre: FloatArray  # (3,) in the body's frame [faces' widths]
 
 
 @dataclass(frozen=True)
 class Shape:
-    """Faces of one size that hang together on the sheet.
+    """Faces of one size that hang together on the sheet."""
 
-    Attributes:
-        name: what it is.
-        faces: in the order of their tags: row by row.
-    """
-
-    name: str
-    faces: tuple[Face, ...]
+    name: str  # what it is
+    faces: tuple[Face, ...]  # in the order of their tags: row by row
 
     @property
     def size(self) -> tuple[int, int]:

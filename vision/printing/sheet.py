@@ -55,27 +55,17 @@ class Text:
 
 @dataclass(frozen=True)
 class Page:
-    """A sheet with what is black on it.
+    """A sheet with what is black on it."""
 
-    Attributes:
-        size_mm: width and height of the sheet.
-        drawing_mm: where the drawing's upper left corner is.
-        rulers_mm: lengths of the rulers, across and upright.
-    """
-
-    size_mm: tuple[float, float]
-    drawing_mm: tuple[float, float]
-    rulers_mm: tuple[float, float]
+    size_mm: tuple[float, float]  # width and height of the sheet
+    drawing_mm: tuple[float, float]  # where the drawing's upper left corner is
+    rulers_mm: tuple[float, float]  # lengths of the rulers, across and upright
     rectangles: tuple[Rectangle, ...]
     texts: tuple[Text, ...]
 
 
 def sheets(paper: str) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return a paper's (width, height) in landscape and in portrait [mm].
-
-    Raises:
-        ConfigError: an unknown paper.
-    """
+    """Return a paper's (width, height) in landscape and in portrait [mm]; raise ConfigError for an unknown paper."""
     known = {name.lower(): size for name, size in PAPERS_MM.items()}
     if paper.lower() not in known:
         raise ConfigError(f"there is no paper {paper!r}", remedy=f"Take one of {', '.join(PAPERS_MM)}")

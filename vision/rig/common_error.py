@@ -28,14 +28,10 @@ class CommonError:
 
     A turn of the whole frame about the left eye is none of them: what the calibration takes for straight ahead is what
     the frame means.
-
-    Attributes:
-        rig: the calibration.
-        size_sigma: relative 1-sigma of the marker's size, from which one eye has all distances.
     """
 
-    rig: Rig
-    size_sigma: float = 0.0
+    rig: Rig  # the calibration
+    size_sigma: float = 0.0  # relative 1-sigma of the marker's size, from which one eye has all distances
 
     def require_usable(self) -> None:
         """Raise CalibrationError if the eyes share no view, or a lens folds over within its image."""

@@ -39,19 +39,12 @@ class _Settings:
 
 @dataclass(frozen=True)
 class Lens:
-    """OpenCV's pinhole model with five coefficients, its fisheye model with four, or its rational model with eight.
+    """OpenCV's pinhole model with five coefficients, its fisheye model with four, or its rational model with eight."""
 
-    Attributes:
-        model: which of them.
-        focal_px: (fx, fy).
-        principal_point_px: (cx, cy); integer coordinates are pixel centres.
-        distortion: in the order of `DISTORTION_NAMES`.
-    """
-
-    model: Model
-    focal_px: tuple[float, float]
-    principal_point_px: tuple[float, float]
-    distortion: tuple[float, ...]
+    model: Model  # which of them
+    focal_px: tuple[float, float]  # (fx, fy)
+    principal_point_px: tuple[float, float]  # (cx, cy); integer coordinates are pixel centres
+    distortion: tuple[float, ...]  # in the order of `DISTORTION_NAMES`
 
     @classmethod
     def from_vector(cls, model: Model, values: ArrayLike) -> Lens:

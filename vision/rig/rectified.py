@@ -27,12 +27,9 @@ class Rectification:
     The rectified left frame has the left eye's optical centre as its origin; it is the left camera's own frame turned
     by `R_rectified_left`: its x axis points to the right eye, and its z axis is as near as that allows to the mean of
     where both cameras look. Nothing is moved and no length changes. The frame of one camera alone is its own.
-
-    Attributes:
-        rig: the calibration.
     """
 
-    rig: Rig
+    rig: Rig  # the calibration
 
     @cached_property
     def R_rectified_left(self) -> FloatArray:

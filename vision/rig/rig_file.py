@@ -96,11 +96,7 @@ def read_rig(file: Path) -> Rig:
 
 
 def write_rig(rig: Rig, file: Path) -> None:
-    """Write the calibration, replacing the file atomically.
-
-    Raises:
-        ConfigError: the folder cannot be written to.
-    """
+    """Write the calibration, replacing the file atomically; raise ConfigError if the folder cannot be written to."""
     heading = "# Written by `bodyschema calibrate cameras`. docs/calibrating_cameras.md says what each entry is."
     text = f"{heading}\n{_text(rig)}"
     part = file.with_name(f"{file.name}.part")

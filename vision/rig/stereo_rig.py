@@ -27,25 +27,15 @@ class OtherCameras(CalibrationError, SourceError):
 
 @dataclass(frozen=True)
 class Made:
-    """Provenance of a calibration.
+    """Provenance of a calibration."""
 
-    Attributes:
-        date: ISO 8601 in UTC.
-        board: the calibration board.
-        views: number of image pairs used.
-        left_out: number of pairs left out as outliers.
-        reprojection_px: RMS reprojection error of the corners per image coordinate, in the fit [px].
-        held_out_px: the same in held-out views [px].
-        scale_sigma: 1-sigma of the board's size, as a share of it; it is in the covariance too.
-    """
-
-    date: str
-    board: str
-    views: int
-    left_out: int
-    reprojection_px: float
-    held_out_px: float
-    scale_sigma: float
+    date: str  # ISO 8601 in UTC
+    board: str  # the calibration board
+    views: int  # number of image pairs used
+    left_out: int  # number of pairs left out as outliers
+    reprojection_px: float  # RMS reprojection error of the corners per image coordinate, in the fit [px]
+    held_out_px: float  # the same in held-out views [px]
+    scale_sigma: float  # 1-sigma of the board's size, as a share of it; it is in the covariance too
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,25 +43,17 @@ class StereoRig:
     """Two lenses, where the right eye is against the left one, and how sure all that is.
 
     A point x in the left eye's frame (x right, y down, z forward) is at R x + t in the right one's.
-
-    Attributes:
-        left, right: the lenses, of one model.
-        rotation_rad: rotation vector of R, shape (3,) [rad].
-        translation_m: t, shape (3,) [m].
-        image_size_px: width and height of both eyes' images.
-        serials: what tells the left and the right device from all others; "" where it was not known.
-        covariance: of `vector`, shape (p, p).
-        made: how it was made.
     """
 
+    # left, right: the lenses, of one model
     left: Lens
     right: Lens
-    rotation_rad: FloatArray
-    translation_m: FloatArray
-    image_size_px: tuple[int, int]
-    serials: tuple[str, str]
-    covariance: FloatArray
-    made: Made
+    rotation_rad: FloatArray  # rotation vector of R, shape (3,) [rad]
+    translation_m: FloatArray  # t, shape (3,) [m]
+    image_size_px: tuple[int, int]  # width and height of both eyes' images
+    serials: tuple[str, str]  # what tells the left and the right device from all others; "" where it was not known
+    covariance: FloatArray  # of `vector`, shape (p, p)
+    made: Made  # how it was made
 
     def __post_init__(self) -> None:
         for name in ("rotation_rad", "translation_m", "covariance"):
@@ -143,21 +125,13 @@ class StereoRig:
 
 @dataclass(frozen=True, eq=False)
 class OneEyeRig:
-    """One camera alone: its lens, and how sure that is.
+    """One camera alone: its lens, and how sure that is."""
 
-    Attributes:
-        left: the lens, as that of a pair's left eye.
-        image_size_px: width and height of its images.
-        serials: what tells the device from all others; "" where it was not known.
-        covariance: of `vector`, shape (p, p).
-        made: how it was made.
-    """
-
-    left: Lens
-    image_size_px: tuple[int, int]
-    serials: tuple[str]
-    covariance: FloatArray
-    made: Made
+    left: Lens  # the lens, as that of a pair's left eye
+    image_size_px: tuple[int, int]  # width and height of its images
+    serials: tuple[str]  # what tells the device from all others; "" where it was not known
+    covariance: FloatArray  # of `vector`, shape (p, p)
+    made: Made  # how it was made
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "covariance", frozen_array(self.covariance))

@@ -230,8 +230,6 @@ def arm(
 
 @dataclass(frozen=True)
 class _Rows:
-    """Rows to learn."""
-
     robot: RobotDescription
     source: Path
     recording: Recording

@@ -15,6 +15,7 @@ from rich.console import Console
 from bodyschema.cli.commands.options import flag
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.extras import require_extra
+from bodyschema.interfaces.whole_files import writing
 
 Name = Literal["fig4", "fig5", "fig6", "fig7", "exactness", "all"]
 
@@ -55,10 +56,8 @@ def reproduce(
         raise ConfigError(f"--seed is {seed}", remedy="Give 0 or more")
     if real and name in ("fig5", "fig7", "all"):
         require_extra("sim", "a measured curve (--no-real leaves it out)")
-    try:
+    with writing(out, what="made", remedy="Give another --out"):
         out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"cannot be made: {error.strerror}", file=out, remedy="Give another --out") from error
     done = list(_experiments(name, out, seed, real=real, quiet=as_json))
     if as_json:
         told = {"schema": 3, "version": version("bodyschema"), "seed": seed, "real": real, "experiments": done}

@@ -14,6 +14,7 @@ from rich.prompt import Prompt
 
 from bodyschema.cli.commands.options import HERE, flag, say, several
 from bodyschema.interfaces.errors import BodyschemaError, ConfigError
+from bodyschema.interfaces.whole_files import write_whole, writing
 
 if TYPE_CHECKING:
     from bodyschema.cli.hardware.robot_template import Guess, Seen
@@ -77,7 +78,7 @@ def init(
     if os.path.lexists(robot):
         raise ConfigError("is there already", file=robot, remedy="Give another --robot, or move it away")
     seen = _seen(webcam, tag_mm, ball_mm, chessboard, plugged_in=bool(lerobot or source))
-    try:
+    with writing(robot, remedy="Give another --robot"):
         if sim:
             _copy_model(robot)
         elif lerobot is not None:
@@ -90,8 +91,6 @@ def init(
 
             guess = EXAMPLE if urdf is None else _guess(urdf, robot, marker_link, camera_link)
             write_new(robot, robot_toml(guess, seen))
-    except OSError as error:
-        raise ConfigError(f"cannot be written: {error.strerror}", file=robot, remedy="Give another --robot") from error
     following = "run --sim" if sim else "watch joints" if lerobot or source else "config"
     say(f"{robot} written. Next: `bodyschema {following} --robot {robot}`")
 
@@ -178,14 +177,10 @@ def _of_lerobot(
 
 def write_new(file: Path, text: str) -> None:
     """Write a new file; raise ConfigError if it exists."""
-    from bodyschema.interfaces.whole_files import write_whole
-
     if os.path.lexists(file):
         raise ConfigError("is there already", file=file, remedy="Give another --robot, or move it away")
-    try:
+    with writing(file, remedy="Give another --robot"):
         write_whole({file: text.encode()})
-    except OSError as error:
-        raise ConfigError(f"cannot be written: {error.strerror}", file=file, remedy="Give another --robot") from error
 
 
 def _copy_model(robot: Path) -> None:

@@ -26,17 +26,12 @@ KEPT = 1024  # moves that are remembered: about a second, at the rate at which a
 
 
 class DrivenShaft:
-    """The angle of a servo's shaft: it goes where the servo holds it, and stays where nothing does.
-
-    Attributes:
-        servo: the servo that turns it, if any.
-        jammed: the shaft does not move, whatever the servo does.
-    """
+    """The angle of a servo's shaft: it goes where the servo holds it, and stays where nothing does."""
 
     def __init__(self, angle: float, fastest_rad_s: float = FASTEST_RAD_S) -> None:
         """Start at `angle` [rad], 0 in the middle of the servo's range."""
-        self.servo: Servo | None = None
-        self.jammed = False
+        self.servo: Servo | None = None  # the servo that turns it, if any
+        self.jammed = False  # the shaft does not move, whatever the servo does
         self._fastest = fastest_rad_s
         self._moves = deque([(-math.inf, angle)], maxlen=KEPT)
         self._lock = threading.RLock()  # its servo moves it in one thread, cameras see it in others

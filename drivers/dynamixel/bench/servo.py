@@ -119,7 +119,6 @@ class Servo(EmulatedServo):
 
     @property
     def hardware_error(self) -> int:
-        """Hardware error bits."""
         return self._error1 if self.model.protocol == 1 else self["hardware_error"]
 
     def fail(self, bits: int) -> None:
@@ -205,7 +204,6 @@ class Servo(EmulatedServo):
         return places
 
     def write(self, address: int, data: bytes, t: float) -> Error:
-        """Write bytes of the control table where that is allowed."""
         for begin, part in self._runs(address, data):
             error = self._write(begin, part, t)
             if error is not Error.NONE:

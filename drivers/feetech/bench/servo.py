@@ -60,11 +60,7 @@ LARGEST_SPEED = 3400  # [ticks/s]
 
 
 class Servo(EmulatedServo):
-    """An emulated servo. Torque has no effect on the shaft.
-
-    Attributes:
-        knows_sync_read: it answers SYNC_READ.
-    """
+    """An emulated servo. Torque has no effect on the shaft."""
 
     delay_unit_us = RETURN_DELAY_UNIT_US
 
@@ -75,17 +71,12 @@ class Servo(EmulatedServo):
         angle: Angle,
         *,
         baud: int = 1_000_000,
-        return_delay_s: float = 500e-6,
-        multi_turn: bool = False,
+        return_delay_s: float = 500e-6,  # delay between instruction and answer
+        multi_turn: bool = False,  # it counts turns until it loses power
     ) -> None:
-        """Create a servo with factory settings, except for the arguments.
-
-        Args:
-            return_delay_s: delay between instruction and answer.
-            multi_turn: it counts turns until it loses power.
-        """
+        """Create a servo with factory settings, except for the arguments."""
         super().__init__(model, angle)
-        self.knows_sync_read = model.protocol != SCS
+        self.knows_sync_read = model.protocol != SCS  # it answers SYNC_READ
         self._multi_turn, self._base = multi_turn, 0
         self["model"] = model.number
         self._set_factory_values()

@@ -24,18 +24,14 @@ GONE_AFTER_S = 4.0
 
 
 class NatnetReceiver:
-    """The stream of a NatNet server, by multicast or to this client alone, as the server is set up.
-
-    Attributes:
-        names: names of the rigid bodies by streaming ID.
-    """
+    """The stream of a NatNet server, by multicast or to this client alone, as the server is set up."""
 
     def __init__(self, table: NatnetTable, clock: Clock) -> None:
         self._table, self._clock = table, clock
         self._commands: socket.socket | None = None
         self._data: socket.socket | None = None
         self.server: ServerInfo | None = None
-        self.names: dict[int, str] = {}
+        self.names: dict[int, str] = {}  # names of the rigid bodies by streaming ID
         self._frames = 0
         self._heard = self._asked = self._asked_names = -math.inf
 

@@ -29,8 +29,6 @@ _Skip = Callable[["_Reader"], None]
 
 
 class Message(IntEnum):
-    """Kinds of packets."""
-
     CONNECT = 0
     SERVER_INFO = 1
     REQUEST_MODEL = 4
@@ -200,13 +198,11 @@ class _Reader:
         return text
 
     def bytes(self, size: int) -> bytes:
-        """Read bytes."""
         begin = self.at
         self.skip(size)
         return self._data[begin : self.at]
 
     def skip(self, size: int) -> None:
-        """Skip bytes."""
         self.go_to(self.at + size)
 
     def go_to(self, at: int) -> None:

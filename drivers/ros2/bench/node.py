@@ -77,17 +77,12 @@ def _misled(fault: Fault, message: JointState, before_ns: int, rng: Random) -> J
 
 
 class Planned:
-    """Encoder that corrupts the next message on request, or a random share of all.
-
-    Attributes:
-        next: fault of the next message; reset to None once it is applied.
-    """
+    """Encoder that corrupts the next message on request, or a random share of all."""
 
     def __init__(self, rng: Random, *, share: float = 0.0, kinds: tuple[Fault, ...] = tuple(Fault)) -> None:
-        """Start without any corrupted message."""
         self._rng, self._share, self._kinds = rng, share, kinds
         self._before_ns = 0
-        self.next: Fault | None = None
+        self.next: Fault | None = None  # fault of the next message; reset to None once it is applied
         self.given: dict[Fault, int] = {}
 
     def __call__(self, message: JointState) -> bytes | None:

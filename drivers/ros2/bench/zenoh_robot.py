@@ -22,17 +22,12 @@ class ZenohRobot:
     def __init__(
         self,
         nodes: Sequence[Node],
-        listen: str,
+        listen: str,  # endpoint of the router, such as tcp/127.0.0.1:7447
         *,
         domain: int = 0,
         topic: str = "/joint_states",
         via: Literal["rmw_zenoh", "ros2dds"] = "rmw_zenoh",
     ) -> None:
-        """Prepare without opening anything.
-
-        Args:
-            listen: endpoint of the router, such as tcp/127.0.0.1:7447.
-        """
         self._via = via
         self._nodes, self._listen, self._domain, self._topic = list(nodes), listen, domain, topic
         self._session: zenoh.Session | None = None
@@ -63,7 +58,6 @@ class ZenohRobot:
 
     @property
     def is_heard(self) -> bool:
-        """True if there is a subscriber."""
         status: Any = self._publisher.matching_status  # zenoh's stub wrongly declares it as bool
         return bool(status.matching)
 

@@ -38,7 +38,6 @@ class EncoderArm(BenchArm):
         rate_hz: float = 200.0,
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Create a board with its power on."""
         self._config, rng = config, Random(seed)
         self._names = {encoder.joint: encoder.name for encoder in config.encoders}
         wire = WireFaults.asked(faults, KINDS, dict.fromkeys(self._names, 0), rng)  # one line contains all encoders

@@ -28,21 +28,15 @@ class EncoderBoard:
 
     def __init__(
         self,
+        # by name, ticks per turn, and shaft angle as a function of time [s]: [rad], 0 at the raw position 0
         encoders: Mapping[str, tuple[int, Angle]],
         *,
         rate_hz: float = 200.0,
         begun_s: float = 0.0,
         boot: int = 1,
-        drift: float = 0.0,
+        drift: float = 0.0,  # how much its clock is too fast
         faults: Faults = no_faults,
     ) -> None:
-        """Create a board with its power on.
-
-        Args:
-            encoders: by name, ticks per turn, and shaft angle as a function of time [s]: [rad], 0 at the raw position
-                0.
-            drift: how much its clock is too fast.
-        """
         self.encoders, self.faults = dict(encoders), faults
         self.failing: set[str] = set()
         self.glitch_ticks: dict[str, int] = {}

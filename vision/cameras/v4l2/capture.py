@@ -19,12 +19,7 @@ log = logging.getLogger(__name__)
 
 
 class Capture:
-    """Thread that reads a device as fast as it sends and hands each image on.
-
-    Attributes:
-        look: statistics of the camera from its images.
-        failure: error that ended the thread, or None.
-    """
+    """Thread that reads a device as fast as it sends and hands each image on."""
 
     def __init__(
         self, device: CameraDevice, fps: float, take: Callable[[Shot], None], wake: Callable[[], None]
@@ -37,8 +32,8 @@ class Capture:
             wake: called in the thread when it ends.
         """
         self._device, self._fps, self._take, self._wake = device, fps, take, wake
-        self.look = Look(device.name, fps)
-        self.failure: SourceError | None = None
+        self.look = Look(device.name, fps)  # statistics of the camera from its images
+        self.failure: SourceError | None = None  # error that ended the thread, or None
         self._opened = ExitStack()
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
