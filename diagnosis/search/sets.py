@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -128,6 +129,7 @@ class Sets:
         ends = np.cumsum([0, *(len(effect.amounts) for effect in self.effects)])
         first = self._nuisances + self._tolerances
         self._places = [np.arange(first + a, first + b) for a, b in pairwise(ends)]
+        self._log_most = _LOG_MOST
         self._known_places: dict[tuple[int, ...], NDArray[np.intp]] = {}
         # Numbers of one cause that are added and removed together.
         groups: dict[tuple[object, ...], list[int]] = {}
@@ -147,9 +149,21 @@ class Sets:
 
         Without them different sets may be the same.
         """
-        seen: dict[frozenset[int], Together] = {}
-        reached = (self.possible(self._climbed(start, seen)) for start in starts)
+        exact, near = self._of_an_exact_arm, [*starts]
+        seen, others = dict[frozenset[int], Together](), dict[frozenset[int], Together]()
+        near += [exact._climbed(start, others).chosen for start in near]
+        reached = [self.possible(self._climbed(start, seen)) for start in dict.fromkeys(near)]
         return list({frozenset(one.chosen): one for one in reached}.values())
+
+    @cached_property
+    def _of_an_exact_arm(self) -> Sets:
+        """The same sets beside no tolerances.
+
+        Beside tolerances that have followed a cause it seems to be worth nothing, however small they are.
+        """
+        exact = copy(self)
+        exact._log_most, exact._known = _LOG_SMALLEST, {}
+        return exact
 
     def possible(self, here: Together) -> Together:
         """Return a set without the causes whose amounts would be impossible, such as a negative backlash."""
@@ -348,7 +362,7 @@ class Sets:
         columns = np.sort(np.concatenate([np.arange(self._nuisances + self._tolerances), *own]).astype(np.intp))
         group = self._group(columns)
         inner, toward = self._inner[np.ix_(columns, columns)], self._toward[columns]
-        logs = np.log(near.scales if near else Scales())
+        logs = np.minimum(np.log(near.scales if near else Scales()), self._log_most)
         sigma = near.sigma if near else self._noise
         members, spent = (group == np.arange(SCALES)[:, None]).astype(np.float64), np.zeros(SCALES)
         unit = np.eye(len(columns), order="F")
@@ -360,7 +374,7 @@ class Sets:
             spent, squares = members @ told, members @ (np.square(amounts) / variances)
             steps = (squares - spent - logs / SPREAD**2) / (2.0 * np.maximum(spent, 0.5) + 1.0 / SPREAD**2)
             steps = np.minimum(np.maximum(steps, -_FARTHEST), _FARTHEST)
-            moved = np.minimum(np.maximum(logs + steps, _LOG_SMALLEST), _LOG_MOST)
+            moved = np.minimum(np.maximum(logs + steps, _LOG_SMALLEST), self._log_most)
             rss = self._square - 2.0 * float(amounts @ toward) + float(amounts @ inner @ amounts)
             free = max(self._rows - float(told.sum()), 1.0)
             quieter = 0.5 * math.log(max(rss, 1e-300) / free) - math.log(sigma)

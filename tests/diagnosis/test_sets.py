@@ -7,7 +7,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from planted_cases import BASE, ELBOW, SHOULDER, WRIST, desk_arm, measured, motion_of, scattered, surveyed_arm
+from planted_cases import (
+    BASE,
+    ELBOW,
+    SHOULDER,
+    WRIST,
+    desk_arm,
+    measured,
+    motion_of,
+    scattered,
+    start_of,
+    surveyed_arm,
+    walk,
+)
 
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.background import Scales
@@ -137,6 +149,16 @@ def test_tolerances_of_a_workshop_are_no_cause_instead() -> None:
     start, hypotheses = bent(1, 0.0)
     fit = start.tolerating(Scales())
     assert in_place_of_tolerances(fit.tolerating(tolerated(fit).scales), hypotheses) == []
+
+
+@pytest.mark.parametrize("seed", [0, 1, 3, 4])
+def test_a_small_shift_of_a_link_is_found_where_small_tolerances_would_follow_it(seed) -> None:
+    robot = surveyed_arm()
+    shift = Effect.at(robot, "link_geometry", WRIST, values=[5e-4, -5e-4, 5e-4, 0.0, 0.0, 0.0])
+    lens = Effect.at(robot, "camera_focal", values=[2e-3])
+    start = start_of(robot, walk(robot, seed), (shift, lens), seed)
+    found = together(start, Hypotheses.of(start.simulation, start.observations).effects)
+    assert {(cause.name, cause.where) for cause in found.causes} == {("link_geometry", WRIST), ("camera_focal", None)}
 
 
 @pytest.mark.parametrize("seed", range(3))
