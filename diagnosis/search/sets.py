@@ -35,8 +35,6 @@ _FARTHEST = 1.0
 _QUIETEST = 1e-3
 # Number of the most promising moves that are tried with their own scales.
 _TRIED = 4
-# With all scales below this, also try an arm exactly as described, such as a simulated one.
-_MAY_BE_EXACT = 0.5
 # Prior width of what robot.toml does not know, about the fit, in usual sizes; the same in all fits, to compare them.
 _FREE = 100.0
 # Relative rounding of squares, and of columns that are collinear up to rounding.
@@ -388,10 +386,9 @@ class Sets:
         worth = self._evidence(solution, toward, sigma)
         scales = Scales(*np.exp(logs).tolist())
         worth -= scales.doubt + _volume(spent)
-        if math.exp(logs[members.any(axis=1)].max()) < _MAY_BE_EXACT:
-            exact = self._solved(inner, toward, group, np.full(SCALES, _LOG_SMALLEST), sigma)
-            if (evidence := self._evidence(exact, toward, sigma)) > worth:
-                worth, solution, scales = evidence, exact, Scales(*[SMALLEST] * SCALES)
+        exact = self._solved(inner, toward, group, np.full(SCALES, _LOG_SMALLEST), sigma)
+        if (evidence := self._evidence(exact, toward, sigma)) > worth:
+            worth, solution, scales = evidence, exact, Scales(*[SMALLEST] * SCALES)
         worth += self._outliers - self._cost(chosen) - NAMED * scales.several_times
         factor, _, amounts = solution
         return Together(chosen, worth, scales, sigma, spent, amounts, factor, columns)
