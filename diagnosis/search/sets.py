@@ -35,6 +35,8 @@ _FARTHEST = 1.0
 _QUIETEST = 1e-3
 # Number of the most promising moves that are tried with their own scales.
 _TRIED = 4
+# Logarithms of the sizes of a cause, in usual ones, with which it is tried before its own is fitted.
+_SIZES = (0.0, -2.0, -4.0)
 # Prior width of what robot.toml does not know, about the fit, in usual sizes; the same in all fits, to compare them.
 _FREE = 100.0
 # Relative rounding of squares, and of columns that are collinear up to rounding.
@@ -65,6 +67,8 @@ class Together:
         chosen: indices of its candidates.
         worth: its evidence less the cost of naming its causes [nats]; comparable only with that of other sets.
         scales: scales of the tolerances.
+        logs: logarithms of these scales, then of the sizes of causes in usual ones.
+        group: the index (p,) in `logs` of each column's prior width; -1 where it is 1.
         sigma: size of the noise, in units of the stated one.
         spent: effective number of data that determine each scale (4,).
         amounts: amounts of all its columns (p,).
@@ -75,6 +79,8 @@ class Together:
     chosen: tuple[int, ...]
     worth: float
     scales: Scales
+    logs: FloatArray
+    group: NDArray[np.int64]
     sigma: float
     spent: FloatArray
     amounts: FloatArray
@@ -274,6 +280,8 @@ class Sets:
         """Return the worth of each of some groups of numbers with scales and noise held fixed [nats]."""
         own = [np.searchsorted(here.columns, self._places_of(group)) for group in groups]
         squares, volumes = _in_groups(here.covariance, here.amounts, own)
+        widths = np.append(here.logs, 0.0)[here.group]
+        volumes -= [widths[places].sum() for places in own]
         return squares + volumes - self._costs_of(here.chosen, groups, are_in=True)
 
     def _cost(self, chosen: Sequence[int]) -> float:
@@ -317,13 +325,18 @@ class Sets:
         across = self._inner[np.ix_(here.columns, places)] / here.sigma**2
         solved = dpotrs(here.factor, across, lower=True)[0]
         inner = self._inner[np.ix_(places, places)] / here.sigma**2 - across.T @ solved
-        inner[np.diag_indices_from(inner)] += 1.0
         gradient = self._toward[places] / here.sigma**2 - solved.T @ (self._toward[here.columns] / here.sigma**2)
         at = np.empty(len(self._toward), dtype=np.intp)
         at[places] = np.arange(len(places))
         own = [at[self._places_of(group)] for group in open_groups]
-        squares, volumes = _in_groups(inner, gradient, own)
-        worths = squares - volumes - self._costs_of(here.chosen, open_groups, are_in=False)
+        numbers, worths = np.array([len(one) for one in own]), np.full(len(own), -np.inf)
+        fixed = np.array([self._kinds[group[0]].in_parts for group in open_groups])
+        for log in _SIZES:
+            narrow = inner + math.exp(-2.0 * log) * np.eye(len(inner))
+            squares, volumes = _in_groups(narrow, gradient, own)
+            worth = squares - volumes - numbers * log - 0.5 * (log / SPREAD) ** 2
+            worths = np.where(fixed & (log != 0.0), worths, np.maximum(worths, worth))
+        worths -= self._costs_of(here.chosen, open_groups, are_in=False)
         best = np.argsort(worths)[::-1]
         return [open_groups[k] for k in best[here.worth + worths[best] > least - COMES_NEAR].tolist()]
 
@@ -358,11 +371,11 @@ class Sets:
     def _fitted(self, chosen: tuple[int, ...], near: Together | None) -> Together:
         own = [self._places[k] for k in chosen]
         columns = np.sort(np.concatenate([np.arange(self._nuisances + self._tolerances), *own]).astype(np.intp))
-        group = self._group(columns)
+        group, most = self._group(columns, chosen)
         inner, toward = self._inner[np.ix_(columns, columns)], self._toward[columns]
-        logs = np.minimum(np.log(near.scales if near else Scales()), self._log_most)
+        logs = np.minimum(np.append(np.log(near.scales if near else Scales()), np.zeros(len(most) - SCALES)), most)
         sigma = near.sigma if near else self._noise
-        members, spent = (group == np.arange(SCALES)[:, None]).astype(np.float64), np.zeros(SCALES)
+        members, spent = (group == np.arange(len(most))[:, None]).astype(np.float64), np.zeros(len(most))
         unit = np.eye(len(columns), order="F")
         for done in range(_ROUNDS if near is None else _ROUNDS_NEAR):
             factor, variances, amounts = solution = self._solved(inner, toward, group, logs, sigma)
@@ -372,7 +385,7 @@ class Sets:
             spent, squares = members @ told, members @ (np.square(amounts) / variances)
             steps = (squares - spent - logs / SPREAD**2) / (2.0 * np.maximum(spent, 0.5) + 1.0 / SPREAD**2)
             steps = np.minimum(np.maximum(steps, -_FARTHEST), _FARTHEST)
-            moved = np.minimum(np.maximum(logs + steps, _LOG_SMALLEST), self._log_most)
+            moved = np.minimum(np.maximum(logs + steps, _LOG_SMALLEST), most)
             rss = self._square - 2.0 * float(amounts @ toward) + float(amounts @ inner @ amounts)
             free = max(self._rows - float(told.sum()), 1.0)
             quieter = 0.5 * math.log(max(rss, 1e-300) / free) - math.log(sigma)
@@ -383,36 +396,34 @@ class Sets:
             sigma = max(sigma * math.exp(quieter), _QUIETEST * self._noise)
         else:
             solution = self._solved(inner, toward, group, logs, sigma)
-        worth = self._evidence(solution, toward, sigma)
-        scales = Scales(*np.exp(logs).tolist())
-        worth -= scales.doubt + _volume(spent)
-        exact = self._solved(inner, toward, group, np.full(SCALES, _LOG_SMALLEST), sigma)
+        scales, sizes = Scales(*np.exp(logs[:SCALES]).tolist()), logs[SCALES:]
+        worth = self._evidence(solution, toward, sigma) - scales.doubt - _volume(spent[:SCALES])
+        as_described = np.append(np.full(SCALES, _LOG_SMALLEST), sizes)
+        exact = self._solved(inner, toward, group, as_described, sigma)
         if (evidence := self._evidence(exact, toward, sigma)) > worth:
-            worth, solution, scales = evidence, exact, Scales(*[SMALLEST] * SCALES)
+            worth, solution, scales, logs = evidence, exact, Scales(*[SMALLEST] * SCALES), as_described
+        worth -= 0.5 * float(np.square(sizes / SPREAD).sum()) + _volume(spent[SCALES:])
         worth += self._outliers - self._cost(chosen) - NAMED * scales.several_times
         factor, _, amounts = solution
-        return Together(chosen, worth, scales, sigma, spent, amounts, factor, columns)
+        return Together(chosen, worth, scales, logs, group, sigma, spent[:SCALES], amounts, factor, columns)
 
     def shown(self, here: Together) -> NDArray[np.bool_]:
         """Return True for each scale without whose tolerances the data would be much less probable (4,)."""
-        inner, toward = self._inner[np.ix_(here.columns, here.columns)], self._toward[here.columns]
-        group = self._group(here.columns)
-        whole = self._worth(inner, toward, group, np.log(here.scales), here.sigma)
+        whole = self._worth(here, here.logs)
         without = []
         for g in range(SCALES):
-            logs = np.log(here.scales)
+            logs = here.logs.copy()
             logs[g] = _LOG_SMALLEST
-            without.append(self._worth(inner, toward, group, logs, here.sigma))
+            without.append(self._worth(here, logs))
         return whole - np.array(without) > _SHOWN
 
     def largest(self, here: Together) -> FloatArray:
         """Return the largest scales (4,), each beside the others as they are, that the data do not rule out."""
-        inner, toward = self._inner[np.ix_(here.columns, here.columns)], self._toward[here.columns]
-        group, found = self._group(here.columns), np.array(here.scales)
+        found = np.array(here.scales)
         for g in range(SCALES):
-            logs, best = np.log(here.scales), -np.inf
+            logs, best = here.logs.copy(), -np.inf
             while logs[g] < _LOG_MOST:
-                worth = self._worth(inner, toward, group, logs, here.sigma)
+                worth = self._worth(here, logs)
                 best = max(best, worth)
                 if worth < best - _RULED_OUT:
                     break
@@ -420,15 +431,22 @@ class Sets:
             found[g] = np.exp(logs[g])
         return found
 
-    def _group(self, columns: NDArray[np.intp]) -> NDArray[np.int64]:
-        """Return the scale of each column (p,); -1 where it is not a tolerance."""
+    def _group(self, columns: NDArray[np.intp], chosen: Sequence[int]) -> tuple[NDArray[np.int64], FloatArray]:
+        """Return the index of each column's prior width (p,), -1 where it is 1, and the largest logarithms of these.
+
+        First come the scales of tolerances, then the sizes of causes. The numbers of a link have fixed widths.
+        """
         group = np.full(len(columns), -1)
         group[self._nuisances : self._nuisances + self._tolerances] = self._of_scale
-        return group
+        sized = [k for k in chosen if not self._kinds[k].in_parts]
+        for index, k in enumerate(sized, SCALES):
+            group[np.searchsorted(columns, self._places[k])] = index
+        return group, np.append(np.full(SCALES, self._log_most), np.full(len(sized), _LOG_MOST))
 
-    def _worth(self, inner: FloatArray, toward: FloatArray, group: np.ndarray, logs: FloatArray, sigma: float) -> float:
-        """Return the evidence of scales and noise [nats]."""
-        return self._evidence(self._solved(inner, toward, group, logs, sigma), toward, sigma)
+    def _worth(self, here: Together, logs: FloatArray) -> float:
+        """Return the evidence of a set with other scales [nats]."""
+        inner, toward = self._inner[np.ix_(here.columns, here.columns)], self._toward[here.columns]
+        return self._evidence(self._solved(inner, toward, here.group, logs, here.sigma), toward, here.sigma)
 
     def _evidence(self, solution: _Solution, toward: FloatArray, sigma: float) -> float:
         """Return the evidence of the scales and the noise of a solution [nats]."""
@@ -441,7 +459,7 @@ class Sets:
         self, inner: FloatArray, toward: FloatArray, group: np.ndarray, logs: FloatArray, sigma: float
     ) -> _Solution:
         """Return the factor of the precision, prior variances (p,) and amounts (p,), in units of `_units`."""
-        # The last of the scales stands for columns that are no tolerances.
+        # The last of the widths stands for columns that have none of their own.
         variances = np.append(np.exp(2.0 * logs), 1.0)[group]
         precision = inner / sigma**2
         diagonal = precision.reshape(-1)[:: len(precision) + 1]
