@@ -35,8 +35,8 @@ _FARTHEST = 1.0
 _QUIETEST = 1e-3
 # Number of the most promising moves that are tried with their own scales.
 _TRIED = 4
-# A cause with as many numbers has a size of its own; logarithms, in usual ones, with which it is tried before.
-_SEVERAL, _SIZES = 3, (0.0, -2.0, -4.0)
+# Logarithms of the sizes, in usual ones, with which a pose is tried before its own is fitted.
+_SIZES = (0.0, -2.0, -4.0)
 # Prior width of what robot.toml does not know, about the fit, in usual sizes; the same in all fits, to compare them.
 _FREE = 100.0
 # Relative rounding of squares, and of columns that are collinear up to rounding.
@@ -67,7 +67,7 @@ class Together:
         chosen: indices of its candidates.
         worth: its evidence less the cost of naming its causes [nats]; comparable only with that of other sets.
         scales: scales of the tolerances.
-        logs: logarithms of these scales, then of the sizes of causes in usual ones.
+        logs: logarithms of these scales, then of the sizes of poses in usual ones.
         group: the index (p,) in `logs` of each column's prior width; -1 where it is 1.
         sigma: size of the noise, in units of the stated one.
         spent: effective number of data that determine each scale (4,).
@@ -133,9 +133,6 @@ class Sets:
         ends = np.cumsum([0, *(len(effect.amounts) for effect in self.effects)])
         first = self._nuisances + self._tolerances
         self._places = [np.arange(first + a, first + b) for a, b in pairwise(ends)]
-        # Several numbers tell how large they are together; those of a link may be chosen one by one.
-        several = (k for k, one in enumerate(self.effects) if len(one.amounts) >= _SEVERAL)
-        self._sized = frozenset(k for k in several if not self._kinds[k].in_parts)
         self._log_most = _LOG_MOST
         self._known_places: dict[tuple[int, ...], NDArray[np.intp]] = {}
         # Numbers of one cause that are added and removed together.
@@ -335,7 +332,7 @@ class Sets:
         at[places] = np.arange(len(places))
         own = [at[self._places_of(group)] for group in open_groups]
         numbers, worths = np.array([len(one) for one in own]), np.full(len(own), -np.inf)
-        fixed = np.array([group[0] not in self._sized for group in open_groups])
+        fixed = np.array([group[0] not in self._poses for group in open_groups])
         for log in _SIZES:
             narrow = inner + math.exp(-2.0 * log) * np.eye(len(inner))
             squares, volumes = _in_groups(narrow, gradient, own)
@@ -439,11 +436,11 @@ class Sets:
     def _group(self, columns: NDArray[np.intp], chosen: Sequence[int]) -> tuple[NDArray[np.int64], FloatArray]:
         """Return the index of each column's prior width (p,), -1 where it is 1, and the largest logarithms of these.
 
-        First come the scales of tolerances, then the sizes of causes that have one of their own.
+        First come the scales of tolerances, then the sizes of poses: a camera may be off by 0.05 mm or by 50.
         """
         group = np.full(len(columns), -1)
         group[self._nuisances : self._nuisances + self._tolerances] = self._of_scale
-        sized = [k for k in chosen if k in self._sized]
+        sized = [k for k in chosen if k in self._poses]
         for index, k in enumerate(sized, SCALES):
             group[np.searchsorted(columns, self._places[k])] = index
         return group, np.append(np.full(SCALES, self._log_most), np.full(len(sized), _LOG_MOST))
