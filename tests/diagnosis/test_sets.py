@@ -114,10 +114,10 @@ def test_a_link_leaves_a_roughly_made_arm_unless_it_is_bent_far_more(seed, bent,
     assert (place.with_one_less() is None) is stays
 
 
-@pytest.mark.parametrize("angle", [5e-3, 8e-3])
+@pytest.mark.parametrize(("arm", "angle"), [(desk_arm, 5e-3), (desk_arm, 8e-3), (surveyed_arm, 1e-3)])
 @pytest.mark.parametrize("seed", range(6))
-def test_a_roughly_made_arm_has_no_cause(seed, angle) -> None:
-    start = rough(desk_arm(), seed, angle)
+def test_a_roughly_made_arm_has_no_cause(seed, arm, angle) -> None:
+    start = rough(arm(), seed, angle)
     hypotheses = Hypotheses.of(start.simulation, start.observations).effects
     assert together(start, hypotheses).causes == ()
 
@@ -159,6 +159,15 @@ def test_a_small_shift_of_a_link_is_found_where_small_tolerances_would_follow_it
     start = start_of(robot, walk(robot, seed), (shift, lens), seed)
     found = together(start, Hypotheses.of(start.simulation, start.observations).effects)
     assert {(cause.name, cause.where) for cause in found.causes} == {("link_geometry", WRIST), ("camera_focal", None)}
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_camera_that_stands_half_a_millimetre_off_is_found_where_tolerances_would_follow_it(seed) -> None:
+    robot = surveyed_arm()
+    pose = Effect.at(robot, "camera_pose", values=4e-4 * np.random.default_rng([3, seed]).normal(size=6))
+    start = start_of(robot, walk(robot, seed, 400), (pose,), seed)
+    found = together(start, Hypotheses.of(start.simulation, start.observations).effects)
+    assert [cause.name for cause in found.causes] == ["camera_pose"]
 
 
 @pytest.mark.parametrize("seed", range(3))
