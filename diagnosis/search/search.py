@@ -87,7 +87,7 @@ class Beside:
     def without(self) -> Fit:
         """Return the fit without the cause.
 
-        What began a little later or earlier may have left the rows between to it, so without it another moment is right.
+        Another that begins beside it may have left rows to it, and begins at another moment without it.
         """
         fit = improved(self._fit.starting(self.others))
         for k in np.flatnonzero([one.kind.begins for one in self.others] if self._cause.kind.begins else []).tolist():
