@@ -153,23 +153,17 @@ class Sets:
 
         Without them different sets may be the same.
         """
-        starts, seen = [*starts], dict[frozenset[int], Together]()
-        reached = [self.possible(self._climbed(start, seen)) for start in starts]
-        if max(reached, key=lambda one: one.worth).scales.several_times == 0.0:
-            exact, others = self._of_an_exact_arm, dict[frozenset[int], Together]()
-            near = [exact._climbed(start, others).chosen for start in starts]
-            reached += [self.possible(self._climbed(start, seen)) for start in dict.fromkeys(near)]
-        return list({frozenset(one.chosen): one for one in reached}.values())
-
-    @cached_property
-    def _of_an_exact_arm(self) -> Sets:
-        """The same sets beside no tolerances.
-
-        Beside tolerances that have followed a cause it seems to be worth nothing, however small they are.
-        """
-        exact = copy(self)
-        exact._log_most, exact._known = _LOG_SMALLEST, {}
-        return exact
+        seen: dict[frozenset[int], Together] = {}
+        reached = {self.possible(self._climbed(start, seen)).chosen: None for start in starts}
+        best = max(map(self.of, reached), key=lambda one: one.worth)
+        if best.scales.several_times == 0.0:
+            # Beside tolerances that have followed a cause it seems to be worth nothing, however small they are.
+            exact, others = copy(self), dict[frozenset[int], Together]()
+            exact._log_most, exact._known = _LOG_SMALLEST, {}
+            near = dict.fromkeys(exact._climbed(start, others).chosen for start in ((), best.chosen))
+            near = [one for one in near if self.of(one, best).worth > best.worth - COMES_NEAR]
+            reached |= {self.possible(self._climbed(start, seen)).chosen: None for start in near}
+        return list({frozenset(chosen): self.of(chosen) for chosen in reached}.values())
 
     def possible(self, here: Together) -> Together:
         """Return a set without the causes whose amounts would be impossible, such as a negative backlash."""
