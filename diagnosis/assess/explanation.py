@@ -196,8 +196,12 @@ def _is_told(cause: Effect, beyond: bool | None, loss: float) -> bool:
 
 
 def _missed(fit: Fit, blocks: Blocks) -> FloatArray:
-    """Return squared held-out distances (n,) [m²]."""
-    return np.square(held_out_errors(fit, blocks)).sum(axis=1)
+    """Return squared held-out errors (n,), in units of the stated noise.
+
+    In metres, the rows that the instrument sees least exactly would decide.
+    """
+    errors = held_out_errors(fit, blocks)[:, :, None]
+    return np.square(fit.observations.whitened(errors)).sum(axis=(1, 2))
 
 
 def _rescaled(

@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import chdtri
 
 from bodyschema.diagnosis.fit.fit import Fit, amount_columns, improved, solved
@@ -84,8 +85,17 @@ class Beside:
 
     @cached_property
     def without(self) -> Fit:
-        """Return the fit without the cause."""
-        return improved(self._fit.starting(self.others))
+        """Return the fit without the cause.
+
+        Another that begins beside it may have left rows to it, and begins at another moment without it.
+        """
+        fit = improved(self._fit.starting(self.others))
+        for k in np.flatnonzero([one.kind.begins for one in self.others] if self._cause.kind.begins else []).tolist():
+            others = [*fit.causes]
+            if (again := moment_again(fit, others[k], _near_moment(fit, others[k]))) is not None:
+                others[k] = again.effect
+                fit = max(fit, improved(fit.starting(others)), key=lambda one: one.log_likelihood)
+        return fit
 
     @property
     def lead(self) -> float:
@@ -103,9 +113,11 @@ class Beside:
     def is_lost_for(self, worth: float) -> bool:
         """Return True if the cause is worth less than `worth` [nats]."""
         rise = rise_for(worth, self.itself.dof)
+        least = self._fit.log_likelihood - rise
+        if self._cause.kind.begins and any(one.kind.begins for one in self.others):
+            return self.without.log_likelihood > least
         if self._fit.loss(self._cause) > _Settings.clearly * rise + _Settings.at_least:
             return False
-        least = self._fit.log_likelihood - rise
         return improved(self._fit.starting(self.others), least).log_likelihood > least
 
     def elsewhere(self) -> Fit | None:
@@ -114,8 +126,7 @@ class Beside:
         least = fit.log_likelihood + _Settings.elsewhere
         tried = [self.itself] if self.itself.gain > self.gain + _Settings.elsewhere else []
         if cause.kind.begins:
-            row = int(np.searchsorted(fit.observations.motion.clock, cause.values[-1]))
-            near = np.abs(np.arange(len(fit.left)) + 0.5 - row) < _Settings.near_a_moment
+            near = _near_moment(fit, cause)
             if (fit.noise.weights[near & fit.observations.trusted] < _Settings.off).any():
                 tried += [again for again in [moment_again(fit, cause, near)] if again is not None]
         for candidate in tried:
@@ -369,6 +380,12 @@ class Search:
         lead = min(beside.lead, 0.5 * beside.itself.gain - rise_for(least, beside.itself.dof))
         self._leads[cause.identity] = lead, fit.log_likelihood, fit.observations
         return None
+
+
+def _near_moment(fit: Fit, cause: Effect) -> NDArray[np.bool_]:
+    """Return the rows (n,) near the moment at which a cause begins."""
+    row = int(np.searchsorted(fit.observations.motion.clock, cause.values[-1]))
+    return np.abs(np.arange(len(fit.left)) + 0.5 - row) < _Settings.near_a_moment
 
 
 def _rise(worth: float, dof: int, counted: float) -> float:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -34,8 +35,8 @@ _FARTHEST = 1.0
 _QUIETEST = 1e-3
 # Number of the most promising moves that are tried with their own scales.
 _TRIED = 4
-# With all scales below this, also try an arm exactly as described, such as a simulated one.
-_MAY_BE_EXACT = 0.5
+# Logarithms of the sizes, in usual ones, with which a pose is tried before its own is fitted.
+_SIZES = (0.0, -2.0, -4.0)
 # Prior width of what robot.toml does not know, about the fit, in usual sizes; the same in all fits, to compare them.
 _FREE = 100.0
 # Relative rounding of squares, and of columns that are collinear up to rounding.
@@ -66,6 +67,8 @@ class Together:
         chosen: indices of its candidates.
         worth: its evidence less the cost of naming its causes [nats]; comparable only with that of other sets.
         scales: scales of the tolerances.
+        logs: logarithms of these scales, then of the sizes of poses in usual ones.
+        group: the index (p,) in `logs` of each column's prior width; -1 where it is 1.
         sigma: size of the noise, in units of the stated one.
         spent: effective number of data that determine each scale (4,).
         amounts: amounts of all its columns (p,).
@@ -76,6 +79,8 @@ class Together:
     chosen: tuple[int, ...]
     worth: float
     scales: Scales
+    logs: FloatArray
+    group: NDArray[np.int64]
     sigma: float
     spent: FloatArray
     amounts: FloatArray
@@ -128,6 +133,7 @@ class Sets:
         ends = np.cumsum([0, *(len(effect.amounts) for effect in self.effects)])
         first = self._nuisances + self._tolerances
         self._places = [np.arange(first + a, first + b) for a, b in pairwise(ends)]
+        self._log_most = _LOG_MOST
         self._known_places: dict[tuple[int, ...], NDArray[np.intp]] = {}
         # Numbers of one cause that are added and removed together.
         groups: dict[tuple[object, ...], list[int]] = {}
@@ -148,8 +154,16 @@ class Sets:
         Without them different sets may be the same.
         """
         seen: dict[frozenset[int], Together] = {}
-        reached = (self.possible(self._climbed(start, seen)) for start in starts)
-        return list({frozenset(one.chosen): one for one in reached}.values())
+        reached = {self.possible(self._climbed(start, seen)).chosen: None for start in starts}
+        best = max(map(self.of, reached), key=lambda one: one.worth)
+        if best.scales.several_times == 0.0:
+            # Beside tolerances that have followed a cause it seems to be worth nothing, however small they are.
+            exact, others = copy(self), dict[frozenset[int], Together]()
+            exact._log_most, exact._known = _LOG_SMALLEST, {}
+            near = dict.fromkeys(exact._climbed(start, others).chosen for start in ((), best.chosen))
+            near = [one for one in near if self.of(one, best).worth > best.worth - COMES_NEAR]
+            reached |= {self.possible(self._climbed(start, seen)).chosen: None for start in near}
+        return list({frozenset(chosen): self.of(chosen) for chosen in reached}.values())
 
     def possible(self, here: Together) -> Together:
         """Return a set without the causes whose amounts would be impossible, such as a negative backlash."""
@@ -262,6 +276,8 @@ class Sets:
         """Return the worth of each of some groups of numbers with scales and noise held fixed [nats]."""
         own = [np.searchsorted(here.columns, self._places_of(group)) for group in groups]
         squares, volumes = _in_groups(here.covariance, here.amounts, own)
+        widths = np.append(here.logs, 0.0)[here.group]
+        volumes -= [widths[places].sum() for places in own]
         return squares + volumes - self._costs_of(here.chosen, groups, are_in=True)
 
     def _cost(self, chosen: Sequence[int]) -> float:
@@ -305,13 +321,18 @@ class Sets:
         across = self._inner[np.ix_(here.columns, places)] / here.sigma**2
         solved = dpotrs(here.factor, across, lower=True)[0]
         inner = self._inner[np.ix_(places, places)] / here.sigma**2 - across.T @ solved
-        inner[np.diag_indices_from(inner)] += 1.0
         gradient = self._toward[places] / here.sigma**2 - solved.T @ (self._toward[here.columns] / here.sigma**2)
         at = np.empty(len(self._toward), dtype=np.intp)
         at[places] = np.arange(len(places))
         own = [at[self._places_of(group)] for group in open_groups]
-        squares, volumes = _in_groups(inner, gradient, own)
-        worths = squares - volumes - self._costs_of(here.chosen, open_groups, are_in=False)
+        numbers, worths = np.array([len(one) for one in own]), np.full(len(own), -np.inf)
+        fixed = np.array([group[0] not in self._poses for group in open_groups])
+        for log in _SIZES:
+            narrow = inner + math.exp(-2.0 * log) * np.eye(len(inner))
+            squares, volumes = _in_groups(narrow, gradient, own)
+            worth = squares - volumes - numbers * log - 0.5 * (log / SPREAD) ** 2
+            worths = np.where(fixed & (log != 0.0), worths, np.maximum(worths, worth))
+        worths -= self._costs_of(here.chosen, open_groups, are_in=False)
         best = np.argsort(worths)[::-1]
         return [open_groups[k] for k in best[here.worth + worths[best] > least - COMES_NEAR].tolist()]
 
@@ -346,11 +367,11 @@ class Sets:
     def _fitted(self, chosen: tuple[int, ...], near: Together | None) -> Together:
         own = [self._places[k] for k in chosen]
         columns = np.sort(np.concatenate([np.arange(self._nuisances + self._tolerances), *own]).astype(np.intp))
-        group = self._group(columns)
+        group, most = self._group(columns, chosen)
         inner, toward = self._inner[np.ix_(columns, columns)], self._toward[columns]
-        logs = np.log(near.scales if near else Scales())
+        logs = np.minimum(np.append(np.log(near.scales if near else Scales()), np.zeros(len(most) - SCALES)), most)
         sigma = near.sigma if near else self._noise
-        members, spent = (group == np.arange(SCALES)[:, None]).astype(np.float64), np.zeros(SCALES)
+        members, spent = (group == np.arange(len(most))[:, None]).astype(np.float64), np.zeros(len(most))
         unit = np.eye(len(columns), order="F")
         for done in range(_ROUNDS if near is None else _ROUNDS_NEAR):
             factor, variances, amounts = solution = self._solved(inner, toward, group, logs, sigma)
@@ -360,7 +381,7 @@ class Sets:
             spent, squares = members @ told, members @ (np.square(amounts) / variances)
             steps = (squares - spent - logs / SPREAD**2) / (2.0 * np.maximum(spent, 0.5) + 1.0 / SPREAD**2)
             steps = np.minimum(np.maximum(steps, -_FARTHEST), _FARTHEST)
-            moved = np.minimum(np.maximum(logs + steps, _LOG_SMALLEST), _LOG_MOST)
+            moved = np.minimum(np.maximum(logs + steps, _LOG_SMALLEST), most)
             rss = self._square - 2.0 * float(amounts @ toward) + float(amounts @ inner @ amounts)
             free = max(self._rows - float(told.sum()), 1.0)
             quieter = 0.5 * math.log(max(rss, 1e-300) / free) - math.log(sigma)
@@ -371,37 +392,34 @@ class Sets:
             sigma = max(sigma * math.exp(quieter), _QUIETEST * self._noise)
         else:
             solution = self._solved(inner, toward, group, logs, sigma)
-        worth = self._evidence(solution, toward, sigma)
-        scales = Scales(*np.exp(logs).tolist())
-        worth -= scales.doubt + _volume(spent)
-        if math.exp(logs[members.any(axis=1)].max()) < _MAY_BE_EXACT:
-            exact = self._solved(inner, toward, group, np.full(SCALES, _LOG_SMALLEST), sigma)
-            if (evidence := self._evidence(exact, toward, sigma)) > worth:
-                worth, solution, scales = evidence, exact, Scales(*[SMALLEST] * SCALES)
+        scales, sizes = Scales(*np.exp(logs[:SCALES]).tolist()), logs[SCALES:]
+        worth = self._evidence(solution, toward, sigma) - scales.doubt - _volume(spent[:SCALES])
+        as_described = np.append(np.full(SCALES, _LOG_SMALLEST), sizes)
+        exact = self._solved(inner, toward, group, as_described, sigma)
+        if (evidence := self._evidence(exact, toward, sigma)) > worth:
+            worth, solution, scales, logs = evidence, exact, Scales(*[SMALLEST] * SCALES), as_described
+        worth -= 0.5 * float(np.square(sizes / SPREAD).sum()) + _volume(spent[SCALES:])
         worth += self._outliers - self._cost(chosen) - NAMED * scales.several_times
         factor, _, amounts = solution
-        return Together(chosen, worth, scales, sigma, spent, amounts, factor, columns)
+        return Together(chosen, worth, scales, logs, group, sigma, spent[:SCALES], amounts, factor, columns)
 
     def shown(self, here: Together) -> NDArray[np.bool_]:
         """Return True for each scale without whose tolerances the data would be much less probable (4,)."""
-        inner, toward = self._inner[np.ix_(here.columns, here.columns)], self._toward[here.columns]
-        group = self._group(here.columns)
-        whole = self._worth(inner, toward, group, np.log(here.scales), here.sigma)
+        whole = self._worth(here, here.logs)
         without = []
         for g in range(SCALES):
-            logs = np.log(here.scales)
+            logs = here.logs.copy()
             logs[g] = _LOG_SMALLEST
-            without.append(self._worth(inner, toward, group, logs, here.sigma))
+            without.append(self._worth(here, logs))
         return whole - np.array(without) > _SHOWN
 
     def largest(self, here: Together) -> FloatArray:
         """Return the largest scales (4,), each beside the others as they are, that the data do not rule out."""
-        inner, toward = self._inner[np.ix_(here.columns, here.columns)], self._toward[here.columns]
-        group, found = self._group(here.columns), np.array(here.scales)
+        found = np.array(here.scales)
         for g in range(SCALES):
-            logs, best = np.log(here.scales), -np.inf
+            logs, best = here.logs.copy(), -np.inf
             while logs[g] < _LOG_MOST:
-                worth = self._worth(inner, toward, group, logs, here.sigma)
+                worth = self._worth(here, logs)
                 best = max(best, worth)
                 if worth < best - _RULED_OUT:
                     break
@@ -409,15 +427,22 @@ class Sets:
             found[g] = np.exp(logs[g])
         return found
 
-    def _group(self, columns: NDArray[np.intp]) -> NDArray[np.int64]:
-        """Return the scale of each column (p,); -1 where it is not a tolerance."""
+    def _group(self, columns: NDArray[np.intp], chosen: Sequence[int]) -> tuple[NDArray[np.int64], FloatArray]:
+        """Return the index of each column's prior width (p,), -1 where it is 1, and the largest logarithms of these.
+
+        First come the scales of tolerances, then the sizes of poses: a camera may be off by 0.05 mm or by 50.
+        """
         group = np.full(len(columns), -1)
         group[self._nuisances : self._nuisances + self._tolerances] = self._of_scale
-        return group
+        sized = [k for k in chosen if k in self._poses]
+        for index, k in enumerate(sized, SCALES):
+            group[np.searchsorted(columns, self._places[k])] = index
+        return group, np.append(np.full(SCALES, self._log_most), np.full(len(sized), _LOG_MOST))
 
-    def _worth(self, inner: FloatArray, toward: FloatArray, group: np.ndarray, logs: FloatArray, sigma: float) -> float:
-        """Return the evidence of scales and noise [nats]."""
-        return self._evidence(self._solved(inner, toward, group, logs, sigma), toward, sigma)
+    def _worth(self, here: Together, logs: FloatArray) -> float:
+        """Return the evidence of a set with other scales [nats]."""
+        inner, toward = self._inner[np.ix_(here.columns, here.columns)], self._toward[here.columns]
+        return self._evidence(self._solved(inner, toward, here.group, logs, here.sigma), toward, here.sigma)
 
     def _evidence(self, solution: _Solution, toward: FloatArray, sigma: float) -> float:
         """Return the evidence of the scales and the noise of a solution [nats]."""
@@ -430,7 +455,7 @@ class Sets:
         self, inner: FloatArray, toward: FloatArray, group: np.ndarray, logs: FloatArray, sigma: float
     ) -> _Solution:
         """Return the factor of the precision, prior variances (p,) and amounts (p,), in units of `_units`."""
-        # The last of the scales stands for columns that are no tolerances.
+        # The last of the widths stands for columns that have none of their own.
         variances = np.append(np.exp(2.0 * logs), 1.0)[group]
         precision = inner / sigma**2
         diagonal = precision.reshape(-1)[:: len(precision) + 1]

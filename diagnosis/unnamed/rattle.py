@@ -108,14 +108,18 @@ def _two_sided(fit: Fit) -> Rattle | None:
         return None
     left = _on_link(fit)
     variances, axes = np.linalg.eigh(np.cov(left[rows].T))
-    means, sigma, worth, sides = _two_sides(left @ axes[:, 2], rows)
+    along = left @ axes[:, 2]
+    ways = np.einsum("nji,j->ni", _turns(fit), axes[:, 2])
+    means, sigma, worth, sides = _two_sides(along, rows)
+    # Rows that the instrument sees less exactly than others look like a second side.
+    stated = np.sqrt(np.einsum("ni,nij,nj->n", ways, fit.observations.own, ways))
+    worth = min(worth, _two_sides(along / stated, rows)[2])
     alike = _alike(sides, rows, fit.observations.motion.begins)
     if alike > 0.0:
         sides = np.where(_on_their_way(sides), 0.0, sides)
     worth += alike
     half = 0.5 * float(means[1] - means[0])
     ratio = float(variances[2] / max(variances[:2].mean(), _Settings.least_across**2 * variances[2])) - 1.0
-    ways = np.einsum("nji,j->ni", _turns(fit), axes[:, 2])
     rarer = min(int((sides[rows] < 0.0).sum()), int((sides[rows] > 0.0).sum()))
     is_clear = (
         2.0 * half >= _Settings.apart * sigma and worth >= _Settings.named and ratio >= _Settings.beyond_noise**2 - 1.0

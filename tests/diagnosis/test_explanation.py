@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
-from planted_cases import ELBOW, SHOULDER, SIGMA_M, desk_arm, measured, motion_of, start_of, walk
+from planted_cases import ELBOW, SHOULDER, SIGMA_M, desk_arm, measured, motion_of, start_of, surveyed_arm, walk
 
 from bodyschema.diagnosis.assess import explanation
-from bodyschema.diagnosis.assess.explanation import Explanation, explain
+from bodyschema.diagnosis.assess.explanation import Explanation, explain, useful
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.fit.worth import NAMED
+from bodyschema.diagnosis.search.held_out import Blocks
 from bodyschema.diagnosis.search.search import Search
 from bodyschema.diagnosis.unnamed.families import families
 from bodyschema.diagnosis.unnamed.unknown import Unknowns, Way
@@ -94,3 +96,16 @@ def test_noise_that_is_alike_in_neighbouring_rows_puts_no_unnamed_error_in_the_p
     chosen = explain(found, [start, found], Unknowns(start), Search([cause], lambda _: None), lambda _: None)
     assert chosen.fit.causes
     assert not chosen.unknown
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_cause_stays_that_only_the_rows_show_which_the_instrument_sees_well(seed) -> None:
+    robot, rng = surveyed_arm(), np.random.default_rng([seed, 7])
+    motion = walk(robot, seed, 400)
+    cause = Effect.at(robot, "joint_eccentricity", ELBOW, values=[1e-3, 1e-3])
+    sizes = np.where(rng.random(400) < 0.2, 0.05, SIGMA_M)
+    x = Simulation(robot, (cause,)).positions(motion) + sizes[:, None] * rng.normal(size=(400, 3))
+    recording = replace(measured(robot, motion, x), cov=np.square(sizes)[:, None, None] * np.eye(3))
+    fit = aligned(Observations.of(recording, Simulation(robot)), Simulation(robot)).with_causes([cause])
+    found = Explanation(fit, None, 0.0)
+    assert useful(found, Search([cause], lambda _: None), Blocks.cut(400), lambda _: None).fit.causes

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,7 +16,7 @@ from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.report.conclusion import conclusion
 from bodyschema.diagnosis.report.result import DiagnosisFile
-from bodyschema.diagnosis.unnamed.rattle import Rattle, rattle
+from bodyschema.diagnosis.unnamed.rattle import Rattle, rattle, rattle_beside
 from bodyschema.diagnosis.unnamed.rattle import _Settings as Limits
 from bodyschema.effects import Effect, Simulation
 
@@ -226,3 +227,19 @@ def test_a_loose_marker_in_few_rows_has_noise(rows) -> None:
     found = diagnose(measured(robot, motion, x + SIGMA_M * rng.normal(size=x.shape)), Simulation(robot))
     assert found.extended.noise.sigma > 0.5
     assert conclusion(found).causes == ()
+
+
+@pytest.mark.parametrize("seed", range(2, 6))
+def test_rows_that_the_instrument_sees_less_exactly_are_no_second_side(seed) -> None:
+    robot, rng = surveyed_arm(), np.random.default_rng([seed, 8])
+    motion = walk(robot, seed, 400)
+    run = Simulation(robot).run(motion)
+    turns = run.simulation.camera_pose[:3, :3].T @ run.frames[:, -1, :3, :3]
+    sizes = np.full((len(motion), 3), SIGMA_M)
+    sizes[rng.random(len(motion)) < 0.05, 2] = 5e-3
+    roots = turns * sizes[:, None, :]
+    x = run.measured + np.einsum("nij,nj->ni", roots, rng.normal(size=sizes.shape))
+    exact = measured(robot, motion, x)
+    stated = np.array([root @ root.T for root in roots])
+    recording = replace(exact, cov=0.5 * (stated + np.swapaxes(stated, 1, 2)))
+    assert rattle_beside(aligned(Observations.of(recording, Simulation(robot)), Simulation(robot))) is None

@@ -75,6 +75,21 @@ def test_a_cause_is_exchanged_for_a_rival_that_explains_more(robot) -> None:
     assert names(found) == {("joint_coupling", ELBOW), ("encoder_jump", SHOULDER)}
 
 
+@pytest.mark.parametrize("seed", [5, 6])
+def test_a_jump_that_stands_for_the_first_rows_of_a_bump_is_dropped(seed) -> None:
+    robot = surveyed_arm()
+    jump = Effect.at(robot, "encoder_jump", BASE, values=[0.01, 40.1])
+    bump = Effect.at(robot, "camera_moved", values=[0.0] * 6 + [40.1])
+    # Mostly about the first axis, which is what a jump of that joint looks like.
+    (bump,) = start_of(robot, walk(robot, seed), (jump,), seed).with_causes([bump]).causes
+    bump = bump.with_values(bump.values + np.array([5e-4] * 3 + [1e-3] * 3 + [0.0]))
+    early = bump.with_values(np.append(bump.values[:-1], 35.1))
+    misled = start_of(robot, walk(robot, seed), (bump,), seed).with_causes([early, jump])
+    found = Search([early, jump], lambda _: None).run(misled)
+    assert names(found) == {("camera_moved", None)}
+    assert found.causes[0].values[-1] == pytest.approx(40.1, abs=INTERVAL_S)
+
+
 @pytest.mark.parametrize("first", ["camera_pose", "link_geometry"])
 def test_of_two_causes_that_explain_the_same_the_simpler_one_is_named(first) -> None:
     robot = surveyed_arm()

@@ -7,7 +7,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from planted_cases import BASE, ELBOW, SHOULDER, WRIST, desk_arm, measured, motion_of, scattered, surveyed_arm
+from planted_cases import (
+    BASE,
+    ELBOW,
+    SHOULDER,
+    WRIST,
+    desk_arm,
+    measured,
+    motion_of,
+    scattered,
+    start_of,
+    surveyed_arm,
+    walk,
+)
 
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.background import Scales
@@ -102,10 +114,10 @@ def test_a_link_leaves_a_roughly_made_arm_unless_it_is_bent_far_more(seed, bent,
     assert (place.with_one_less() is None) is stays
 
 
-@pytest.mark.parametrize("angle", [5e-3, 8e-3])
+@pytest.mark.parametrize(("arm", "angle"), [(desk_arm, 5e-3), (desk_arm, 8e-3), (surveyed_arm, 1e-3)])
 @pytest.mark.parametrize("seed", range(6))
-def test_a_roughly_made_arm_has_no_cause(seed, angle) -> None:
-    start = rough(desk_arm(), seed, angle)
+def test_a_roughly_made_arm_has_no_cause(seed, arm, angle) -> None:
+    start = rough(arm(), seed, angle)
     hypotheses = Hypotheses.of(start.simulation, start.observations).effects
     assert together(start, hypotheses).causes == ()
 
@@ -137,6 +149,25 @@ def test_tolerances_of_a_workshop_are_no_cause_instead() -> None:
     start, hypotheses = bent(1, 0.0)
     fit = start.tolerating(Scales())
     assert in_place_of_tolerances(fit.tolerating(tolerated(fit).scales), hypotheses) == []
+
+
+@pytest.mark.parametrize("seed", [0, 1, 3, 4])
+def test_a_small_shift_of_a_link_is_found_where_small_tolerances_would_follow_it(seed) -> None:
+    robot = surveyed_arm()
+    shift = Effect.at(robot, "link_geometry", WRIST, values=[5e-4, -5e-4, 5e-4, 0.0, 0.0, 0.0])
+    lens = Effect.at(robot, "camera_focal", values=[2e-3])
+    start = start_of(robot, walk(robot, seed), (shift, lens), seed)
+    found = together(start, Hypotheses.of(start.simulation, start.observations).effects)
+    assert {(cause.name, cause.where) for cause in found.causes} == {("link_geometry", WRIST), ("camera_focal", None)}
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_camera_that_stands_half_a_millimetre_off_is_found_where_tolerances_would_follow_it(seed) -> None:
+    robot = surveyed_arm()
+    pose = Effect.at(robot, "camera_pose", values=4e-4 * np.random.default_rng([3, seed]).normal(size=6))
+    start = start_of(robot, walk(robot, seed, 400), (pose,), seed)
+    found = together(start, Hypotheses.of(start.simulation, start.observations).effects)
+    assert [cause.name for cause in found.causes] == ["camera_pose"]
 
 
 @pytest.mark.parametrize("seed", range(3))
