@@ -500,7 +500,7 @@ def _found(
     if loose is None:
         return found
     # No simulation tells on which side the marker lies.
-    whole = start.observations.without_play(np.zeros_like(start.observations.x))
+    whole = start.observations.without_play(np.zeros_like(start.observations.x)).without(_left_out(explanation.fit))
     return found.of(whole.with_rattle(loose.ratio, loose.ways), simulation)
 
 

@@ -16,7 +16,7 @@ from bodyschema.diagnosis.fit.background import MOST, Scales
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.search.held_out import Blocks, is_marker
-from bodyschema.effects import Effect, Simulation
+from bodyschema.effects import Effect, Motion, Simulation
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
 
@@ -68,6 +68,31 @@ def test_what_is_written_is_placed_by_both_sides_of_a_play(robot) -> None:
     fit = start.to(loose.with_rattle(100.0, ways)).tolerating(Scales())
     left = loose.x - fit.written.positions(loose.motion)
     np.testing.assert_allclose(left.mean(axis=0), 0.0, atol=0.02 * SIGMA_M)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 5])
+def test_tolerances_beside_a_marker_that_hangs_where_gravity_takes_it_are_stored(robot, seed) -> None:
+    rng, motion = np.random.default_rng(seed), walk(robot, seed)
+    links = tuple(
+        Effect.at(robot, "link_geometry", joint, values=rng.normal(size=6) * np.repeat([5e-4, 2e-3], 3))
+        for joint in robot.joints
+    )
+
+    def seen(motion: Motion) -> tuple[FloatArray, FloatArray]:
+        """Return the positions of a marker with play, and the direction of its play."""
+        run = Simulation(robot, links).run(motion)
+        ways = run.columns(Effect.at(robot, "tool_offset")) @ np.array([0.6, 0.0, 0.8])
+        down = (ways @ run.simulation.camera_pose[:3, :3].T)[:, [2]]
+        return run.measured + 2e-3 * np.sign(down) * ways, ways
+
+    x, ways = seen(motion)
+    recording = measured(robot, motion, x + SIGMA_M * rng.normal(size=x.shape))
+    observations, elsewhere = Observations.of(recording, Simulation(robot)), walk(robot, 100 + seed)
+    start = aligned(observations.whole, Simulation(robot))
+    loose = aligned(observations.with_rattle(100.0, ways), Simulation(robot)).tolerating(Scales(3.0, 3.0, 1.0))
+    assert stored([start, loose], is_marker(start)) is loose
+    before, after = (np.square(fit.written.positions(elsewhere) - seen(elsewhere)[0]).sum() for fit in (start, loose))
+    assert after < before
 
 
 def test_rows_that_a_cause_ignored_place_the_arm_that_is_stored_without_it(robot) -> None:
