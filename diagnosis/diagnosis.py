@@ -321,7 +321,7 @@ def diagnose(
     start, explanation, search = found.start, found.explanation, found.search
     if found.loose is not None:
         # Where the side goes with the pose, one that follows it predicts better.
-        start = aligned(replace(start.observations, rattling=None), simulation)
+        start = aligned(start.observations.whole, simulation)
     left = found.left(blocks)
     fit = (explanation.fit if left.model is None else left.model.fit).settled()
     made = tolerated(fit)
@@ -500,7 +500,7 @@ def _found(
     if loose is None:
         return found
     # No simulation tells on which side the marker lies.
-    whole = start.observations.without_play(np.zeros_like(start.observations.x))
+    whole = start.observations.without_play(np.zeros_like(start.observations.x)).without(_left_out(explanation.fit))
     return found.of(whole.with_rattle(loose.ratio, loose.ways), simulation)
 
 
@@ -545,7 +545,7 @@ def _stored(start: Fit, alone: Fit, complete: Fit, left: Leftover, blocks: Block
     markers = is_marker(complete)
     has_model = left.model is not None and left.model.stored is not None
     largest = alone.settled() if has_model else complete
-    fits = [start, largest]
+    fits = [start.to(start.observations.whole), largest]
     if largest.causes and largest.background.scales is not None:
         fits.insert(1, start.with_causes(largest.causes))
     best = stored(fits, markers)

@@ -75,12 +75,19 @@ class _Elsewhere:
             return cls(fit, _sums(errors, markers), 0.0)
         parts, columns, here = _long_blocks(len(errors)).of_row, fit.columns, fit.run_columns
         flat, left = columns.reshape(fit.left.size, -1), fit.left.ravel()
+        whole = fit.observations.whole
+        free = whole.whitened(here[:, :, : fit.amounts]) * fit.root_weights[:, :, None]
         normal = flat.T @ flat + np.diag(fit.precision) * fit.noise.sigma**2
         gradient, changes = flat.T @ left, []
         for part in np.unique(parts):
             own = parts == part
             rows = columns[own].reshape(-1, columns.shape[2])
             change = solved(normal - rows.T @ rows, gradient - rows.T @ fit.left[own].ravel())
+            if fit.observations.rattling is not None:
+                # As it is written: both sides of the play place it.
+                missed = (whole.residuals(fit.predicted + here @ change) * fit.root_weights)[~own].ravel()
+                rest = free[~own].reshape(len(missed), fit.amounts)
+                change[: fit.amounts] += solved(rest.T @ rest, rest.T @ missed)
             errors[own] -= here[own] @ change
             changes.append(change)
         elsewhere = _columns(fit, fit.settled_simulation.run(_new_poses(fit.observations.motion)))

@@ -466,11 +466,12 @@ class Fit:
         """Return the simulation to be stored: tolerances as found, and everything else refitted beside them.
 
         Tolerances are found to first order. Where a link turns one way and the camera the other, their second-order
-        terms are left over.
+        terms are left over. Rows that were ignored for the sake of other causes count here.
         """
-        if self.background.scales is None:
+        if self.is_exact:
             return self.simulation
-        return improved(self._about(self.settled_simulation, None)).simulation
+        observations = replace(self.observations, rattling=None) if self.doubtful().any() else self.observations.whole
+        return improved(self._about(self.settled_simulation, None, observations)).simulation
 
     def untolerated(self) -> Fit:
         """Refit without any tolerance."""

@@ -40,6 +40,7 @@ class Observations:
         doubtful: rows (n,) at which the simulation lacks a state it needs; None for no such rows.
         rattling: covariance (n, 3, 3) [m²] of a loose marker; None for one that is fixed.
         play: displacement (n, 3) [m] of a loose marker that was taken out of `x`; 0 for none.
+        is_whole: True if no row is ignored, since each is predicted by its own readings alone.
     """
 
     motion: Motion
@@ -50,6 +51,7 @@ class Observations:
     doubtful: NDArray[np.bool_] | None = None
     rattling: FloatArray | None = None
     play: FloatArray | float = 0.0
+    is_whole: bool = False
 
     @classmethod
     def of(cls, recording: Recording, simulation: Simulation) -> Observations:
@@ -98,6 +100,11 @@ class Observations:
         """Return the same observations with rows (n,) that are ignored."""
         return replace(self, doubtful=doubtful)
 
+    @property
+    def whole(self) -> Observations:
+        """The same observations as they place an arm without memory: all rows count, and both sides of a play."""
+        return replace(self, doubtful=None, rattling=None, is_whole=True)
+
     def with_factor(self, stated_factor: float) -> Observations:
         """Return the same observations with another factor on the instrument's noise."""
         return replace(self, stated_factor=stated_factor)
@@ -119,7 +126,7 @@ class Observations:
         unknown.
         """
         begins = self.motion.begins
-        if begins.sum() * _ROWS_A_RUN > len(self):
+        if self.is_whole or begins.sum() * _ROWS_A_RUN > len(self):
             begins = np.zeros(len(self), dtype=np.bool_)
         return ~begins if self.doubtful is None else ~(begins | self.doubtful)
 

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from planted_cases import ELBOW, SHOULDER, SIGMA_M, desk_arm, measured, motion_of, walk
 
+from bodyschema.diagnosis.assess.leftover import Leftover
 from bodyschema.diagnosis.assess.stored import _Elsewhere, stored
+from bodyschema.diagnosis.diagnosis import _stored
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.background import MOST, Scales
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.observations import Observations
-from bodyschema.diagnosis.search.held_out import is_marker
-from bodyschema.effects import Effect, Simulation
+from bodyschema.diagnosis.search.held_out import Blocks, is_marker
+from bodyschema.effects import Effect, Motion, Simulation
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
 
@@ -45,6 +49,57 @@ def test_tolerances_fitted_to_a_change_with_time_are_not_stored(robot) -> None:
     large = start.tolerating(Scales(MOST, MOST, MOST))
     assert np.square(large.residuals).sum() < np.square(start.residuals).sum()
     assert stored([start, large], is_marker(large)) is start
+
+
+def test_what_is_written_is_placed_by_all_rows(robot) -> None:
+    start = placed(robot, np.zeros(ROWS))
+    ignoring = start.to(start.observations.without(np.arange(ROWS) < ROWS // 2))
+    for fit in (ignoring, ignoring.tolerating(Scales())):
+        # The camera may stand anywhere, so nothing is left of the mean of the rows by which it is placed.
+        left = start.observations.x - fit.written.positions(start.observations.motion)
+        np.testing.assert_allclose(left.mean(axis=0), 0.0, atol=1e-3 * SIGMA_M)
+
+
+def test_what_is_written_is_placed_by_both_sides_of_a_play(robot) -> None:
+    start = placed(robot, np.zeros(ROWS))
+    ways = start.run.columns(Effect.at(robot, "tool_offset")) @ np.array([0.6, 0.0, 0.8])
+    beyond = np.where(np.arange(ROWS) // 10 % 3, 2e-3, -2e-3)[:, None] * ways
+    loose = replace(start.observations, x=start.observations.x + beyond)
+    fit = start.to(loose.with_rattle(100.0, ways)).tolerating(Scales())
+    left = loose.x - fit.written.positions(loose.motion)
+    np.testing.assert_allclose(left.mean(axis=0), 0.0, atol=0.02 * SIGMA_M)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 5])
+def test_tolerances_beside_a_marker_that_hangs_where_gravity_takes_it_are_stored(robot, seed) -> None:
+    rng, motion = np.random.default_rng(seed), walk(robot, seed)
+    links = tuple(
+        Effect.at(robot, "link_geometry", joint, values=rng.normal(size=6) * np.repeat([5e-4, 2e-3], 3))
+        for joint in robot.joints
+    )
+
+    def seen(motion: Motion) -> tuple[FloatArray, FloatArray]:
+        """Return the positions of a marker with play, and the direction of its play."""
+        run = Simulation(robot, links).run(motion)
+        ways = run.columns(Effect.at(robot, "tool_offset")) @ np.array([0.6, 0.0, 0.8])
+        down = (ways @ run.simulation.camera_pose[:3, :3].T)[:, [2]]
+        return run.measured + 2e-3 * np.sign(down) * ways, ways
+
+    x, ways = seen(motion)
+    recording = measured(robot, motion, x + SIGMA_M * rng.normal(size=x.shape))
+    observations, elsewhere = Observations.of(recording, Simulation(robot)), walk(robot, 100 + seed)
+    start = aligned(observations.whole, Simulation(robot))
+    loose = aligned(observations.with_rattle(100.0, ways), Simulation(robot)).tolerating(Scales(3.0, 3.0, 1.0))
+    assert stored([start, loose], is_marker(start)) is loose
+    before, after = (np.square(fit.written.positions(elsewhere) - seen(elsewhere)[0]).sum() for fit in (start, loose))
+    assert after < before
+
+
+def test_rows_that_a_cause_ignored_place_the_arm_that_is_stored_without_it(robot) -> None:
+    start = placed(robot, np.zeros(ROWS))
+    ignoring = start.to(start.observations.without(np.arange(ROWS) < ROWS // 2))
+    best = _stored(ignoring, ignoring, ignoring, Leftover((), (), False, 1.0), Blocks.cut(ROWS))
+    assert (best.noise.weights > 0.5).all()
 
 
 def test_a_cause_that_explains_nothing_is_not_stored(robot) -> None:
