@@ -23,7 +23,7 @@ class CameraScale(CameraEffect):
 
     def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
         # 1 mm of a side of 50 mm; a print that was fitted to the page is 3 to 6 % too small.
-        return (Parameter("scale_error", 0.01),)
+        return (Parameter("scale_error", 0.02),)
 
     def optics(self, values: FloatArray) -> Optics:
         return Optics(scale_error=float(values[0]))
