@@ -57,6 +57,7 @@ class EffectType(ABC):
         needs_weight: True if it needs joints that bear the arm's weight.
         in_parts: True if only some of its amounts may differ from nominal, as where a link is too long but straight.
         rigid: True if a rigid chain can hold it.
+        scales_all: True if the lengths of all links, wrong by one factor, look like it.
         is_spring: True if its joint yields in proportion to its load.
         is_load: True if it is a mass that the URDF does not state.
         moves_joints: True if the true joint angles differ from the readings.
@@ -84,6 +85,7 @@ class EffectType(ABC):
     needs_weight: ClassVar[bool] = False
     in_parts: ClassVar[bool] = False
     rigid: ClassVar[bool] = False
+    scales_all: ClassVar[bool] = False
     is_spring: ClassVar[bool] = False
     is_load: ClassVar[bool] = False
     moves_joints: ClassVar[bool] = False
@@ -126,6 +128,11 @@ class EffectType(ABC):
     def encoder(self) -> EncoderEffect | None:
         """The effect, if it is one of the first stage."""
         return None
+
+    @property
+    def is_like_tolerances(self) -> bool:
+        """True if small errors of every link may stand for it."""
+        return (self.rigid and not self.is_zero) or self.scales_all
 
     @property
     def depends_on_path(self) -> bool:

@@ -136,6 +136,7 @@ def sentence(
         return f"The simulation is right to within the noise: nothing found in {rms.aligned:.3g} mm of error"
     if not causes:
         told = "What is measured differs from the simulation in a way that none of the known effects explains"
+        told += _or_a_cause(tolerances, seen_by)
         if named_mm is None:
             return told
         if not _shows(tolerances):

@@ -145,8 +145,8 @@ class Sets:
         known = {cause.identity for cause in fit.causes}
         # The moment of each was sought without the others, so it is right for one of them at most.
         self._begins = {k for k, one in enumerate(self.effects) if one.kind.begins and one.identity not in known}
-        # The camera's pose and the marker's place, which tolerances of the links beside them can follow.
-        self._poses = [k for k, one in enumerate(self.effects) if one.kind.rigid and not one.kind.at_joint]
+        # The camera's pose and scale and the marker's place, which tolerances of the links beside them can follow.
+        self._poses = [k for k, one in enumerate(self.effects) if one.kind.is_like_tolerances and not one.kind.at_joint]
 
     def climbed(self, starts: Iterable[tuple[int, ...]]) -> list[Together]:
         """Improve each start by single changes, and return the sets reached, without causes that cannot be.

@@ -86,15 +86,17 @@ def together(start: Fit, hypotheses: Sequence[Effect], tell: Callable[[str], Non
 def in_place_of_tolerances(fit: Fit, hypotheses: Sequence[Effect]) -> list[tuple[Effect, float]]:
     """Return what may be there, beside a fit's causes, instead of tolerances several times a workshop's.
 
-    These are links, the camera's pose and the marker's place: beside one of them the tolerances may be smaller.
+    These are links, the camera's pose and scale, and the marker's place: beside one of them the tolerances may be
+    smaller.
 
     Returns:
         Each with its probability among sets with one of these or none, without the margin for naming it.
     """
     if fit.background.scales is None or not fit.background.scales.several_times:
         return []
-    large = [one for one in hypotheses if one.kind.rigid and not one.kind.is_zero]
-    sets = _sets_about(fit, large, float(np.log(max(len(hypotheses), 1))))
+    # Beside large tolerances they may not be identifiable; beside smaller ones they are.
+    large = [Candidate(one, 0.0, 1) for one in _absent(fit, hypotheses) if one.kind.is_like_tolerances]
+    sets = _sets_of(fit, large, float(np.log(max(len(hypotheses), 1))))
     here = sets.of(sets.again(fit.causes))
     found = [(effect, one.worth + NAMED * (one.scales.several_times + 1.0)) for effect, one in sets.with_one(here)]
     without = here.worth + NAMED * here.scales.several_times
@@ -237,12 +239,20 @@ def _sets_about(fit: Fit, hypotheses: Sequence[Effect], doubt: float) -> Sets:
     Args:
         doubt: minimum cost of naming one of them [nats].
     """
+    return _sets_of(fit, [_at_rest(one) for one in _beside_links(fit, _absent(fit, hypotheses))], doubt)
+
+
+def _sets_of(fit: Fit, candidates: Sequence[Candidate], doubt: float) -> Sets:
+    """Return the sets of a fit's causes and of some candidates."""
+    everything = [*(Candidate(cause, 0.0, 1) for cause in fit.causes), *candidates]
+    return Sets(fit, [part for candidate in everything for part in _in_parts(candidate)], doubt)
+
+
+def _absent(fit: Fit, hypotheses: Sequence[Effect]) -> list[Effect]:
+    """Return the hypotheses that are no causes of a fit, nor refine one, nor have a simpler name."""
     present = {cause.key for cause in fit.causes}
     absent = [one for one in hypotheses if one.key not in present and not one.kind.refines]
-    absent = [one for one in absent if not has_simpler_name(one, hypotheses, fit.simulation)]
-    candidates = [Candidate(cause, 0.0, 1) for cause in fit.causes]
-    candidates += [_at_rest(one) for one in _beside_links(fit, absent)]
-    return Sets(fit, [part for candidate in candidates for part in _in_parts(candidate)], doubt)
+    return [one for one in absent if not has_simpler_name(one, hypotheses, fit.simulation)]
 
 
 def _beside_links(fit: Fit, absent: Sequence[Effect]) -> list[Candidate]:

@@ -145,6 +145,24 @@ def test_what_large_tolerances_may_be_instead_has_a_probability(seed) -> None:
     assert all(share < 0.02 for _, share in found[1:])
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_wrong_scale_is_named_rather_than_large_tolerances(seed) -> None:
+    robot = desk_arm()
+    start = rough(robot, seed, 1e-3, Effect.at(robot, "camera_scale", values=[0.03]))
+    hypotheses = Hypotheses.of(start.simulation, start.observations).effects
+    assert [cause.name for cause in together(start, hypotheses).causes] == ["camera_scale"]
+
+
+def test_a_scale_that_large_tolerances_absorb_is_told_as_an_alternative() -> None:
+    robot = desk_arm()
+    start = rough(robot, 2, 3e-3, Effect.at(robot, "camera_scale", values=[0.02]))
+    hypotheses = Hypotheses.of(start.simulation, start.observations).effects
+    fit = start.tolerating(Scales())
+    found = in_place_of_tolerances(fit.tolerating(tolerated(fit).scales), hypotheses)
+    assert found[0][0].name == "camera_scale"
+    assert found[0][1] > 0.3
+
+
 def test_tolerances_of_a_workshop_are_no_cause_instead() -> None:
     start, hypotheses = bent(1, 0.0)
     fit = start.tolerating(Scales())

@@ -106,6 +106,14 @@ def test_an_instrument_is_not_called_a_camera():
     assert finding("camera_moved", None, None, SHIFT, "instrument") == "the instrument moved by 1 mm"
 
 
+def test_a_wrong_scale_is_a_wrong_size_to_a_camera() -> None:
+    numbers = {"scale_error": -0.03}
+    assert finding("camera_scale", None, None, numbers) == (
+        "all that is measured is 3 % too small: a tag, ball or board has another size than stated"
+    )
+    assert finding("camera_scale", None, None, numbers, "instrument") == "all that is measured is 3 % too small"
+
+
 def test_a_slides_ripple_is_told_where_its_pitch_is_unsure():
     numbers = {
         "amplitude_m": Interval(2e-4, (1e-4, 3e-4)),
@@ -137,6 +145,9 @@ def test_what_large_tolerances_may_be_is_told_in_the_headline_and_beside_them() 
     ]
     assert all("small errors everywhere (or a wrong link before joint elbow, 30 %)" in one for one in said)
     assert not replace(rough, links_share_percent=1.0).leaves_open
+    scale = Indistinguishable("camera_scale", None, None, "this_motion", 0.6)
+    unexplained = sentence("unexplained", [], errors, gain, replace(rough, rivals=(scale,)))
+    assert "explains (or a wrong scale of all that is measured, 60 %)" in unexplained
 
 
 def test_an_alternative_that_is_more_probable_is_told_to_be_so() -> None:

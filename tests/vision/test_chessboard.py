@@ -134,7 +134,7 @@ def test_bent_plate_is_placed_as_well_as_a_flat_one(eyes, bent) -> None:
     assert 0.6 < (np.abs(off_bent) < 1.0).mean() < 0.8
 
 
-@pytest.mark.parametrize("squares", [(8, 5), (7, 5), (8, 4), (9, 6)], ids=str)
+@pytest.mark.parametrize("squares", [(8, 5), (7, 5), (8, 4), (9, 6), (11, 8)], ids=str)
 def test_larger_chessboard_is_refused_by_its_squares(squares, caplog) -> None:
     found = tracker_of(ONE, BOARD).track(photographed("one", shown(facing(15.0), squares=squares)))
     assert isinstance(found, MarkerMiss)
@@ -145,7 +145,7 @@ def test_larger_chessboard_is_refused_by_its_squares(squares, caplog) -> None:
 def test_smaller_chessboard_is_a_part_of_it() -> None:
     found = tracker_of(ONE, BOARD).track(photographed("one", shown(facing(15.0), squares=(6, 4))))
     assert isinstance(found, MarkerMiss)
-    assert found.reason in (Reason.OCCLUDED, Reason.NO_MARKER)
+    assert found.reason is Reason.OCCLUDED
 
 
 @pytest.mark.parametrize("eyes", EYES)

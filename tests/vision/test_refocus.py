@@ -49,21 +49,26 @@ def test_a_camera_without_autofocus_is_quiet(unknown) -> None:
     assert complaints(unknown, unknown, autofocus=unknown) == []
 
 
-@pytest.fixture(scope="module")
-def wandering() -> list[View]:
-    """Return views by cameras whose focal lengths differ from view to view by 1.5 % (1-sigma)."""
+def wandering_by(spread: float, *, alike: bool) -> list[View]:
+    """Return views by cameras whose focal lengths differ from view to view by a 1-sigma, in both eyes alike or not."""
     rng = np.random.default_rng(0)
     rig, refocus = webcams(rng), np.random.default_rng(77)
 
-    def refocused(lens: TrueLens) -> TrueLens:
-        factor = 1.0 + 0.015 * refocus.standard_normal()
+    def refocused(lens: TrueLens, factor: float) -> TrueLens:
         return replace(lens, focal_px=(factor * lens.focal_px[0], factor * lens.focal_px[1]))
 
     views = []
     for k, pose in enumerate(poses(rng, rig, Printed(), 14)):
-        moved = replace(rig, left=refocused(rig.left), right=refocused(rig.right))
+        left, right = 1.0 + spread * refocus.standard_normal(2)
+        moved = replace(rig, left=refocused(rig.left, left), right=refocused(rig.right, left if alike else right))
         views.append(view_of(f"{k:02d}", Photographer(moved, Printed(), Taken(), rng), pose, rng))
     return views
+
+
+@pytest.fixture(scope="module")
+def wandering() -> list[View]:
+    """Return views by cameras whose focal lengths differ from view to view by 1.5 % (1-sigma), each by itself."""
+    return wandering_by(0.015, alike=False)
 
 
 def spread_of(
@@ -79,6 +84,14 @@ def of_left(views: Sequence[View]) -> list[View]:
 
 def test_focal_lengths_that_wander_are_found_with_one_eye(wandering) -> None:
     assert spread_of(of_left(wandering), ONE_EYE) == pytest.approx(0.015, rel=0.5)
+
+
+def test_two_eyes_that_refocus_alike_have_their_size() -> None:
+    views = wandering_by(0.01, alike=True)
+    assert spread_of(views) == pytest.approx(0.01, rel=0.5)
+    # The factors are those of each view, whichever eyes see it.
+    some = [replace(view, right=None) if k < 4 else view for k, view in enumerate(views)]
+    assert spread_of(some) == pytest.approx(0.01, rel=0.5)
 
 
 def test_steady_lenses_are_quiet() -> None:

@@ -23,7 +23,7 @@ def focal_spread(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -
     The shape that the board has in all views alike is removed first.
     """
     lenses, right_eye = lenses_and_rest(bundle.model, bundle.vector)
-    seen = list[tuple[FloatArray, FloatArray, FloatArray, FloatArray]]()
+    seen, eyes = list[tuple[FloatArray, FloatArray, FloatArray, FloatArray]](), list[FloatArray]()
     for view, pose, weights in zip(views, bundle.poses, bundle.weights, strict=True):
         residual, slopes = seen_with_slopes(view, corners_m, lenses, right_eye, pose)
         root, by_pose = np.sqrt(np.repeat(weights, 2))[:, None], slopes[:, -6:]
@@ -32,12 +32,14 @@ def focal_spread(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -
         if len(lenses) > 1:
             is_right = np.arange(len(slopes)) >= (0 if view.left is None else 2 * len(view.left))
             others.append(is_right[:, None] * by_pose)
+        in_view = focal.any(axis=0)
+        eyes.append(np.eye(len(lenses))[in_view])
         # The board's pose is free.
         off, focal, board, rest = (
             _without(root * by_pose, root * each)
             for each in (
                 residual.reshape(-1, 1),
-                focal[:, focal.any(axis=0)],
+                focal[:, in_view],
                 _by_board(view, corners_m, by_pose, pose),
                 np.column_stack(others),
             )
@@ -45,13 +47,12 @@ def focal_spread(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -
         seen.append((off, focal, board, rest))
     shapes = np.concatenate([_without(focal, np.column_stack([board, off])) for off, focal, board, _ in seen])
     shape = np.linalg.lstsq(shapes[:, :-1], shapes[:, -1:])[0]
-    by_focal, by_others, factors, variances = [], [], [], []
+    by_focal, by_others, pulls = [], [], list[tuple[FloatArray, FloatArray]]()
     squares, freedom = 0.0, 0
-    for off, focal, board, rest in seen:
+    for (off, focal, board, rest), eye in zip(seen, eyes, strict=True):
         off = off - board @ shape
         normal, pull = np.sum(focal**2, axis=0), (focal.T @ off)[:, 0]
-        factors.extend(pull / normal)
-        variances.extend(1.0 / normal)
+        pulls.append((eye.T @ focal.T @ focal @ eye, eye.T @ pull))
         by_focal.extend(pull**2 / normal)
         off, rest = _without(focal, off), _without(focal, np.column_stack([rest, board]))
         # One that is no freedom of this view explains nothing.
@@ -62,8 +63,28 @@ def focal_spread(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -
     explained = np.mean(by_focal) / max(variance, np.mean(by_others, axis=0).max())
     if explained < max(_Settings.clearly, float(chdtri(len(by_focal), _Settings.false_alarms)) / len(by_focal)):
         return None
-    spread = float(np.mean(np.square(factors))) - variance * float(np.mean(variances))
-    return float(np.sqrt(max(spread, 0.0)))
+    return _spread(pulls, variance)
+
+
+def _spread(pulls: Sequence[tuple[FloatArray, FloatArray]], variance: float) -> float:
+    """Return the relative 1-sigma of the eyes' focal lengths, of which a part may be common to both.
+
+    A board that moves along the axis hides most of a change that both eyes share, so the covariance of the eyes' focal
+    lengths over the views is the most probable one (expectation maximisation).
+
+    Args:
+        pulls: of each view the information (eyes, eyes) on the focal lengths and their gradient (eyes,).
+        variance: of one residual.
+    """
+    information = np.stack([each for each, _ in pulls]) / variance
+    pull = np.stack([each for _, each in pulls])[:, :, None] / variance
+    one = np.eye(pull.shape[1])
+    among = one
+    for _ in range(_Settings.rounds):
+        left = among @ np.linalg.inv(one + information @ among)
+        factors = left @ pull
+        among = np.mean(left + factors @ factors.transpose(0, 2, 1), axis=0)
+    return float(np.sqrt(np.trace(among) / len(one)))
 
 
 def refocused(spread: float) -> str:

@@ -14,11 +14,12 @@ class CameraScale(Presenter):
     """Present a wrong scale of what is measured."""
 
     effect = "camera_scale"
-    noun = "a wrong baseline"
+    noun = "a wrong scale of all that is measured"
 
     def finding(self, found: Found) -> str:
-        error = f"{100 * found.numbers['scale_error']:+.3g} %"
-        return f"all that is measured is {error} too large: the baseline is wrong"
+        error = found.numbers["scale_error"]
+        said = f"all that is measured is {100 * abs(error):.3g} % too {'large' if error > 0.0 else 'small'}"
+        return said if found.seen_by != "camera" else f"{said}: a tag, ball or board has another size than stated"
 
     def remedy(self, workshop: Workshop, found: Found) -> str:
         factor, calibration = 1.0 + found.numbers["scale_error"], workshop.robot.calibration
@@ -32,7 +33,8 @@ class CameraScale(Presenter):
                 "it is."
             )
         return (
-            f"Calibrate the stereo pair again; or set baseline_m = {calibration.baseline_m / factor:.6g} in robot.toml."
+            f"Measure the squares of the calibration board and calibrate the stereo pair again; or set baseline_m = "
+            f"{calibration.baseline_m / factor:.6g} in robot.toml."
         )
 
     def panel(self, residuals: Residuals, effect: Effect) -> Panel:
