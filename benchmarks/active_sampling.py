@@ -25,14 +25,7 @@ from numpy.typing import NDArray
 from benchmarks.bent_arm import RIGID, bent
 from benchmarks.rough_arm import ROUGH, RoughArm, rough_arm
 from benchmarks.timing import interleaved_medians_us
-from kbmaps import (
-    ChainPosterior,
-    RigidLearner,
-    candidate_motions,
-    expected_gain,
-    next_pose,
-    next_poses,
-)
+from kbmaps import ChainPosterior, RigidLearner, candidate_motions, expected_gain, next_pose, next_poses
 from kbmaps.arrays import FloatArray
 
 SIGMA = 0.01

@@ -32,11 +32,7 @@ from ball_renderer import VGA, Look, backdrop, in_eyes, paint_ball, random_light
 from scenes import RADIUS_M, place
 
 WEBCAM = Look(noise_sd=1.5, shot=0.03, samples=8)
-LOOKS = {
-    "even wall": replace(WEBCAM, wall=0.5),
-    "clutter": WEBCAM,
-    "clutter, JPEG 90": replace(WEBCAM, jpeg=90),
-}
+LOOKS = {"even wall": replace(WEBCAM, wall=0.5), "clutter": WEBCAM, "clutter, JPEG 90": replace(WEBCAM, jpeg=90)}
 AT_ONE_METRE = replace(VGA, focal_px=900.0)
 CONFIG = VisionConfig()
 GATE = ColourGate(CONFIG.band)

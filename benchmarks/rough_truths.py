@@ -38,15 +38,7 @@ from benchmarks.humanoid_arm import NECK_JOINTS
 from benchmarks.recording import RECORDED, Recording
 from benchmarks.rough_arm import RoughArm, rough_arm
 from benchmarks.side_by_side import SideBySide
-from kbmaps import (
-    ChainTolerances,
-    Model,
-    ResidualLearner,
-    RigidLearner,
-    TensorLearner,
-    TensorSettings,
-    learning_bases,
-)
+from kbmaps import ChainTolerances, Model, ResidualLearner, RigidLearner, TensorLearner, TensorSettings, learning_bases
 from kbmaps.arrays import FloatArray
 
 ROUGH = ChainTolerances(axes=np.radians(2.0), points=0.01, tool=0.03)

@@ -24,15 +24,7 @@ import numpy as np
 
 from benchmarks.humanoid_arm import JOINTS, guided_path, nominal_chain
 from benchmarks.timing import interleaved_medians_us
-from kbmaps import (
-    NLMS,
-    ChainTolerances,
-    ExactLearner,
-    KBMap,
-    RecursiveRigidLearner,
-    SupportSet,
-    learning_bases,
-)
+from kbmaps import NLMS, ChainTolerances, ExactLearner, KBMap, RecursiveRigidLearner, SupportSet, learning_bases
 from kbmaps.arrays import FloatArray
 from kbmaps.maps import kernels
 

@@ -103,12 +103,7 @@ def learner_for(task: Task, chain: RigidChain, rng: np.random.Generator, setting
     axis_deg, shift_mm, tool_mm = task.prior
     nominal = built_chain(chain, rng, axis_deg=axis_deg, shift_mm=shift_mm, tool_mm=tool_mm)
     return TensorLearner.around(
-        nominal,
-        bases,
-        settings,
-        turn_std=np.radians(axis_deg),
-        shift_std=1e-3 * shift_mm,
-        marker_std=1e-3 * tool_mm,
+        nominal, bases, settings, turn_std=np.radians(axis_deg), shift_std=1e-3 * shift_mm, marker_std=1e-3 * tool_mm
     )
 
 

@@ -80,11 +80,7 @@ def aligned_chain(robot: RobotDescription, learnt: Recording) -> RigidChain:
     """
     try:
         fit = align(
-            robot.chain,
-            learnt.q,
-            learnt.x,
-            pose_known=robot.camera.pose_known,
-            marker_known=robot.robot.marker_known,
+            robot.chain, learnt.q, learnt.x, pose_known=robot.camera.pose_known, marker_known=robot.robot.marker_known
         )
     except KBMapsError as error:
         raise EvaluationError(f"the nominal model cannot be aligned to the recording: {error}") from error

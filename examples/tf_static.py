@@ -32,10 +32,7 @@ class StaticTransform:
         self.tokens = [session.liveliness().declare_token(token) for token in tokens]
         self.gid = hashlib.blake2b(told.encode(), digest_size=rmw.GID_BYTES).digest()
         self.publisher = zenoh.ext.declare_advanced_publisher(
-            session,
-            rmw.topic_key(domain, TOPIC, TF_MESSAGE),
-            cache=zenoh.ext.CacheConfig(1),
-            publisher_detection=True,
+            session, rmw.topic_key(domain, TOPIC, TF_MESSAGE), cache=zenoh.ext.CacheConfig(1), publisher_detection=True
         )
 
     def publish(self):

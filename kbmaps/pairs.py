@@ -43,11 +43,7 @@ class Pairs:
 
 
 def with_units(
-    q: FloatArray,
-    x: FloatArray,
-    sigma: FloatArray,
-    shape: FloatArray | None = None,
-    common: FloatArray | None = None,
+    q: FloatArray, x: FloatArray, sigma: FloatArray, shape: FloatArray | None = None, common: FloatArray | None = None
 ) -> Pairs:
     """Return pairs from their sigma (n,) [m], NaN where unknown, and the rest as in `Pairs`.
 

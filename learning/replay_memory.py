@@ -61,12 +61,7 @@ class PairMemory:
         return min(max(count - self._oldest, 0), len(self))
 
     def restore(
-        self,
-        q: FloatArray,
-        x: FloatArray,
-        count: int,
-        cov: FloatArray | None = None,
-        turns: FloatArray | None = None,
+        self, q: FloatArray, x: FloatArray, count: int, cov: FloatArray | None = None, turns: FloatArray | None = None
     ) -> None:
         """Hold the newest of `count` pairs, as `append` takes them."""
         self._count = self._first = count - len(q)

@@ -76,11 +76,7 @@ def _cluster(seed: int) -> Values:
 
 def _train(task: Task, seed: int) -> Values:
     outcome = tensor_train.run(task, seed)
-    return {
-        "m": outcome.mean,
-        "exact": _PERCENT * (outcome.largest < tensor_train.EXACT_M),
-        "s": outcome.seconds,
-    }
+    return {"m": outcome.mean, "exact": _PERCENT * (outcome.largest < tensor_train.EXACT_M), "s": outcome.seconds}
 
 
 def _rigid_from_drawing(pairs: int, seed: int) -> Values:
@@ -122,10 +118,7 @@ def _net_row() -> Row:
         "noise-free, 3^d random pairs over ±80°, α in 20…70°, error on ±180°",
         (
             Figure(
-                "d = 2…7 turning joints: mean error, worst seed and d",
-                net,
-                worst("turning"),
-                at_most(_EXACT_M, "m"),
+                "d = 2…7 turning joints: mean error, worst seed and d", net, worst("turning"), at_most(_EXACT_M, "m")
             ),
             Figure("the same at d = 7: median seed", net, median("d=7"), at_most(_EXACT_M, "m")),
             Figure("the same at d = 7 from 5 % more pairs: worst seed", net, worst("more"), at_most(_EXACT_M, "m")),

@@ -11,16 +11,7 @@ import numpy as np
 from benchmarks import tensor_train
 from benchmarks.goals.goal import Figure, Row, at_most
 from benchmarks.goals.study import Study, Values, first_below, mean, ratio, worst
-from benchmarks.rigid_learner import (
-    DRAWINGS,
-    SIGMA,
-    STAGES,
-    found_error,
-    guided_fits,
-    local_fit,
-    noisy_fit,
-    spoilt_fit,
-)
+from benchmarks.rigid_learner import DRAWINGS, SIGMA, STAGES, found_error, guided_fits, local_fit, noisy_fit, spoilt_fit
 from bodyschema.reproduce.arm import JOINTS, arm, longer_tool
 from bodyschema.reproduce.fig6 import MOVED_M
 from bodyschema.reproduce.walk import WALK_SIGMA, walk

@@ -70,12 +70,7 @@ def _ladder_row() -> Row:
             )
         )
     figures.append(
-        Figure(
-            "the same, geometric mean over truths and sizes",
-            tuple(every),
-            _over_best(tuple(MODELS)),
-            at_most(1.05),
-        )
+        Figure("the same, geometric mean over truths and sizes", tuple(every), _over_best(tuple(MODELS)), at_most(1.05))
     )
     what = (
         "non-rigid truths (sag 1°, 3°; eccentric 1°; gain 1 %; camera 2–3 %; radial 2 %), over the best of "

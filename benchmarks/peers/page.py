@@ -166,12 +166,7 @@ def _section(task: Task, results: Results, competitors: Sequence[Competitor], lo
 
 
 def _panel(
-    task: Task,
-    test: str,
-    captioned: bool,
-    results: Results,
-    competitors: Sequence[Competitor],
-    looks: dict[str, Style],
+    task: Task, test: str, captioned: bool, results: Results, competitors: Sequence[Competitor], looks: dict[str, Style]
 ) -> str:
     counts = counts_of(task, results)
     lines: list[Line] = []
@@ -200,12 +195,7 @@ def _best(lines: Sequence[Line], competitors: Sequence[Competitor]) -> list[str]
 
 
 def _table(
-    task: Task,
-    test: str,
-    captioned: bool,
-    results: Results,
-    competitors: Sequence[Competitor],
-    looks: dict[str, Style],
+    task: Task, test: str, captioned: bool, results: Results, competitors: Sequence[Competitor], looks: dict[str, Style]
 ) -> str:
     counts = counts_of(task, results)
     cells = {c.key: [cell(results.of(task.key, c.key, n), test) for n in counts] for c in competitors}

@@ -119,14 +119,7 @@ class Setting:
         return Arm.of(chain, joint_effect=effect)
 
     def _problem(
-        self,
-        arm: Arm,
-        built: RoughArm,
-        pairs: int,
-        centre: FloatArray,
-        half: FloatArray,
-        reach: FloatArray,
-        seed: int,
+        self, arm: Arm, built: RoughArm, pairs: int, centre: FloatArray, half: FloatArray, reach: FloatArray, seed: int
     ) -> Problem:
         poses, noise = np.random.default_rng([seed, 1]), np.random.default_rng([seed, 2])
         q = poses.uniform(centre - half, centre + half, (pairs, self.joints))

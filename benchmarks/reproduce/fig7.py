@@ -125,10 +125,7 @@ def _papers_panel(learnt: Found, apart: Curve) -> Panel:
         names = (SAME_POSES, MEASURED)
     else:
         red, orange, names = learnt[RANDOM][RULE][NEAR], learnt[NOISY][RULE][NEAR], (RANDOM, NOISY)
-    curves = [
-        replace(red, name=names[0], colour="tab:red"),
-        replace(orange, name=names[1], colour="tab:orange"),
-    ]
+    curves = [replace(red, name=names[0], colour="tab:red"), replace(orange, name=names[1], colour="tab:orange")]
     return Panel("as in the paper", [apart, *curves], as_paper=True)
 
 

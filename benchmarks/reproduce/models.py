@@ -91,10 +91,7 @@ def _tensor_train_around(known: Knowledge) -> Model:
 WITH_DRAWING = (
     Contender("rigid chain", "tab:blue", lambda known: RigidLearner(known.chain, known.tolerances), 5.0),
     Contender(
-        "rigid chain, recursive",
-        "tab:cyan",
-        lambda known: RecursiveRigidLearner(known.chain, known.tolerances),
-        3.2,
+        "rigid chain, recursive", "tab:cyan", lambda known: RecursiveRigidLearner(known.chain, known.tolerances), 3.2
     ),
     Contender("tensor train", "tab:purple", _tensor_train_around),
 )

@@ -126,12 +126,7 @@ def learn_stream(
     }
     counts = sorted({0, EARLY, *spread_counts(1, stream.online)})
     return found | learn_all(
-        WITH_DRAWING,
-        known,
-        (stream.q, stream.x),
-        counts,
-        stream.tests,
-        say=lambda said: say(f"{stream.name}, {said}"),
+        WITH_DRAWING, known, (stream.q, stream.x), counts, stream.tests, say=lambda said: say(f"{stream.name}, {said}")
     )
 
 

@@ -19,11 +19,7 @@ _W_FIRST = "hold a quaternion with w first"
 _CONJUGATE = "hold the conjugate of the marker's orientation, that of the measurement frame in the marker"
 _REORDER = "name the columns qw, qx, qy, qz"
 _NEGATE = "multiply qx, qy and qz by -1"
-_REMEDIES = {
-    _W_FIRST: _REORDER,
-    _CONJUGATE: _NEGATE,
-    f"{_W_FIRST}, and {_CONJUGATE}": f"{_REORDER}, and {_NEGATE}",
-}
+_REMEDIES = {_W_FIRST: _REORDER, _CONJUGATE: _NEGATE, f"{_W_FIRST}, and {_CONJUGATE}": f"{_REORDER}, and {_NEGATE}"}
 
 
 def turned_frame(chain: RigidChain, q: FloatArray, x: FloatArray, fit: ReadingFit) -> Plausibility | None:

@@ -54,10 +54,7 @@ class Watching:
             folder.mkdir(parents=True, exist_ok=True)
         numbers = itertools.count(1)
         return cls(
-            pictures,
-            lambda jpeg: _write(folder / f"{next(numbers):06}.jpg", jpeg),
-            every_s=every_s,
-            count=count,
+            pictures, lambda jpeg: _write(folder / f"{next(numbers):06}.jpg", jpeg), every_s=every_s, count=count
         )
 
     def stop(self) -> None:

@@ -24,8 +24,7 @@ VARIABLE = "BODYSCHEMA_ROBOT"
 RobotFile = Annotated[Path, Parameter(env_var=VARIABLE, help="The robot's description.")]
 
 SourceRobotFile = Annotated[
-    Path | None,
-    Parameter(show_default=False, help=f"robot.toml; else the one beside the source, {VARIABLE}, or here."),
+    Path | None, Parameter(show_default=False, help=f"robot.toml; else the one beside the source, {VARIABLE}, or here.")
 ]
 
 
@@ -186,8 +185,7 @@ class PrintedBoard:
         Parameter(help="The markers' dictionary, as in 5X5_100; else the smallest of 4x4 bits.", show_default=False),
     ] = None
     pattern: Annotated[
-        Literal["charuco", "chessboard"],
-        Parameter(help="`chessboard` has no markers; all of it has to be in view."),
+        Literal["charuco", "chessboard"], Parameter(help="`chessboard` has no markers; all of it has to be in view.")
     ] = "charuco"
 
     ruler_mm: Annotated[
@@ -204,11 +202,7 @@ class PrintedBoard:
         from bodyschema.cli.cameras.calibration import board_of
 
         return board_of(
-            self.squares,
-            self.square_mm,
-            marker_mm=self.marker_mm,
-            dictionary=self.dictionary,
-            pattern=self.pattern,
+            self.squares, self.square_mm, marker_mm=self.marker_mm, dictionary=self.dictionary, pattern=self.pattern
         )
 
     def board(self) -> Board:

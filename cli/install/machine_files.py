@@ -117,10 +117,7 @@ def rules() -> str:
     lines.append("# Users at the machine, and the group dialout, may open them; modem managers leave them alone.")
     for vendor, product, name in ADAPTERS:
         match = f'SUBSYSTEM=="tty", ATTRS{{idVendor}}=="{vendor}", ATTRS{{idProduct}}=="{product}"'
-        lines += [
-            f"# {name}",
-            f'{match}, GROUP="dialout", MODE="0660", TAG+="uaccess", ENV{{ID_MM_DEVICE_IGNORE}}="1"',
-        ]
+        lines += [f"# {name}", f'{match}, GROUP="dialout", MODE="0660", TAG+="uaccess", ENV{{ID_MM_DEVICE_IGNORE}}="1"']
     return "\n".join(lines) + "\n"
 
 

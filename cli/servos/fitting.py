@@ -130,10 +130,7 @@ def _bus_names(servos: Sequence[Candidate]) -> dict[tuple[str, int], str]:
     taken: dict[str, int] = {}
     for port, baud in buses:
         if taken.setdefault(os.path.realpath(port), baud) != baud:
-            raise ConfigError(
-                f"the servos on {port} have different rates",
-                remedy=_other_rates(servos, port),
-            )
+            raise ConfigError(f"the servos on {port} have different rates", remedy=_other_rates(servos, port))
     return {bus: "arm" if len(buses) == 1 else f"bus{place}" for place, bus in enumerate(buses, 1)}
 
 

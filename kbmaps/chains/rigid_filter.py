@@ -105,15 +105,7 @@ class RigidFilter:
         if self._kernel is None:
             return False
         noise = self._kernel.learn_one(
-            self.change,
-            self._covariance,
-            row,
-            q,
-            x,
-            sigma,
-            self.origin,
-            self.noise_square,
-            self.noise_coordinates,
+            self.change, self._covariance, row, q, x, sigma, self.origin, self.noise_square, self.noise_coordinates
         )
         if noise is None:
             return False

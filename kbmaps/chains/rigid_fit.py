@@ -159,12 +159,7 @@ class _Fitter:
 
 
 def fit_chain(
-    prior: ChainBelief,
-    pairs: Pairs,
-    start: FloatArray,
-    *,
-    near: bool = False,
-    noise: NoiseKnowledge = NOTHING_KNOWN,
+    prior: ChainBelief, pairs: Pairs, start: FloatArray, *, near: bool = False, noise: NoiseKnowledge = NOTHING_KNOWN
 ) -> RigidFit:
     """Fit the most probable change to at least one pair, starting from `start` (size,).
 

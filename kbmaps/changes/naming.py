@@ -37,12 +37,7 @@ class Explanation:
 
 
 def explanations(
-    before: ChainBelief,
-    kinds: Sequence[ChangeKind],
-    q: FloatArray,
-    x: FloatArray,
-    noise_m: float,
-    shared: float = 1.0,
+    before: ChainBelief, kinds: Sequence[ChangeKind], q: FloatArray, x: FloatArray, noise_m: float, shared: float = 1.0
 ) -> list[Explanation]:
     """Return the probability of each kind of change, the most probable first.
 

@@ -47,11 +47,7 @@ class SupportSet:
     """
 
     def __init__(
-        self,
-        bases: Sequence[JointBasis],
-        capacity: int = 256,
-        noise: float = 1e-3,
-        threshold: float = 2e-3,
+        self, bases: Sequence[JointBasis], capacity: int = 256, noise: float = 1e-3, threshold: float = 2e-3
     ) -> None:
         if capacity < 2:
             raise SettingError(f"capacity must be at least 2, got {capacity}")

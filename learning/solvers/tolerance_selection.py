@@ -117,8 +117,6 @@ def _narrower(tolerances: ChainTolerances, angle: float, length: float) -> list[
     if math.isinf(tolerances.base_rotation):
         return [arm, zeroed]
     placed = replace(
-        zeroed,
-        base_rotation=min(zeroed.base_rotation, angle),
-        base_translation=min(zeroed.base_translation, length),
+        zeroed, base_rotation=min(zeroed.base_rotation, angle), base_translation=min(zeroed.base_translation, length)
     )
     return [arm, zeroed, placed]

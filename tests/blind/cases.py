@@ -225,13 +225,7 @@ def _size(size: Size, index: int, rng: np.random.Generator) -> float:
 
 
 def _one(
-    wish: Wish,
-    size: float,
-    sizer: Sizer,
-    motion: Motion,
-    arm: Arm,
-    truth: Sequence[Hidden],
-    rng: np.random.Generator,
+    wish: Wish, size: float, sizer: Sizer, motion: Motion, arm: Arm, truth: Sequence[Hidden], rng: np.random.Generator
 ) -> Hidden:
     """Return one effect of that size, at a place where it shows."""
     taken = [(hidden.effect, hidden.where) for hidden in truth]

@@ -71,11 +71,9 @@ def goals(cases: Sequence[Judgement]) -> str:
 
 
 def _goals(scenario: str, cases: Sequence[Judgement]) -> list[tuple[str, str, str]]:
-    rows = {
-        "none": _of_nothing,
-        "scattered-none": _of_nothing,
-        "outside": _of_strange,
-    }.get(scenario, lambda c: _of_named(scenario, c))(cases)
+    rows = {"none": _of_nothing, "scattered-none": _of_nothing, "outside": _of_strange}.get(
+        scenario, lambda c: _of_named(scenario, c)
+    )(cases)
     for what, seconds in (("clock", [c.seconds for c in cases]), ("processor", [c.cpu_seconds for c in cases])):
         typical, most = np.median(seconds), np.quantile(seconds, 0.95)
         rows.append((f"seconds by the {what}: median, 95 %", f"≤ {SECONDS_WANTED:.0f}", f"{typical:.1f}, {most:.1f}"))

@@ -54,13 +54,7 @@ class Motion:
 
 
 def move(
-    rng: np.random.Generator,
-    style: Style,
-    ranges: FloatArray,
-    pairs: int,
-    visible: Visible,
-    *,
-    rests: bool = False,
+    rng: np.random.Generator, style: Style, ranges: FloatArray, pairs: int, visible: Visible, *, rests: bool = False
 ) -> Motion:
     """Return a motion with `pairs` pairs that are all visible.
 

@@ -46,20 +46,8 @@ def _numbered(prefix: str, count: int) -> tuple[str, ...]:
 
 
 MODELS = (
-    Model(
-        "iiwa",
-        "kuka_iiwa/model.urdf",
-        "lbr_iiwa_link_0",
-        "lbr_iiwa_link_7",
-        _numbered("lbr_iiwa_joint_", 7),
-    ),
-    Model(
-        "panda",
-        "franka_panda/panda.urdf",
-        "panda_link0",
-        "panda_link8",
-        _numbered("panda_joint", 7),
-    ),
+    Model("iiwa", "kuka_iiwa/model.urdf", "lbr_iiwa_link_0", "lbr_iiwa_link_7", _numbered("lbr_iiwa_joint_", 7)),
+    Model("panda", "franka_panda/panda.urdf", "panda_link0", "panda_link8", _numbered("panda_joint", 7)),
     Model("xarm6", "xarm/xarm6_robot.urdf", "link_base", "link6", _numbered("joint", 6)),
 )
 

@@ -24,9 +24,7 @@ from .judgement import Crash, told
 from .sealed import Case, Record, judged, run
 
 # All are clear: chi-square between the hidden effects and their alternatives is 10 or more.
-KNOWN = [
-    Case("one", 2, 300),
-]
+KNOWN = [Case("one", 2, 300)]
 MORE = [
     Case("three", 3, 300),
     Case("none", 1, 300),

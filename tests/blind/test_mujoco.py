@@ -146,8 +146,7 @@ def test_outcome_follows_from_truth_and_answer(truth, answer, expected) -> None:
 
 # Each with and without tolerances at every link.
 @pytest.mark.parametrize(
-    ("kind", "style", "rows", "dense"),
-    [("play_by_gravity", "static", 80, 1.0), ("dahl", "walk", 150, 0.0)],
+    ("kind", "style", "rows", "dense"), [("play_by_gravity", "static", 80, 1.0), ("dahl", "walk", 150, 0.0)]
 )
 @pytest.mark.soak
 def test_a_simulated_cause_is_named(kind, style, rows, dense, tmp_path: Path) -> None:

@@ -223,8 +223,7 @@ def test_another_tool_moves_the_marker_as_far_everywhere(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize(
-    ("effect", "p"),
-    [("tool_slip", shifted(t0_s=19.5)), ("camera_moved", six((0.01, -0.02, 0.005), t0_s=19.5))],
+    ("effect", "p"), [("tool_slip", shifted(t0_s=19.5)), ("camera_moved", six((0.01, -0.02, 0.005), t0_s=19.5))]
 )
 def test_nothing_moves_before_the_moment(bench: Bench, effect: str, p: dict[str, float]) -> None:
     off = moved(bench, bench.sight(effect, **p))

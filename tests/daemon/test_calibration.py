@@ -519,10 +519,7 @@ def test_each_tool_can_be_calibrated_alone(pairs_file, capsys) -> None:
     for rows in (("--last", 50), ("--first", 51)):
         called(pairs_file, "--json", *rows)
         found.append(msgspec.json.decode(capsys.readouterr().out, type=CalibrationReport))
-    assert [(report.pairs, report.first, report.other_tool_from) for report in found] == [
-        (50, 1, None),
-        (50, 51, None),
-    ]
+    assert [(report.pairs, report.first, report.other_tool_from) for report in found] == [(50, 1, None), (50, 51, None)]
 
 
 def test_rows_that_are_not_there_are_told(pairs_file) -> None:

@@ -231,10 +231,7 @@ def test_several_lost_pages_cost_their_own_pairs(long) -> None:
 
 def test_a_lost_identity_costs_no_pair(file) -> None:
     alter(file, "UPDATE meta SET value = replace(value, '-', '+') WHERE key = 'store'")
-    with (
-        pytest.raises(StoreError, match="Start the sampler: it puts the pairs"),
-        PairReader(file),
-    ):
+    with pytest.raises(StoreError, match="Start the sampler: it puts the pairs"), PairReader(file):
         pass
     with PairStore(file, SESSION) as store:
         assert numbers(store) == list(range(1, PAIRS + 1))

@@ -52,11 +52,7 @@ def test_what_a_rigid_chain_can_have_is_known_from_the_start(robot) -> None:
 
 @pytest.mark.parametrize(
     ("name", "joint", "values", "share"),
-    [
-        ("camera_scale", None, [0.02], 1e-6),
-        ("joint_eccentricity", 1, TURN, 0.7),
-        ("joint_scale", 2, [0.03], 0.7),
-    ],
+    [("camera_scale", None, [0.02], 1e-6), ("joint_eccentricity", 1, TURN, 0.7), ("joint_scale", 2, [0.03], 0.7)],
 )
 def test_what_it_cannot_have_is_known_as_far_as_a_map_has_it(robot, name, joint, values, share) -> None:
     simulation = Simulation(robot, (at(robot, name, joint, values),))

@@ -91,11 +91,7 @@ def test_an_arm_at_rest_gives_no_pair_however_long_it_rests(walk) -> None:
 def test_a_restart_goes_on_after_the_last_pair_in_a_new_segment() -> None:
     last = Pair("store", 7, 4, 1e9, "", frozen_array(at_deg(10, 20)), frozen_array(HERE), frozen_array(np.eye(3)))
     walk = Walk(Gate(DaemonConfig(), TWO_REVOLUTE, last))
-    assert [walk.offer(10.5, 20), walk.offer(12, 20), walk.offer(14, 20)] == [
-        Reason.TOO_NEAR,
-        5,
-        5,
-    ]
+    assert [walk.offer(10.5, 20), walk.offer(12, 20), walk.offer(14, 20)] == [Reason.TOO_NEAR, 5, 5]
 
 
 def test_a_prismatic_joint_counts_with_its_metres_per_degree() -> None:

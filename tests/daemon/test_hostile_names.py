@@ -48,12 +48,7 @@ def test_no_name_or_path_has_a_nul(tmp_path: Path, old: str, key: str) -> None:
 
 @pytest.mark.parametrize(
     ("value", "said"),
-    [
-        ("[1000000000, 1000000000]", "16384"),
-        ("[640, 100000]", "16384"),
-        ("[0, 480]", ">= 1"),
-        ("[-640, 480]", ">= 1"),
-    ],
+    [("[1000000000, 1000000000]", "16384"), ("[640, 100000]", "16384"), ("[0, 480]", ">= 1"), ("[-640, 480]", ">= 1")],
 )
 def test_an_image_has_a_size_that_a_sensor_can_have(tmp_path: Path, value: str, said: str) -> None:
     refused(tmp_path, "[640, 480]", value, rf"line \d+: camera.image_size_px: expected `int` .*{said}")

@@ -25,10 +25,7 @@ def test_on_a_path_the_misfit_is_found_whatever_noise_is_claimed(claimed: float)
 def test_noise_alone_is_mostly_no_misfit(neighbours: bool) -> None:
     found = [
         model_discrepancy(
-            np.random.default_rng(seed).normal(0.0, 0.002, (500, 3)),
-            np.full(3, 0.002**2),
-            NONE,
-            neighbours=neighbours,
+            np.random.default_rng(seed).normal(0.0, 0.002, (500, 3)), np.full(3, 0.002**2), NONE, neighbours=neighbours
         )
         for seed in range(50)
     ]

@@ -24,20 +24,8 @@ LEARNER, SAMPLER = (learner.TABLES, learner.CHANGEABLE), (devices.TABLES, device
         (LEARNER, "side_sigma_m = 0.0001", "side_sigma_m = 0.001", [], ["vision.tag.side_sigma_m"]),
         (LEARNER, 'marker = "tag"', 'marker = "ball"', [], ["vision.marker"]),
         (LEARNER, "radius_m = 0.02", "radius_m = 0.03", [], []),
-        (
-            LEARNER,
-            "[daemon]",
-            NEW_SOURCE,
-            [],
-            ["marker_source"],
-        ),
-        (
-            SAMPLER,
-            "[daemon]",
-            NEW_SOURCE,
-            [],
-            ["marker_source"],
-        ),
+        (LEARNER, "[daemon]", NEW_SOURCE, [], ["marker_source"]),
+        (SAMPLER, "[daemon]", NEW_SOURCE, [], ["marker_source"]),
         (SAMPLER, "min_step_deg = 1", "min_step_deg = 2", ["daemon.min_step_deg = 2.0"], []),
     ],
 )

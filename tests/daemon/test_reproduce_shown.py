@@ -113,8 +113,4 @@ def test_the_legend_says_what_styles_and_dotted_lines_mean() -> None:
     axes = axes_of(Panel("", [curve], as_paper=True, styles={"--": "without noise"}))
     legend = axes.get_legend()
     assert legend is not None
-    assert [text.get_text() for text in legend.get_texts()] == [
-        "rule",
-        "without noise",
-        "dotted: the largest error",
-    ]
+    assert [text.get_text() for text in legend.get_texts()] == ["rule", "without noise", "dotted: the largest error"]

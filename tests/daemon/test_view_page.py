@@ -143,10 +143,7 @@ def test_pages_that_wait_for_the_shapes_hold_up_nothing_else(hub, processes) -> 
             waiting = [asyncio.create_task(client.get(f"/api/body{each}")) for each in 30 * ["", "/0"]]
             try:
                 async with asyncio.timeout(LIMIT_S):
-                    others = [
-                        await client.get("/static/style.css"),
-                        await client.post("/api/command", json=PAUSE),
-                    ]
+                    others = [await client.get("/static/style.css"), await client.post("/api/command", json=PAUSE)]
             finally:
                 shapes.read.set()
                 late = await asyncio.gather(*waiting)

@@ -17,11 +17,7 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 @pytest.mark.parametrize(
     ("program", "code"),
-    [
-        (KILLED, -signal.SIGKILL),
-        ("import sys\nsys.exit('said')", 1),
-        ("import sys\nsys.stderr.write('said')", 0),
-    ],
+    [(KILLED, -signal.SIGKILL), ("import sys\nsys.exit('said')", 1), ("import sys\nsys.stderr.write('said')", 0)],
     ids=["killed", "exit with a message", "no line end"],
 )
 def test_error_output_is_lost_by_no_kind_of_end(tmp_path: Path, program: str, code: int) -> None:

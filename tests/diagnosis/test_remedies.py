@@ -44,16 +44,7 @@ def cause(effect: Effect, **more) -> Cause:
     numbers = {p.name: Interval(v, (v, v)) for p, v in zip(effect.parameters, effect.values.tolist(), strict=True)}
     told = {"probability": 1.0, "rivals": ()} | more
     return Cause(
-        effect.name,
-        effect.where,
-        effect.source,
-        numbers,
-        told["probability"],
-        100.0,
-        1.0,
-        (),
-        told["rivals"],
-        "",
+        effect.name, effect.where, effect.source, numbers, told["probability"], 100.0, 1.0, (), told["rivals"], ""
     )
 
 

@@ -160,7 +160,7 @@ def test_a_scale_that_large_tolerances_absorb_is_told_as_an_alternative() -> Non
     fit = start.tolerating(Scales())
     found = in_place_of_tolerances(fit.tolerating(tolerated(fit).scales), hypotheses)
     assert found[0][0].name == "camera_scale"
-    assert found[0][1] > 0.3
+    assert found[0][1] > 0.1  # the share from which a report leaves its verdict open
 
 
 def test_tolerances_of_a_workshop_are_no_cause_instead() -> None:

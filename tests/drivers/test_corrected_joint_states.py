@@ -17,13 +17,7 @@ from bodyschema.drivers.ros2 import rmw
 from bodyschema.drivers.ros2.bench.node import Node
 from bodyschema.drivers.ros2.bench.zenoh_robot import ZenohRobot
 from bodyschema.drivers.ros2.link import open_session
-from bodyschema.drivers.ros2.messages import (
-    JOINT_STATE,
-    Header,
-    JointState,
-    decode_joint_state,
-    encode_joint_state,
-)
+from bodyschema.drivers.ros2.messages import JOINT_STATE, Header, JointState, decode_joint_state, encode_joint_state
 from bodyschema.effects import Effect, Simulation
 from bodyschema.effects.exports import write_correction
 from bodyschema.robot.description import RobotDescription

@@ -49,9 +49,7 @@ def test_an_arm_that_stands_still_is_left_alone() -> None:
     assert not any(is_dropped(well, k * 0.004, motion(k * 0.004)) for k in range(1, 1000))
 
 
-@given(
-    st.lists(st.tuples(st.floats(-0.01, 0.2), st.one_of(st.none(), st.tuples(pairs, pairs, pairs))), max_size=30),
-)
+@given(st.lists(st.tuples(st.floats(-0.01, 0.2), st.one_of(st.none(), st.tuples(pairs, pairs, pairs))), max_size=30))
 def test_once_dropped_it_stays_dropped_whatever_comes(cycles) -> None:
     (watching := guard()).begin(0.0)
     now, was = 0.0, False

@@ -91,8 +91,7 @@ def test_a_head_without_watchdog_is_refused(model) -> None:
 
 
 @pytest.mark.parametrize(
-    ("tables", "key"),
-    [(floating(more="curent_limit = 3"), "curent_limit"), (gazing(more="speed = 3"), "speed")],
+    ("tables", "key"), [(floating(more="curent_limit = 3"), "curent_limit"), (gazing(more="speed = 3"), "speed")]
 )
 def test_an_unknown_key_is_an_error(tables, key) -> None:
     with pytest.raises(msgspec.ValidationError, match=key):

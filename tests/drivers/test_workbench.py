@@ -157,8 +157,7 @@ def test_a_servo_that_no_file_names_says_what_it_is(models) -> None:
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
-    [("255", "from 0 to 254"), ("-1", "from 0 to 254"), ("much", "from 0 to 254")],
+    ("text", "said"), [("255", "from 0 to 254"), ("-1", "from 0 to 254"), ("much", "from 0 to 254")]
 )
 def test_what_is_out_of_range_is_refused_with_the_range(text, said) -> None:
     (delay,) = [setting for setting in settings_of(DYNAMIXELS["XM430-W350"]) if setting.name == "return_delay"]

@@ -30,10 +30,7 @@ def test_a_child_imports_nothing_from_the_current_folder(tmp_path: Path) -> None
 
 @pytest.mark.parametrize(
     ("command", "said"),
-    [
-        (["status"], "does not answer"),
-        pytest.param(["diagnose", "pairs.csv"], "NOTHING FOUND", marks=pytest.mark.soak),
-    ],
+    [(["status"], "does not answer"), pytest.param(["diagnose", "pairs.csv"], "NOTHING FOUND", marks=pytest.mark.soak)],
 )
 def test_a_command_executes_nothing_of_the_current_folder(tmp_path: Path, command: list[str], said: str) -> None:
     here, robot = tmp_path / "hostile", tmp_path / "robot"

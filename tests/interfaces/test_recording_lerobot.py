@@ -63,10 +63,7 @@ def test_motors_under_a_heading_are_found(tmp_path) -> None:
 
 @pytest.mark.parametrize(
     ("info", "told"),
-    [
-        ({"robot_type": "so100"}, "before version 0.3"),
-        ({"codebase_version": "v2.0"}, "v2.1 and v3.0 are read"),
-    ],
+    [({"robot_type": "so100"}, "before version 0.3"), ({"codebase_version": "v2.0"}, "v2.1 and v3.0 are read")],
 )
 def test_older_datasets_are_refused(info, told, tmp_path) -> None:
     source = dataset(tmp_path / "set", "v2.1", "degrees", **info)

@@ -8,15 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rough_arms import ROUGH, rough_arm
 
-from kbmaps import (
-    ChainBelief,
-    ChainParameters,
-    ChainTolerances,
-    NonFiniteError,
-    RigidLearner,
-    SettingError,
-    ShapeError,
-)
+from kbmaps import ChainBelief, ChainParameters, ChainTolerances, NonFiniteError, RigidLearner, SettingError, ShapeError
 
 seeds = st.integers(0, 2**32 - 1)
 SLIGHT = ChainTolerances(axes=1e-4, points=1e-4, zeros=1e-4, tool=1e-4, base_rotation=1e-4)

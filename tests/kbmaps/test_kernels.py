@@ -23,8 +23,7 @@ from kbmaps.maps import kernels
 seeds = st.integers(0, 2**32 - 1)
 kinds = st.text("RP", min_size=1, max_size=6)
 needs_both = pytest.mark.skipif(
-    len(kernels.available()) < 2,
-    reason="no compiled kernels; to run it: apt-get install gcc",
+    len(kernels.available()) < 2, reason="no compiled kernels; to run it: apt-get install gcc"
 )
 
 
@@ -315,10 +314,7 @@ def test_a_replay_refuses_buffers_that_do_not_fit(wrong: dict[str, object]) -> N
 
 
 @needs_both
-@pytest.mark.parametrize(
-    ("joints", "points"),
-    [(2, 0), (2, 8), (2, 26), (3, 9), (50, 2**10), (64, 2**10), (41, 3**6)],
-)
+@pytest.mark.parametrize(("joints", "points"), [(2, 0), (2, 8), (2, 26), (3, 9), (50, 2**10), (64, 2**10), (41, 3**6)])
 def test_a_net_refuses_planes_that_do_not_fit(joints: int, points: int) -> None:
     with pytest.raises(TypeError, match=f"{joints} joints cannot have {points} control points"):
         net_of(joints, points)

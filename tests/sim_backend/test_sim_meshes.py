@@ -53,8 +53,7 @@ def collada(triangles=WEDGE, *, unit="0.1", faces=None, count=None, scene='<inst
 
 
 @pytest.mark.parametrize(
-    ("name", "data"),
-    [("a.stl", stl(WEDGE)), ("a.STL", ascii_stl(WEDGE)), ("a.obj", obj(WEDGE)), ("a.dae", collada())],
+    ("name", "data"), [("a.stl", stl(WEDGE)), ("a.STL", ascii_stl(WEDGE)), ("a.obj", obj(WEDGE)), ("a.dae", collada())]
 )
 def test_every_format_gives_the_same_triangles(tmp_path, name, data) -> None:
     (tmp_path / name).write_bytes(data)

@@ -15,11 +15,7 @@ from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray, ImageArray, StereoFrame
 
 VGA = StereoCalibration(
-    focal_px=600.0,
-    principal_point_px=(319.5, 239.5),
-    baseline_m=0.12,
-    image_size_px=(640, 480),
-    pixel_sigma=1e-6,
+    focal_px=600.0, principal_point_px=(319.5, 239.5), baseline_m=0.12, image_size_px=(640, 480), pixel_sigma=1e-6
 )
 # The same cameras with a smaller image: quicker to render.
 SMALL = StereoCalibration(

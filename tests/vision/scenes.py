@@ -36,11 +36,7 @@ class Slab:
 
 
 def stage(
-    *things: Ball | Slab,
-    calibration: StereoCalibration = SMALL,
-    look: Look = PLAIN,
-    t: float = 0.0,
-    seed: int = 0,
+    *things: Ball | Slab, calibration: StereoCalibration = SMALL, look: Look = PLAIN, t: float = 0.0, seed: int = 0
 ) -> StereoFrame:
     """Render both images of `things`, the farthest first, on a grey wall."""
     rng = np.random.default_rng(seed)

@@ -350,12 +350,7 @@ def test_nothing_is_missing_of_a_careful_persons_views(planted) -> None:
 
 @pytest.mark.parametrize(
     ("axis", "said"),
-    [
-        ([0, 1, 0], "right edge"),
-        ([0, -1, 0], "left edge"),
-        ([1, 0, 0], "upper edge"),
-        ([-1, 0, 0], "lower edge"),
-    ],
+    [([0, 1, 0], "right edge"), ([0, -1, 0], "left edge"), ([1, 0, 0], "upper edge"), ([-1, 0, 0], "lower edge")],
 )
 def test_a_tilt_that_was_shown_is_not_asked_for_again(planted, axis, said) -> None:
     rig, _ = planted

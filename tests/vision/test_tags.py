@@ -33,10 +33,7 @@ WALL = Look(wall=0.4, samples=6)
 FACING = np.diag([1.0, -1.0, -1.0])
 MIDDLE = np.array([0.02, 0.0, 0.4])
 # Two tags on faces of a cube, in the cube's frame.
-PLACED = (
-    PlacedTag(id=1, xyz=(0.0, 0.0, 0.02)),
-    PlacedTag(id=2, xyz=(0.02, 0.0, 0.0), rpy=(0.0, np.pi / 2, 0.0)),
-)
+PLACED = (PlacedTag(id=1, xyz=(0.0, 0.0, 0.02)), PlacedTag(id=2, xyz=(0.02, 0.0, 0.0), rpy=(0.0, np.pi / 2, 0.0)))
 CUBE = TagBody.cluster(ClusterConfig(tags=PLACED), CONFIG)
 
 

@@ -113,11 +113,7 @@ def calibrate(
 
 
 def _fits(
-    views: Sequence[View],
-    board: Board,
-    asked: Asked,
-    models: Sequence[Model],
-    tell: Callable[[str], None],
+    views: Sequence[View], board: Board, asked: Asked, models: Sequence[Model], tell: Callable[[str], None]
 ) -> dict[Model, Fitted]:
     """Fit each model and return those that fit; raise CalibrationError if none does."""
     fits: dict[Model, Fitted] = {}
@@ -169,11 +165,7 @@ def fit(
 
 
 def _fit(
-    views: Sequence[View],
-    corners_m: FloatArray,
-    image_size_px: tuple[int, int],
-    model: Model,
-    eyes: tuple[Eye, ...],
+    views: Sequence[View], corners_m: FloatArray, image_size_px: tuple[int, int], model: Model, eyes: tuple[Eye, ...]
 ) -> Fitted:
     kept = list(views)
     left_out: list[LeftOut] = []

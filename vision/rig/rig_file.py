@@ -120,10 +120,7 @@ def _text(rig: Rig) -> str:
         eyes = {
             "left": _eye_table(rig.left, rig.serials[0]),
             "right": _eye_table(rig.right, rig.serials[1]),
-            "right_from_left": {
-                "rotation_rad": rig.rotation_rad.tolist(),
-                "translation_m": rig.translation_m.tolist(),
-            },
+            "right_from_left": {"rotation_rad": rig.rotation_rad.tolist(), "translation_m": rig.translation_m.tolist()},
         }
     tables = {
         "format": FORMAT if isinstance(rig, StereoRig) else FORMAT_OF_ONE,

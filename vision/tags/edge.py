@@ -184,15 +184,7 @@ def find_edges(
     ends = np.stack([rays.s[:, 0], rays.s.max(axis=1)], axis=1)[..., None]
     spots = origins[:, None] + 0.5 * lengths[:, None, None] * ends * along[:, None]
     return Edges(
-        origins,
-        along,
-        normals,
-        0.5 * lengths,
-        *fitted,
-        points.widening,
-        points.information,
-        spots,
-        points.levels,
+        origins, along, normals, 0.5 * lengths, *fitted, points.widening, points.information, spots, points.levels
     )
 
 

@@ -63,8 +63,7 @@ class Instead:
 
     check: Annotated[bool, flag("Check that a calibration still holds, from one look at the board.")] = False
     calibration: Annotated[
-        Path | None,
-        Parameter(help="With --check: the calibration; else cameras.toml, live the one in robot.toml."),
+        Path | None, Parameter(help="With --check: the calibration; else cameras.toml, live the one in robot.toml.")
     ] = None
     seconds: Annotated[
         float, Parameter(help="With --check, live: how long the board is waited for [s].", validator=Number(gt=0))
@@ -162,13 +161,7 @@ def _calibrate(
 
 
 def _check(
-    images: Path | None,
-    files: EyeFiles,
-    printed: PrintedBoard,
-    robot: Path,
-    instead: Instead,
-    *,
-    as_json: bool,
+    images: Path | None, files: EyeFiles, printed: PrintedBoard, robot: Path, instead: Instead, *, as_json: bool
 ) -> None:
     from bodyschema.cli.cameras.calibration import check_view, checked
     from bodyschema.daemon.config import Config

@@ -47,8 +47,7 @@ def print_tags(
         ),
     ] = "tags",
     ids: Annotated[
-        str | None,
-        Parameter(help="Numbers of the tags, as in 0-5,9, row by row; else from 0 on.", show_default=False),
+        str | None, Parameter(help="Numbers of the tags, as in 0-5,9, row by row; else from 0 on.", show_default=False)
     ] = None,
     family: Family = "apriltag_36h11",
     side_mm: Annotated[
@@ -126,8 +125,7 @@ def learn(
         float, Parameter(help="Ball, without IMAGES: how long it is moved [s].", validator=Number(gte=1, lte=120))
     ] = 5.0,
     side_mm: Annotated[
-        float | None,
-        Parameter(help="Cluster: side of the black squares as measured [mm].", validator=Number(gt=0)),
+        float | None, Parameter(help="Cluster: side of the black squares as measured [mm].", validator=Number(gt=0))
     ] = None,
     other_sides_mm: Annotated[
         str | None, Parameter(help="Cluster: tags of another side [mm], as in 7=25,8=25.", show_default=False)

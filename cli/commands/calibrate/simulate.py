@@ -18,8 +18,7 @@ def simulate(
     like: Annotated[Path, Parameter(help="A recording (.csv, .parquet) or a pair store (.sqlite): the joint angles.")],
     robot: SourceRobotFile = None,
     out: Annotated[
-        Path | None,
-        Parameter(help="The file (.csv, .parquet, .mcap, .rrd); else CSV goes to standard output."),
+        Path | None, Parameter(help="The file (.csv, .parquet, .mcap, .rrd); else CSV goes to standard output.")
     ] = None,
     noise: Annotated[bool, flag("Add the noise of the positions: as in LIKE, else as in [camera].")] = False,
     seed: Annotated[int, Parameter(help="Of the noise.", validator=Number(gte=0))] = 0,

@@ -134,13 +134,7 @@ def _compare(looked_at: list[Place], *, as_json: bool) -> None:
 
 
 def _diagnose(
-    wanted: list[Job],
-    asked: Asked,
-    out: Path | None,
-    scheduler: str | None,
-    workers: int | None,
-    *,
-    as_json: bool,
+    wanted: list[Job], asked: Asked, out: Path | None, scheduler: str | None, workers: int | None, *, as_json: bool
 ) -> None:
     from bodyschema.fleet.diagnosing import diagnose_all
     from bodyschema.fleet.diagnosing import workers as cluster

@@ -24,10 +24,7 @@ def bench(
     *,
     port: Annotated[Path, Parameter(help="The name of the port to make; PORT-BUS for each of several buses.")] = PORT,
     robot: RobotFile = HERE,
-    fault: Annotated[
-        tuple[str, ...],
-        several("KIND[@JOINT][=SHARE], as in late=0.05 or overload@elbow"),
-    ] = (),
+    fault: Annotated[tuple[str, ...], several("KIND[@JOINT][=SHARE], as in late=0.05 or overload@elbow")] = (),
     list_faults: Annotated[bool, flag("Show the kinds of faults and end.", name="--list-faults")] = False,
     return_delay_us: Annotated[
         int, Parameter(help="Return Delay Time of the servos; the factory's is 500.", validator=Number(gte=0, lte=508))

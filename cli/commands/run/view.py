@@ -49,8 +49,7 @@ def view(
     *,
     robot: RobotFile = HERE,
     port: Annotated[
-        int,
-        Parameter(help="For the browser on this machine; 0: a free one.", validator=Number(gte=0, lte=65535)),
+        int, Parameter(help="For the browser on this machine; 0: a free one.", validator=Number(gte=0, lte=65535))
     ] = PORT,
     verbose: Annotated[bool, flag("Log more.")] = False,
 ) -> None:

@@ -32,8 +32,7 @@ def init(
     ] = None,
     camera_link: Annotated[str | None, Parameter(help="The link with the cameras; else the first one.")] = None,
     source: Annotated[
-        str | None,
-        Parameter(name="--from", help="`scan` to find the servos, or a file that `scan --json` wrote."),
+        str | None, Parameter(name="--from", help="`scan` to find the servos, or a file that `scan --json` wrote.")
     ] = None,
     lerobot: Annotated[
         str | None, Parameter(help="An arm of LeRobot: so101, so100, moss, koch or koch_leader; with its URDF.")
