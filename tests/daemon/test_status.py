@@ -66,7 +66,7 @@ def sampler_running(config: Config) -> Iterator[None]:
         "sampler of arm is paused, up for 1 min 15 s",
         "700, 29.9/s; readings 120/s",
         "612 in 3 segments, 12.3/s",
-        "rejected 80 too near, 8 at border",
+        "rejected 80 hardly any motion since the last pair, 8 at the border",
         "! the disk is nearly full",
         "-29° … +29°",
         "learner of arm is learning, up for 1 h 06 min",

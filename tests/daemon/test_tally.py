@@ -34,9 +34,8 @@ def test_every_reason_has_words_and_a_remedy(reason) -> None:
 @pytest.mark.parametrize("reason", [Reason.NO_MARKER, Reason.EPIPOLAR, Reason.STALE, Reason.MOVING])
 def test_frames_all_refused_name_reason_and_remedy(tally, reason) -> None:
     refuse(tally, reason, FEWEST_FRAMES)
-    name = reason.replace("_", " ")
     assert tally.complaints == [
-        f"{FEWEST_FRAMES} of the last {FEWEST_FRAMES} frames were rejected: {name}. {REMEDIES[reason]}"
+        f"{FEWEST_FRAMES} of the last {FEWEST_FRAMES} frames were rejected: {WORDS[reason]}. {REMEDIES[reason]}"
     ]
 
 
@@ -45,7 +44,7 @@ def test_the_most_frequent_of_several_reasons_is_named(tally) -> None:
     refuse(tally, Reason.EPIPOLAR, 50)
     tally.accept(Q)
     assert [sentence.partition(". ")[0] for sentence in tally.complaints] == [
-        "50 of the last 91 frames were rejected: epipolar"
+        "50 of the last 91 frames were rejected: rows differ"
     ]
 
 
