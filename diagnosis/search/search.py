@@ -90,11 +90,14 @@ class Beside:
         Another that begins beside it may have left rows to it, and begins at another moment without it.
         """
         fit = improved(self._fit.starting(self.others))
-        for k in np.flatnonzero([one.kind.begins for one in self.others] if self._cause.kind.begins else []).tolist():
-            others = [*fit.causes]
-            if (again := moment_again(fit, others[k], _near_moment(fit, others[k]))) is not None:
-                others[k] = again.effect
-                fit = max(fit, improved(fit.starting(others)), key=lambda one: one.log_likelihood)
+        if not self._cause.kind.begins:
+            return fit
+        for k in range(len(fit.causes)):
+            other = fit.causes[k]
+            again = moment_again(fit, other, _near_moment(fit, other)) if other.kind.begins else None
+            if again is not None:
+                moved = fit.starting([*fit.causes[:k], again.effect, *fit.causes[k + 1 :]])
+                fit = max(fit, improved(moved), key=lambda one: one.log_likelihood)
         return fit
 
     @property

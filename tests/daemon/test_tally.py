@@ -9,7 +9,7 @@ from small_arm import write_small_arm
 from bodyschema.daemon.sampler.counters import FEWEST_FRAMES, NEWEST_FRAMES, SamplerCounters
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.records import Reason
-from bodyschema.interfaces.rejections import REMEDIES, WORDS
+from bodyschema.interfaces.rejections import REMEDIES, WORDS, words_of
 from bodyschema.robot.description import RobotDescription
 
 Q = np.zeros(2)
@@ -29,6 +29,10 @@ def refuse(tally: SamplerCounters, reason: Reason, count: int) -> None:
 def test_every_reason_has_words_and_a_remedy(reason) -> None:
     assert WORDS[reason]
     assert REMEDIES[reason].endswith((".", "?"))
+
+
+def test_a_reason_of_a_newer_version_is_shown_as_it_came() -> None:
+    assert words_of("too_cold") == "too cold"
 
 
 @pytest.mark.parametrize("reason", [Reason.NO_MARKER, Reason.EPIPOLAR, Reason.STALE, Reason.MOVING])

@@ -142,5 +142,5 @@ def test_the_ball_is_followed_in_a_bags_compressed_images(config: Config, tmp_pa
     track = markers_in_images(config, bag, "/camera/image/compressed")
     np.testing.assert_allclose(track.t - BEGUN_S, times, atol=1e-6)
     np.testing.assert_allclose(track.x[:, :2], [ball.x[:2] for ball in balls], atol=5e-4)
-    with pytest.raises(RecordingError, match=r"--video /tag: there is no such topic of sensor_msgs/msg/Compressed"):
+    with pytest.raises(RecordingError, match=r"--video /tag: there is no such topic of .*[.?] The bag has"):
         markers_in_images(config, bag, "/tag")
