@@ -7,8 +7,7 @@ from bodyschema.effects.corrected import LiveEncoders
 from bodyschema.effects.simulation import Simulated
 
 from .corrected import corrected_file, write_corrected
-from .effect import Effect, Identity
-from .effect_type import EffectType
+from .effect_type import Effect, EffectType, Identity
 from .files import load_simulation, read_effects, read_unexplained, simulation_of, write_extended
 from .gravity import GravityLoad
 from .motion import Motion

@@ -18,8 +18,8 @@ from bodyschema.robot.calibrated import CalibratedGeometry
 from bodyschema.robot.calibrated_files import calibrated_urdf
 from bodyschema.robot.description import RobotDescription
 
-from .effect import Effect
-from .effect_type import StructureEffect, ToolEffect
+from .effect_type import Effect, StructureEffect, ToolEffect
+from .encoder import EncoderEffect
 
 
 def corrected_file(robot: RobotDescription) -> str:
@@ -96,9 +96,9 @@ class LiveEncoders:
 
     def __init__(self, simulation: Simulation, row_readings: int = 1) -> None:
         self._errors = [
-            (place.joint, effect.kind.encoder.live(place, effect.values, row_readings))
+            (place.joint, effect.kind.live(place, effect.values, row_readings))
             for effect in simulation.all_effects
-            if effect.kind.encoder is not None
+            if isinstance(effect.kind, EncoderEffect)
             for place in [simulation.place(effect)]
         ]
 

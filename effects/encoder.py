@@ -4,35 +4,20 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
 
-from .effect_type import EffectType
+from .effect_type import Effect, EffectType, SimulationRun
 from .motion import Motion
+from .parameter import Place
 
-if TYPE_CHECKING:
-    from .effect import Effect
-    from .simulation import Simulated
-
-# What an effect adds to correction.json: "ratios" (joint, source, factor), "waves" (joint, amplitude, frequency,
-# phase), "memories" (joint, kind, amount, scale) and "loose" (joint, half of the width, hold).
-Rows = dict[str, list[list[Any]]]
 # Number of runs whose strains are kept: the diagnosis asks again for those of its candidates.
 STRAINS_KEPT = 256
 # Share of a past move below which it is ignored.
 _FORGOTTEN = 1e-17
-
-
-@dataclass(frozen=True, slots=True)
-class Place:
-    """Indices in q of an effect's joint and, for a coupling, of the joint that causes it."""
-
-    joint: int
-    prismatic: bool
-    source: int | None = None
 
 
 class LiveError(Protocol):
@@ -66,15 +51,10 @@ class EncoderEffect(EffectType):
         """
         return _WithoutMemory(self, place, values)
 
-    def jacobian(self, run: Simulated, effect: Effect) -> FloatArray:
+    def jacobian(self, run: SimulationRun, effect: Effect) -> FloatArray:
         """Return derivatives (n, 3, p) of the measurements by the effect's values."""
         place = run.simulation.place(effect)
         return run.by_joint[:, :, place.joint, None] * self.columns(run.readings, place, effect.values)[:, None, :]
-
-    @property
-    def encoder(self) -> EncoderEffect:
-        """The effect itself."""
-        return self
 
 
 @dataclass(frozen=True)

@@ -37,8 +37,7 @@ from bodyschema.robot.toml_file import convert, line_in_entry, line_of, read_tom
 from bodyschema.robot.toml_text import toml_text
 from kbmaps import ModelFormatError
 
-from .effect import Effect
-from .effect_type import CameraEffect
+from .effect_type import CameraEffect, Effect
 from .parameter import Parameter
 from .registry import EFFECT_TYPES
 from .simulation import Simulation

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
+
+# What an effect adds to correction.json: "ratios" (joint, source, factor), "waves" (joint, amplitude, frequency,
+# phase), "memories" (joint, kind, amount, scale) and "loose" (joint, half of the width, hold).
+Rows = dict[str, list[list[Any]]]
 
 
 @dataclass(frozen=True)

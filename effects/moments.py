@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray
 
+from .effect_type import Effect
 from .motion import Motion
-
-if TYPE_CHECKING:
-    from .effect import Effect
 
 
 def settled(motion: Motion, time_constant_s: float) -> FloatArray:

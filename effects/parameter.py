@@ -35,3 +35,12 @@ def shifts(usual_m: float) -> tuple[Parameter, ...]:
 def turns(usual_rad: float) -> tuple[Parameter, ...]:
     """Return the parameters of a rotation vector."""
     return tuple(Parameter(f"r{axis}_rad", usual_rad) for axis in "xyz")
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Indices in q of an effect's joint and, for a coupling, of the joint that causes it."""
+
+    joint: int
+    prismatic: bool
+    source: int | None = None

@@ -10,7 +10,7 @@ from pkgutil import iter_modules
 from bodyschema.robot.plugins import installed
 
 from . import catalogue
-from .effect_type import STAGES, EffectType
+from .effect_type import EFFECT_TYPES, STAGES, EffectType
 
 
 def built_in() -> list[EffectType]:
@@ -42,4 +42,4 @@ def _all() -> dict[str, EffectType]:
     return {e.name: e for e in sorted(found.values(), key=lambda e: (STAGES.index(e.stage), e.rank, e.name))}
 
 
-EFFECT_TYPES: dict[str, EffectType] = _all()
+EFFECT_TYPES.update(_all())

@@ -19,13 +19,24 @@ from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.urdf import inverse
 from kbmaps import RigidChain
 
-from .effect import Effect, Identity
-from .effect_type import STAGES, STEP, CameraEffect, EffectType, Stage, StructureEffect, TimeEffect, ToolEffect
-from .encoder import Place
+from .effect_type import (
+    STAGES,
+    STEP,
+    CameraEffect,
+    Effect,
+    EffectType,
+    Identity,
+    Stage,
+    StructureEffect,
+    TimeEffect,
+    ToolEffect,
+)
+from .encoder import EncoderEffect
 from .gravity import GravityLoad
 from .moments import after, since
 from .motion import Motion
 from .optics import Optics
+from .parameter import Place
 
 # Relative step by a period or a time constant.
 _SHAPE_STEP = 1e-3
@@ -181,10 +192,10 @@ class Simulation:
         """Return joint angles (n, d) [rad, m] with the corrections of some effects added."""
         q = angles.copy()
         for effect in effects:
-            if effect.kind.encoder is not None:
+            if isinstance(effect.kind, EncoderEffect):
                 place, known = self.place(effect), _CORRECTIONS.setdefault(readings, WeakKeyDictionary())
                 if effect not in known:
-                    known[effect] = effect.kind.encoder.correction(readings, place, effect.values)
+                    known[effect] = effect.kind.correction(readings, place, effect.values)
                 q[:, place.joint] += known[effect]
         return q
 
@@ -455,6 +466,17 @@ class Simulated:
             change = change - simulation.reported(self.x_camera, self.motion, less)
             columns.append(change / (2.0 * STEP))
         return np.stack(columns, axis=2)
+
+    def by_report(self, effect: Effect) -> FloatArray:
+        """Return derivatives (n, 3, p) by the values of an effect on the camera's report, by differences."""
+        columns = np.zeros((len(self.motion), 3, len(effect.values)))
+        for k in effect.all_amounts:
+            step = np.zeros(len(effect.values))
+            step[k] = STEP
+            ends = (self.simulation.having(effect.with_values(effect.values + s * step)) for s in (1.0, -1.0))
+            more, less = (simulation.reported(self.x_camera, self.motion) for simulation in ends)
+            columns[:, :, k] = (more - less) / (2.0 * STEP)
+        return columns
 
     def seen(self, moved: FloatArray) -> FloatArray:
         """Return the change of the measurements by moves (n, 3, p) [m] of the point in the nominal camera's frame."""

@@ -16,6 +16,7 @@ from bodyschema.diagnosis.search.scan import Candidate
 from bodyschema.diagnosis.search.search import Search
 from bodyschema.diagnosis.unnamed.unknown import Unknowns
 from bodyschema.effects import Effect, EffectType, Motion
+from bodyschema.effects.encoder import EncoderEffect
 from bodyschema.interfaces.records import FloatArray
 
 from .nameless import Nameless
@@ -152,7 +153,7 @@ def _standing(
 def resembles_sag(kind: EffectType) -> bool:
     """Return True for an error of a joint that depends on angles alone, as sag nearly does."""
     lasts = not (kind.depends_on_path or kind.changes_with_time)
-    return kind.encoder is not None and lasts and not kind.is_zero
+    return isinstance(kind, EncoderEffect) and lasts and not kind.is_zero
 
 
 def is_like_sag(without: Fit, cause: Effect, least: float) -> bool:

@@ -19,6 +19,7 @@ from bodyschema.diagnosis.fit.products import Products, System
 from bodyschema.diagnosis.fit.tangent import TOLD_APART
 from bodyschema.diagnosis.fit.worth import choices, nats, ways_to_choose
 from bodyschema.effects import Effect, Identity
+from bodyschema.effects.encoder import EncoderEffect
 from bodyschema.effects.motion import flanks
 from bodyschema.interfaces.records import FloatArray
 
@@ -201,12 +202,12 @@ class Scan:
     def _each(self, effect: Effect, shapes: FloatArray) -> System:
         """Return the system of each shape (m,), which scales the same columns row by row."""
         run = self._fit.run
-        if effect.kind.encoder is None:
+        if not isinstance(effect.kind, EncoderEffect):
             constant = np.broadcast_to(np.eye(3), (len(run.motion), 3, 3))
             rows = self._products.rows_of(self._fit.weighted(constant))
             factors = [effect.kind.growth(run.motion, float(shape)) for shape in shapes]
         else:
-            place, encoder = self._fit.simulation.place(effect), effect.kind.encoder
+            place, encoder = self._fit.simulation.place(effect), effect.kind
             rows = self._products.port(place.joint)
             shaped = (np.append(effect.values[:-1], shape) for shape in shapes)
             factors = [encoder.columns(run.readings, place, values)[:, 0] for values in shaped]
@@ -214,8 +215,8 @@ class Scan:
 
     def _play(self, effect: Effect) -> Candidate | None:
         """Return the best backlash over widths; the amount is the width itself."""
-        place, encoder = self._fit.simulation.place(effect), effect.kind.encoder
-        assert encoder is not None
+        place, encoder = self._fit.simulation.place(effect), effect.kind
+        assert isinstance(encoder, EncoderEffect)
         widths = encoder.trial_shapes(self._fit.observations.motion)
 
         def bent() -> System:
@@ -324,8 +325,8 @@ class Scan:
         """Return the system of an effect that has amounts only."""
 
         def linear() -> System:
-            encoder = effect.kind.encoder
-            if encoder is None:
+            encoder = effect.kind
+            if not isinstance(encoder, EncoderEffect):
                 return self._products.of(self._fit.weighted(self._fit.run.columns(effect)[:, :, effect.amounts]))
             place = self._fit.simulation.place(effect)
             factors = encoder.columns(self._fit.run.readings, place, effect.values)[:, effect.amounts]

@@ -3,21 +3,16 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyschema.effects.effect_type import STEP
-from bodyschema.effects.encoder import STRAINS_KEPT, EncoderEffect, LiveDriven, Place, Rows
-from bodyschema.effects.joint_errors import JointErrors
+from bodyschema.effects.effect_type import STEP, Effect, SimulationRun
+from bodyschema.effects.encoder import STRAINS_KEPT, EncoderEffect, LiveDriven
+from bodyschema.effects.joint_errors import JointErrors, Rows
 from bodyschema.effects.motion import Motion
-from bodyschema.effects.parameter import Parameter
+from bodyschema.effects.parameter import Parameter, Place
 from bodyschema.interfaces.records import FloatArray, frozen_array
-
-if TYPE_CHECKING:
-    from bodyschema.effects.effect import Effect
-    from bodyschema.effects.simulation import Simulated
 
 # Widths tried [rad, m].
 WIDTHS = np.geomspace(2e-4, 0.15, 14)
@@ -54,7 +49,7 @@ class Backlash(EncoderEffect):
     def trial_shapes(self, motion: Motion) -> FloatArray:
         return WIDTHS
 
-    def unknown_state(self, run: Simulated, effect: Effect) -> NDArray[np.bool_]:
+    def unknown_state(self, run: SimulationRun, effect: Effect) -> NDArray[np.bool_]:
         """Return rows (n,) before the joint first crosses its backlash in a run."""
         return run.motion.before_travel(run.simulation.place(effect).joint, float(effect.values[0]))
 

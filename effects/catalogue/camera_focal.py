@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from bodyschema.effects.effect_type import CameraEffect
+from bodyschema.effects.effect_type import CameraEffect, Effect, SimulationRun
 from bodyschema.effects.optics import Optics
 from bodyschema.effects.parameter import Parameter
 from bodyschema.interfaces.records import FloatArray
-
-if TYPE_CHECKING:
-    from bodyschema.effects.effect import Effect
-    from bodyschema.effects.simulation import Simulated
 
 
 class CameraFocal(CameraEffect):
@@ -27,5 +21,5 @@ class CameraFocal(CameraEffect):
     def optics(self, values: FloatArray) -> Optics:
         return Optics(focal_error=float(values[0]))
 
-    def jacobian(self, run: Simulated, effect: Effect) -> FloatArray:
+    def jacobian(self, run: SimulationRun, effect: Effect) -> FloatArray:
         return run.by_optics(effect)

@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from bodyschema.effects.effect_type import TimeEffect
+from bodyschema.effects.effect_type import Effect, SimulationRun, TimeEffect
 from bodyschema.effects.parameter import Parameter
 from bodyschema.interfaces.records import FloatArray
-
-if TYPE_CHECKING:
-    from bodyschema.effects.effect import Effect
-    from bodyschema.effects.simulation import Simulated
 
 # Step of the numerical derivative [s].
 _STEP_S = 1e-5
@@ -35,7 +29,7 @@ class CameraLatency(TimeEffect):
     def delay_s(self, values: FloatArray) -> float:
         return float(values[0])
 
-    def jacobian(self, run: Simulated, effect: Effect) -> FloatArray:
+    def jacobian(self, run: SimulationRun, effect: Effect) -> FloatArray:
         # Include the encoder errors: they too are those of the earlier moment.
         simulation, latency = run.simulation, run.simulation.latency_s
         later, sooner = (simulation.unloaded(run.motion.earlier(latency + s)) for s in (_STEP_S, -_STEP_S))

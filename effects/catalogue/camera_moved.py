@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from bodyschema.effects.effect_type import CameraEffect
+from bodyschema.effects.effect_type import CameraEffect, Effect, SimulationRun
 from bodyschema.effects.moments import since, with_moment
 from bodyschema.effects.motion import moved_by_observer, transforms
 from bodyschema.effects.parameter import T0, Parameter, shifts, turns
 from bodyschema.interfaces.records import FloatArray
-
-if TYPE_CHECKING:
-    from bodyschema.effects.effect import Effect
-    from bodyschema.effects.simulation import Simulated
 
 
 class CameraMoved(CameraEffect):
@@ -29,6 +23,6 @@ class CameraMoved(CameraEffect):
     def pose(self, values: FloatArray) -> FloatArray:
         return transforms(values[None, :6])[0]
 
-    def jacobian(self, run: Simulated, effect: Effect) -> FloatArray:
+    def jacobian(self, run: SimulationRun, effect: Effect) -> FloatArray:
         moved = moved_by_observer(effect.values, run.x_camera)
         return with_moment(run.optical(moved) * since(run.motion, effect))

@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from bodyschema.effects.effect_type import CameraEffect
+from bodyschema.effects.effect_type import CameraEffect, Effect, SimulationRun
 from bodyschema.effects.motion import moved_by_observer, transforms
 from bodyschema.effects.parameter import Parameter, shifts, turns
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
-
-if TYPE_CHECKING:
-    from bodyschema.effects.effect import Effect
-    from bodyschema.effects.simulation import Simulated
 
 
 class CameraPose(CameraEffect):
@@ -31,5 +25,5 @@ class CameraPose(CameraEffect):
     def pose(self, values: FloatArray) -> FloatArray:
         return transforms(values[None])[0]
 
-    def jacobian(self, run: Simulated, effect: Effect) -> FloatArray:
+    def jacobian(self, run: SimulationRun, effect: Effect) -> FloatArray:
         return run.optical(run.since_moved(moved_by_observer(effect.values, run.x_placed)))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from bodyschema.effects.encoder import EncoderEffect, Place
+from bodyschema.effects.encoder import EncoderEffect
 from bodyschema.effects.motion import Motion
-from bodyschema.effects.parameter import T0, Parameter
+from bodyschema.effects.parameter import T0, Parameter, Place
 from bodyschema.interfaces.records import FloatArray
 
 

@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyschema.effects.effect_type import StructureEffect
-from bodyschema.effects.encoder import Place, Rows
-from bodyschema.effects.joint_errors import JointErrors
+from bodyschema.effects.effect_type import Effect, SimulationRun, StructureEffect
+from bodyschema.effects.joint_errors import JointErrors, Rows
 from bodyschema.effects.moments import with_moment
 from bodyschema.effects.motion import Motion, flanks
-from bodyschema.effects.parameter import Parameter
+from bodyschema.effects.parameter import Parameter, Place
 from bodyschema.interfaces.records import FloatArray
-
-if TYPE_CHECKING:
-    from bodyschema.effects.effect import Effect
-    from bodyschema.effects.simulation import Simulated
 
 # Uncertainty factor of the friction, and the smallest relative load that counts.
 _FRICTION_WITHIN, _UPRIGHT = 2.0, 0.02
@@ -48,7 +41,7 @@ class GravityBacklash(StructureEffect):
         sides = flanks(torque, float(values[1]), side)
         return 0.5 * values[0] * sides, float(sides[-1])
 
-    def jacobian(self, run: Simulated, effect: Effect) -> FloatArray:
+    def jacobian(self, run: SimulationRun, effect: Effect) -> FloatArray:
         k = run.simulation.place(effect).joint
         if not run.simulation.bears_weight:
             return np.zeros((len(run.q), 3, 2))
@@ -59,7 +52,7 @@ class GravityBacklash(StructureEffect):
         """Return shares of the largest load."""
         return np.array(_HOLDS)
 
-    def unknown_state(self, run: Simulated, effect: Effect) -> NDArray[np.bool_]:
+    def unknown_state(self, run: SimulationRun, effect: Effect) -> NDArray[np.bool_]:
         """Return rows (n,) at which the side depends on the size of the friction."""
         torque, hold = run.torques[:, run.simulation.place(effect).joint], float(effect.values[1])
         less, more = hold / _FRICTION_WITHIN, hold * _FRICTION_WITHIN + _UPRIGHT * float(np.abs(torque).max())

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyschema.effects.encoder import STRAINS_KEPT, EncoderEffect, LiveDriven, Place, Rows, carried_on
+from bodyschema.effects.effect_type import Effect, SimulationRun
+from bodyschema.effects.encoder import STRAINS_KEPT, EncoderEffect, LiveDriven, carried_on
+from bodyschema.effects.joint_errors import Rows
 from bodyschema.effects.motion import Motion
-from bodyschema.effects.parameter import Parameter
+from bodyschema.effects.parameter import Parameter, Place
 from bodyschema.interfaces.records import FloatArray, frozen_array
 
 from .backlash import WIDTHS
-
-if TYPE_CHECKING:
-    from bodyschema.effects.effect import Effect
-    from bodyschema.effects.simulation import Simulated
 
 # Lengths tried [rad, m].
 _LENGTHS = np.geomspace(5e-4, 0.3, 14)
@@ -63,7 +60,7 @@ class Hysteresis(EncoderEffect):
     def correction_rows(self, effect: Effect, place: Place) -> Rows:
         return {"memories": [[place.joint, 1, *effect.values.tolist()]]}
 
-    def unknown_state(self, run: Simulated, effect: Effect) -> NDArray[np.bool_]:
+    def unknown_state(self, run: SimulationRun, effect: Effect) -> NDArray[np.bool_]:
         """Return rows (n,) before the joint has gone far enough one way in a run."""
         return run.motion.before_travel(run.simulation.place(effect).joint, _STRAINED * float(effect.values[1]))
 

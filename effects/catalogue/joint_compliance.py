@@ -2,18 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from bodyschema.effects.effect_type import StructureEffect
+from bodyschema.effects.effect_type import Effect, SimulationRun, StructureEffect
 from bodyschema.effects.joint_errors import JointErrors
 from bodyschema.effects.parameter import Parameter
 from bodyschema.interfaces.records import FloatArray
-
-if TYPE_CHECKING:
-    from bodyschema.effects.effect import Effect
-    from bodyschema.effects.simulation import Simulated
 
 
 class JointCompliance(StructureEffect):
@@ -34,7 +28,7 @@ class JointCompliance(StructureEffect):
     def compliance(self, values: FloatArray) -> float:
         return float(values[0])
 
-    def jacobian(self, run: Simulated, effect: Effect) -> FloatArray:
+    def jacobian(self, run: SimulationRun, effect: Effect) -> FloatArray:
         k = run.simulation.place(effect).joint
         if not run.simulation.bears_weight:
             return np.zeros((len(run.q), 3, 1))

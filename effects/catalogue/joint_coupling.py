@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from bodyschema.effects.encoder import EncoderEffect, Place, Rows
-from bodyschema.effects.joint_errors import JointErrors
+from bodyschema.effects.effect_type import Effect
+from bodyschema.effects.encoder import EncoderEffect
+from bodyschema.effects.joint_errors import JointErrors, Rows
 from bodyschema.effects.motion import Motion
-from bodyschema.effects.parameter import Parameter
+from bodyschema.effects.parameter import Parameter, Place
 from bodyschema.interfaces.records import FloatArray
-
-if TYPE_CHECKING:
-    from bodyschema.effects.effect import Effect
 
 
 class JointCoupling(EncoderEffect):

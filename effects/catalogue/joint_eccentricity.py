@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from bodyschema.effects.encoder import EncoderEffect, Place, Rows
-from bodyschema.effects.joint_errors import JointErrors
+from bodyschema.effects.effect_type import Effect
+from bodyschema.effects.encoder import EncoderEffect
+from bodyschema.effects.joint_errors import JointErrors, Rows
 from bodyschema.effects.motion import Motion
-from bodyschema.effects.parameter import Parameter
+from bodyschema.effects.parameter import Parameter, Place
 from bodyschema.interfaces.records import FloatArray
-
-if TYPE_CHECKING:
-    from bodyschema.effects.effect import Effect
 
 # Upper limit of a magnet's eccentricity as a share of its radius; beyond it the encoder cannot be read.
 _FARTHEST_OFF = 0.95

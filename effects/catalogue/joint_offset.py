@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from bodyschema.effects.encoder import EncoderEffect, Place
+from bodyschema.effects.effect_type import Effect
+from bodyschema.effects.encoder import EncoderEffect
 from bodyschema.effects.joint_errors import JointErrors
 from bodyschema.effects.motion import Motion
-from bodyschema.effects.parameter import Parameter
+from bodyschema.effects.parameter import Parameter, Place
 from bodyschema.interfaces.records import FloatArray
-
-if TYPE_CHECKING:
-    from bodyschema.effects.effect import Effect
 
 
 class JointOffset(EncoderEffect):

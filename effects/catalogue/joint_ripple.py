@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from bodyschema.effects.encoder import EncoderEffect, Place, Rows
-from bodyschema.effects.joint_errors import JointErrors
+from bodyschema.effects.effect_type import Effect, SimulationRun
+from bodyschema.effects.encoder import EncoderEffect
+from bodyschema.effects.joint_errors import JointErrors, Rows
 from bodyschema.effects.motion import Motion
-from bodyschema.effects.parameter import Parameter
+from bodyschema.effects.parameter import Parameter, Place
 from bodyschema.interfaces.records import FloatArray
-
-if TYPE_CHECKING:
-    from bodyschema.effects.effect import Effect
-    from bodyschema.effects.simulation import Simulated
 
 # Largest step of the phase over the joint's range [rad].
 _OF_A_PEAK = 0.5
@@ -48,7 +43,7 @@ class JointRipple(EncoderEffect):
         columns[:, 0], columns[:, 1] = np.sin(phase), np.cos(phase)
         return columns
 
-    def shape_step(self, run: Simulated, effect: Effect, k: int) -> float:
+    def shape_step(self, run: SimulationRun, effect: Effect, k: int) -> float:
         return _OF_A_PEAK / max(float(np.ptp(run.readings.q[:, run.simulation.place(effect).joint])), 1e-6)
 
     def bounded(self, effect: Effect, k: int, value: float, motion: Motion) -> float:

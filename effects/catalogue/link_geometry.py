@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from bodyschema.effects.effect_type import StructureEffect
+from bodyschema.effects.effect_type import Effect, SimulationRun, StructureEffect
 from bodyschema.effects.motion import moved_and_turned, rotation, transforms
 from bodyschema.effects.parameter import Parameter, shifts, turns
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.urdf import inverse
-
-if TYPE_CHECKING:
-    from bodyschema.effects.effect import Effect
-    from bodyschema.effects.simulation import Simulated
 
 
 class LinkGeometry(StructureEffect):
@@ -32,7 +26,7 @@ class LinkGeometry(StructureEffect):
     def frame(self, values: FloatArray) -> FloatArray:
         return transforms(values[None])[0]
 
-    def jacobian(self, run: Simulated, effect: Effect) -> FloatArray:
+    def jacobian(self, run: SimulationRun, effect: Effect) -> FloatArray:
         k = run.simulation.place(effect).joint
         turn, by_turn = rotation(effect.values)
         if run.simulation.upward[k]:

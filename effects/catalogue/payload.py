@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from bodyschema.effects.effect_type import StructureEffect
+from bodyschema.effects.effect_type import Effect, SimulationRun, StructureEffect
 from bodyschema.effects.gravity import GravityLoad
 from bodyschema.effects.parameter import Parameter
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.urdf import PointMass
-
-if TYPE_CHECKING:
-    from bodyschema.effects.effect import Effect
-    from bodyschema.effects.simulation import Simulated
 
 
 class Payload(StructureEffect):
@@ -36,7 +30,7 @@ class Payload(StructureEffect):
     def point_mass(self, values: FloatArray) -> PointMass | None:
         return PointMass(float(values[0]), values[1:] / values[0]) if values[0] > 0.0 else None
 
-    def jacobian(self, run: Simulated, effect: Effect) -> FloatArray:
+    def jacobian(self, run: SimulationRun, effect: Effect) -> FloatArray:
         simulation, springs = run.simulation, run.simulation.springs
         if not (springs.any() and simulation.bears_weight):
             return np.zeros((len(run.q), 3, len(effect.values)))

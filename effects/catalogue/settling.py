@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from collections import deque
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyschema.effects.encoder import STRAINS_KEPT, EncoderEffect, Place, Rows, carried_on
+from bodyschema.effects.effect_type import Effect, SimulationRun
+from bodyschema.effects.encoder import STRAINS_KEPT, EncoderEffect, carried_on
+from bodyschema.effects.joint_errors import Rows
 from bodyschema.effects.motion import Motion
-from bodyschema.effects.parameter import Parameter
+from bodyschema.effects.parameter import Parameter, Place
 from bodyschema.interfaces.records import FloatArray, frozen_array
-
-if TYPE_CHECKING:
-    from bodyschema.effects.effect import Effect
-    from bodyschema.effects.simulation import Simulated
 
 # Shares of a lag that remain at the next reading: those tried, the largest step, and the largest.
 _MEMORIES, _OF_A_MEMORY, _LONGEST_MEMORY = np.linspace(0.0, 0.9, 19), 0.1, 0.95
@@ -50,13 +47,13 @@ class Settling(EncoderEffect):
     def trial_shapes(self, motion: Motion) -> FloatArray:
         return _MEMORIES
 
-    def shape_step(self, run: Simulated, effect: Effect, k: int) -> float:
+    def shape_step(self, run: SimulationRun, effect: Effect, k: int) -> float:
         return _OF_A_MEMORY
 
     def bounded(self, effect: Effect, k: int, value: float, motion: Motion) -> float:
         return float(np.clip(value, 0.0, _LONGEST_MEMORY))
 
-    def unknown_state(self, run: Simulated, effect: Effect) -> NDArray[np.bool_]:
+    def unknown_state(self, run: SimulationRun, effect: Effect) -> NDArray[np.bool_]:
         """Return rows (n,), except the first of a run, at which the joint has not settled from before the run."""
         motion, memory = run.motion, effect.value("memory")
         rows = np.zeros(len(motion), dtype=np.bool_)

@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
-from bodyschema.effects.effect_type import TimeEffect
+from bodyschema.effects.effect_type import Effect, SimulationRun, TimeEffect
 from bodyschema.effects.moments import settled, with_moment
 from bodyschema.effects.motion import Motion
 from bodyschema.effects.parameter import Parameter, shifts
 from bodyschema.interfaces.records import FloatArray
-
-if TYPE_CHECKING:
-    from bodyschema.effects.effect import Effect
-    from bodyschema.effects.simulation import Simulated
 
 # A drift that ends within a smaller share of the recording is an offset from the beginning.
 _SHORTEST = 0.03
@@ -36,7 +30,7 @@ class ThermalDrift(TimeEffect):
     def drift(self, motion: Motion, values: FloatArray) -> FloatArray:
         return self.growth(motion, values[3])[:, None] * values[:3]
 
-    def jacobian(self, run: Simulated, effect: Effect) -> FloatArray:
+    def jacobian(self, run: SimulationRun, effect: Effect) -> FloatArray:
         return with_moment(self.growth(run.motion, effect.values[3])[:, None, None] * np.eye(3))
 
     def growth(self, motion: Motion, shape: float) -> FloatArray:

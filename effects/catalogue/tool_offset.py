@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from bodyschema.effects.effect_type import ToolEffect
+from bodyschema.effects.effect_type import Effect, SimulationRun, ToolEffect
 from bodyschema.effects.parameter import Parameter, shifts
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
-
-if TYPE_CHECKING:
-    from bodyschema.effects.effect import Effect
-    from bodyschema.effects.simulation import Simulated
 
 
 class ToolOffset(ToolEffect):
@@ -30,5 +24,5 @@ class ToolOffset(ToolEffect):
     def shift(self, values: FloatArray) -> FloatArray:
         return values
 
-    def jacobian(self, run: Simulated, effect: Effect) -> FloatArray:
+    def jacobian(self, run: SimulationRun, effect: Effect) -> FloatArray:
         return run.by_marker

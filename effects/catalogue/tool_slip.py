@@ -2,16 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
-from bodyschema.effects.effect_type import ToolEffect
+from bodyschema.effects.effect_type import Effect, SimulationRun, ToolEffect
 from bodyschema.effects.moments import since, with_moment
 from bodyschema.effects.parameter import T0, Parameter, shifts
 from bodyschema.interfaces.records import FloatArray
-
-if TYPE_CHECKING:
-    from bodyschema.effects.effect import Effect
-    from bodyschema.effects.simulation import Simulated
 
 
 class ToolSlip(ToolEffect):
@@ -28,5 +22,5 @@ class ToolSlip(ToolEffect):
     def shift(self, values: FloatArray) -> FloatArray:
         return values[:3]
 
-    def jacobian(self, run: Simulated, effect: Effect) -> FloatArray:
+    def jacobian(self, run: SimulationRun, effect: Effect) -> FloatArray:
         return with_moment(run.by_marker * since(run.motion, effect))

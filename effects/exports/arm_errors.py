@@ -9,8 +9,7 @@ from typing import Self
 import numpy as np
 
 from bodyschema.effects.corrected import corrected_geometry
-from bodyschema.effects.effect import Effect
-from bodyschema.effects.effect_type import StructureEffect
+from bodyschema.effects.effect_type import Effect, StructureEffect
 from bodyschema.effects.joint_errors import JointErrors
 from bodyschema.effects.simulation import Simulation
 from bodyschema.robot.calibrated import CalibratedGeometry

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from bodyschema.effects.effect import Effect
-from bodyschema.effects.encoder import Rows
+from bodyschema.effects.effect_type import Effect
 from bodyschema.effects.exports.arm_errors import geometry_without_zeros
 from bodyschema.effects.gravity import GRAVITY_M_S2
+from bodyschema.effects.joint_errors import Rows
 from bodyschema.effects.simulation import SPRING_ROUNDS, Simulation
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.urdf import inverse

@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 
 from bodyschema.effects import EFFECT_TYPES, Effect, LiveEncoders, Motion, Simulation
 from bodyschema.effects.catalogue.backlash import played
+from bodyschema.effects.encoder import EncoderEffect
 
 PATHS = st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=60).map(np.array)
 WIDTHS = st.floats(1e-4, 0.5)
-EACH = [name for name, effect in EFFECT_TYPES.items() if effect.encoder is not None]
+EACH = [name for name, effect in EFFECT_TYPES.items() if isinstance(effect, EncoderEffect)]
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ from bodyschema.diagnosis.report.panels import Panel
 from bodyschema.diagnosis.report.plot import Layout, Plot, span
 from bodyschema.diagnosis.report.residuals import POINTS, Residuals, binned
 from bodyschema.effects import Effect, Motion
+from bodyschema.effects.encoder import EncoderEffect
 from bodyschema.effects.moments import after
 from bodyschema.interfaces.records import FloatArray
 
@@ -54,8 +55,8 @@ def over_reading(residuals: Residuals, effect: Effect) -> Panel:
     rows, factor = residuals.telling(k), residuals.unit(k)[0]
     q = np.zeros((_FINE, len(residuals.robot.joints)))
     q[:, over] = np.linspace(*_ends(residuals.motion.q[rows, over]), _FINE)
-    assert effect.kind.encoder is not None
-    fitted = factor * effect.kind.encoder.correction(Motion(q, None, np.zeros(_FINE, np.int64)), place, effect.values)
+    assert isinstance(effect.kind, EncoderEffect)
+    fitted = factor * effect.kind.correction(Motion(q, None, np.zeros(_FINE, np.int64)), place, effect.values)
     x, fine = residuals.angles(over), q[:, over] * residuals.unit(over)[0]
     label = f"{residuals.robot.joints[over]} [{residuals.unit(over)[1]}]"
     curve = (fine, fitted)
@@ -97,9 +98,9 @@ def load(residuals: Residuals, effect: Effect) -> tuple[FloatArray, str]:
 
 def remembered(residuals: Residuals, effect: Effect) -> FloatArray:
     """Return the correction (n,) of an effect that depends on the order of the readings."""
-    assert effect.kind.encoder is not None
+    assert isinstance(effect.kind, EncoderEffect)
     place = residuals.run.simulation.place(effect)
-    return effect.kind.encoder.correction(residuals.run.readings, place, effect.values)
+    return effect.kind.correction(residuals.run.readings, place, effect.values)
 
 
 def over_time_since(residuals: Residuals, effect: Effect) -> Panel:
