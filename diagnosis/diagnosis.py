@@ -69,8 +69,8 @@ class _Settings:
     most_rows, run = 1000, 50
 
 
-# With a larger share of doubtful rows, dropping them costs more than keeping them.
-MOST_DOUBTFUL = 0.25
+# Rows before which the state is unknown are left out while most rows remain: a false jump may stand in for them.
+MOST_DOUBTFUL = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -436,9 +436,12 @@ def _moment_anew(fit: Fit, cause: Effect, searched: FloatArray) -> Candidate | N
 
 
 def _left_out(fit: Fit) -> NDArray[np.bool_]:
-    """Return the rows (n,) to leave out because their history is not known well enough, if they are not too many."""
+    """Return the rows (n,) to leave out because their history is not known well enough.
+
+    If they are too many, these are only the first ones, and the arm is taken to go straight from each run to the next.
+    """
     rows = fit.doubtful()
-    return rows if rows.mean() <= MOST_DOUBTFUL else np.zeros_like(rows)
+    return rows if rows.mean() <= MOST_DOUBTFUL else fit.doubtful_at_first
 
 
 def _found(

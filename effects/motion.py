@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
@@ -56,6 +56,11 @@ class Motion:
 
     def __len__(self) -> int:
         return len(self.q)
+
+    @property
+    def joined(self) -> Motion:
+        """The same readings as one run, as if the arm had gone straight from each run to the next."""
+        return replace(self, segment=np.zeros_like(self.segment))
 
     @property
     def began(self) -> float:

@@ -164,6 +164,15 @@ class Fit:
             rows |= effect.kind.unknown_state(self.run, effect)
         return rows
 
+    @property
+    def doubtful_at_first(self) -> NDArray[np.bool_]:
+        """Rows (n,) before any whose history is known, if the arm goes straight from each run to the next."""
+        rows = np.zeros(len(self.observations), dtype=np.bool_)
+        joined = replace(self.run, motion=self.run.motion.joined)
+        for effect in self.simulation.effects:
+            rows[1:] |= np.logical_and.accumulate(effect.kind.unknown_state(joined, effect)[1:])
+        return rows
+
     def weighted(self, columns: FloatArray) -> FloatArray:
         """Return columns (n, 3, p) [m] whitened and weighted."""
         return self.observations.whitened(columns) * self.root_weights[:, :, None]

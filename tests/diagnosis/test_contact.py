@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from planted_cases import INTERVAL_S, SHOULDER, desk_arm, measured, motion_of, seen, walk
 
+from bodyschema.diagnosis.diagnosis import diagnose
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.effects import Effect, Motion, Simulation
+from bodyschema.recordings.recording import Recording
 from bodyschema.robot.description import RobotDescription
 
 RUN, UNSEEN = 20, 4
@@ -22,16 +24,20 @@ def robot() -> RobotDescription:
     return desk_arm()
 
 
-def in_runs(robot: RobotDescription, *effects: Effect) -> Fit:
-    """Return the effects fitted to a walk on which the marker is lost every few rows."""
-    way = walk(robot, 3, 600)
-    x = seen(robot, way, effects, 3).x
+def recorded(robot: RobotDescription, *effects: Effect, seed: int = 3) -> Recording:
+    """Return the recording of a walk on which the marker is lost every few rows."""
+    way = walk(robot, seed, 600)
+    x = seen(robot, way, effects, seed).x
     kept = np.arange(len(way)) % (RUN + UNSEEN) < RUN
     assert way.t is not None
     t = way.t[kept]
     segment = np.cumsum(np.diff(t, prepend=0.0) > 1.5 * INTERVAL_S, dtype=np.int64)
-    motion = Motion(way.q[kept], t, segment)
-    observations = Observations.of(measured(robot, motion, x[kept]), Simulation(robot))
+    return measured(robot, Motion(way.q[kept], t, segment), x[kept])
+
+
+def in_runs(robot: RobotDescription, *effects: Effect) -> Fit:
+    """Return the effects fitted to such a recording."""
+    observations = Observations.of(recorded(robot, *effects), Simulation(robot))
     return aligned(observations, Simulation(robot)).with_causes(effects)
 
 
@@ -59,6 +65,22 @@ def test_a_play_is_known_once_the_run_has_crossed_it(robot) -> None:
     play = Effect.at(robot, "backlash", SHOULDER, values=[0.025])
     run = Simulation(robot, (play,)).run(motion_of(q))
     np.testing.assert_array_equal(play.kind.unknown_state(run, play), [True, True, True, False, False, False])
+
+
+def test_after_the_first_crossing_the_path_between_two_runs_is_believed(robot) -> None:
+    fit = in_runs(robot, Effect.at(robot, "backlash", SHOULDER, values=[0.2]))
+    reached = fit.observations.motion.q[:, robot.joints.index(SHOULDER)]
+    crossed = np.maximum.accumulate(reached) - np.minimum.accumulate(reached) >= fit.causes[0].values[0]
+    assert fit.doubtful()[crossed].any()
+    np.testing.assert_array_equal(fit.doubtful_at_first[1:], ~crossed[1:])
+
+
+@pytest.mark.parametrize("seed", [3, 4])
+def test_where_few_runs_cross_a_play_nothing_stands_in_for_its_side(robot, seed) -> None:
+    play = Effect.at(robot, "backlash", SHOULDER, values=[0.2])
+    found = diagnose(recorded(robot, play, seed=seed), Simulation(robot))
+    assert [cause.key for cause in found.causes] == [play.key]
+    assert not found.left.is_there
 
 
 def test_a_flank_is_known_where_friction_does_not_matter(robot) -> None:
