@@ -21,6 +21,7 @@ from bodyschema.interfaces.records import (
 from bodyschema.vision.ball.blob import Disc, Patch, Region, find_patches, measure, patch_at, roughly
 from bodyschema.vision.ball.colour import gate_of
 from bodyschema.vision.ball.match import StereoMatcher, is_reflection_of
+from bodyschema.vision.ball.settings import LimbSettings
 from bodyschema.vision.ball.settings import TrackSettings as _Settings
 from bodyschema.vision.ball.size import BallSize
 from bodyschema.vision.ball.sphere import Pinhole
@@ -108,6 +109,7 @@ class StereoTracker:
         self._ambiguous_t = -math.inf
         self._sighted: tuple[_Sighting, ...] = ()
         self._fixes = 0
+        self._blur_px = LimbSettings.usual_blur_px  # of the marker's contour, where it was last as predicted [px]
 
     def track(self, frame: StereoFrame) -> MarkerFix | MarkerMiss:
         """Return the marker in `frame`, in the left optical frame, or the reason for a miss.
@@ -141,6 +143,7 @@ class StereoTracker:
         """Look for the marker in the whole images next time."""
         self._track = self._last = self._refused = None
         self._ambiguous_t, self._sighted = -math.inf, ()
+        self._blur_px = LimbSettings.usual_blur_px
         self._gate.reset()
         self._size.forget()
 
@@ -203,7 +206,7 @@ class StereoTracker:
                 continue
             if expected is not None and not patch.is_whole and any(expected.fits(disc) for disc in discs):
                 continue
-            outcome = measure(image, patch, self._eye, self._gate, self.config)
+            outcome = self._measured(image, patch, expected)
             if isinstance(outcome, Reason):
                 reason = reason or outcome
                 thing = roughly(image, patch, self._gate)
@@ -215,8 +218,16 @@ class StereoTracker:
     def _where_expected(self, image: ImageArray, expected: _Expected) -> Disc | None:
         """Return the marker if it can be measured from its predicted circle."""
         patch = patch_at(image, expected.centre_px, expected.radius_px, self._gate)
-        outcome = None if patch is None else measure(image, patch, self._eye, self._gate, self.config)
+        outcome = None if patch is None else self._measured(image, patch, expected)
         return outcome if isinstance(outcome, Disc) and expected.fits(outcome) else None
+
+    def _measured(self, image: ImageArray, patch: Patch, expected: _Expected | None) -> Disc | Reason:
+        """Return the ball at a patch, or the reason for none; start from its last blur where it is expected."""
+        blur_px = LimbSettings.usual_blur_px if expected is None else self._blur_px
+        outcome = measure(image, patch, self._eye, self._gate, self.config, blur_px)
+        if isinstance(outcome, Disc) and expected is not None and expected.fits(outcome):
+            self._blur_px = outcome.blur_px
+        return outcome
 
     def _predicted(self, t: float) -> tuple[_Expected, _Expected] | None:
         track = self._track

@@ -15,6 +15,7 @@ from bodyschema.vision.images import WHITE
 
 from .colour import Gate
 from .outline import Outline, fit_outline, refine_outline
+from .settings import LimbSettings
 from .settings import PatchSettings as _Settings
 from .sphere import Pinhole
 
@@ -74,6 +75,7 @@ class Disc:
     level: float  # mean amount of the marker's colour on it [grey levels]
     # roughness of its contour: deviation from the ellipse in variances of its samples; 0 if not computed
     unrest: float = 0.0
+    blur_px: float = LimbSettings.usual_blur_px  # blur of its contour (1-sigma) [px]
 
     def is_same_as(self, other: Disc) -> bool:
         """Return True if two discs from overlapping patches show the same ball."""
@@ -107,8 +109,19 @@ def patch_at(image: ImageArray, centre_px: FloatArray, radius_px: float, gate: G
     return Patch(box, centre_px, radius_px, fill) if fill >= _Settings.least_fill else None
 
 
-def measure(image: ImageArray, patch: Patch, eye: Pinhole, gate: Gate, config: VisionConfig) -> Disc | Reason:
-    """Measure the ball's image at `patch`, or return the reason why it cannot be measured."""
+def measure(
+    image: ImageArray,
+    patch: Patch,
+    eye: Pinhole,
+    gate: Gate,
+    config: VisionConfig,
+    blur_px: float = LimbSettings.usual_blur_px,
+) -> Disc | Reason:
+    """Measure the ball's image at `patch`, or return the reason why it cannot be measured.
+
+    Args:
+        blur_px: rough blur of its contour (1-sigma) [px], such as it had in the last frame; it saves time.
+    """
     height, width = image.shape[:2]
     if not _clear_of_border(patch.box, config.border_margin_px, (width, height)):
         return Reason.AT_BORDER
@@ -125,7 +138,7 @@ def measure(image: ImageArray, patch: Patch, eye: Pinhole, gate: Gate, config: V
     reason = _not_whole(outline, config)
     if reason is not None:
         return reason
-    outline = refine_outline(pixels, gate, outline, shape)
+    outline = refine_outline(pixels, gate, outline, shape, blur_px)
     if outline is None or not _is_sure(outline, config):
         return Reason.NOT_ROUND
     centre_px = outline.centre_px + corner
@@ -134,7 +147,8 @@ def measure(image: ImageArray, patch: Patch, eye: Pinhole, gate: Gate, config: V
         return Reason.AT_BORDER
     # Over the whole ball: the patch may be only its brighter part.
     level = _level(image, Region(0, 0, width, height), centre_px, outline.radius_px, gate)
-    return Disc(centre_px, outline.radius_px, outline.cov_px, outline.radius_sigma_px, level, outline.unrest)
+    sigma_px, unrest, blur_px = outline.radius_sigma_px, outline.unrest, outline.blur_px
+    return Disc(centre_px, outline.radius_px, outline.cov_px, sigma_px, level, unrest, blur_px)
 
 
 def roughly(image: ImageArray, patch: Patch, gate: Gate) -> Disc | None:

@@ -27,7 +27,12 @@ class Circle:
     # deviation of the limb from the circle, in slow and quick waves, in variances of its samples; 0 if it is as round
     # as usual
     unrest: float
-    aliased: bool  # True if the image was not anti-aliased, so that the fit is unreliable
+    blur_px: float  # blur of the edge (1-sigma) [px]
+
+    @property
+    def aliased(self) -> bool:
+        """True if the image was not anti-aliased, so that the fit is unreliable."""
+        return self.blur_px < _Settings.aliased_px
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,14 +48,14 @@ class _Fit:
 
 
 def fit_limb(
-    image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray
+    image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray, blur_px: float
 ) -> Circle | None:
     """Fit an ellipse to the limb near the given outline, which must be right to about half a pixel.
 
-    Return None if there is no ball's limb all around. If the iteration has not settled, its last step is added to the
-    covariance.
+    It starts from the blur `blur_px`, and ends with the one that the limb shows. Return None if there is no ball's limb
+    all around. If the iteration has not settled, its last step is added to the covariance.
     """
-    blur_px, looks = _Settings.usual_blur_px, 0
+    looks = 0
     while True:
         limb = find_limb(image, gate, centre_px, radius_px, shape, blur_px)
         fit = None if limb is None else _fit(limb)
@@ -60,14 +65,15 @@ def fit_limb(
         centre_px, radius_px = centre_px + shape @ fit.solution[:2], radius_px + growth
         moved_px, widened_px = max(math.hypot(u, v), abs(growth)), limb.blur_px - blur_px
         blur_px, looks = limb.blur_px, looks + 1
-        settled = moved_px < _Settings.settled_px and abs(widened_px) < _Settings.settled_px
+        # Where the image was not anti-aliased, the circle is not used.
+        aliased = blur_px < _Settings.aliased_px
+        settled = (aliased or moved_px < _Settings.settled_px) and abs(widened_px) < _Settings.settled_px
         if settled or looks == _Settings.looks:
             break
     excess, fewer = limb.excess, max(1.0, _Settings.least_evenness / limb.evenness)
     around, told = waves(np.sqrt(fit.used) * fit.residual, radius_px), limb.weight > 0
     off = np.minimum(np.abs(fit.residual[told]), _Settings.farthest_px)
     off_px = math.sqrt(max(0.0, float(np.mean(off**2 - 1.0 / limb.weight[told]))))  # RMS without noise
-    aliased = blur_px < _Settings.aliased_px
     is_angular = off_px > max(_Settings.most_angular * radius_px, _Settings.most_angular_blurs * blur_px)
     if (is_angular or around.quick > _Settings.largest_density * excess) and not aliased:
         return None
@@ -81,7 +87,7 @@ def fit_limb(
     radius_px += blur_px**2 / (2.0 * radius_px)
     is_round = off_px < _Settings.round_share * radius_px
     unrest = 0.0 if is_round else math.sqrt(around.slow * around.quick) / excess
-    return Circle(centre_px, radius_px, shape @ cov[:2, :2] @ shape, math.sqrt(cov[2, 2]), unrest, aliased)
+    return Circle(centre_px, radius_px, shape @ cov[:2, :2] @ shape, math.sqrt(cov[2, 2]), unrest, blur_px)
 
 
 def _fit(limb: Limb) -> _Fit | None:

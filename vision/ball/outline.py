@@ -25,6 +25,7 @@ from .colour import Float32Array, Gate
 from .contour_fit import fit_limb
 from .contour_spectrum import waves
 from .polar import ball_colour, fit_circle, mean_of_three, median, rays_round, sample
+from .settings import LimbSettings
 from .settings import OutlineSettings as _Settings
 
 BoolArray = NDArray[np.bool_]
@@ -44,6 +45,7 @@ class Outline:
     uneven: float  # share of the outline with a background too uneven to show the edge
     off: float  # share of the fit's weights where the outline leaves the ellipse in whole arcs
     unrest: float = 0.0  # deviation of the limb from the ellipse, in variances of its samples; 0 if it was not checked
+    blur_px: float = LimbSettings.usual_blur_px  # blur of the limb (1-sigma) [px]
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +93,7 @@ def fit_outline(
             break
         if fit is not None:
             centre_px, radius_px = centre_px + shape @ fit.solution[:2], float(fit.solution[2])
-        fit, moved_px = _step(image, gate, centre_px, radius_px, shape, window_px)
+        fit, moved_px = _step(image, gate, centre_px, radius_px, shape, window_px, is_agreed=fit is not None)
         if moved_px > max(2.0, 0.5 * radius_px):
             return None
         if window_px == _Settings.wide_px:
@@ -99,13 +101,19 @@ def fit_outline(
     return None if fit is None else _outline(fit, centre_px, shape)
 
 
-def refine_outline(image: Float32Array, gate: Gate, rough: Outline, shape: FloatArray) -> Outline | None:
-    """Refine an outline's centre, radius and covariance by the limb; None if there is no ball's limb."""
-    fitted = fit_limb(image, gate, rough.centre_px, rough.radius_px, shape)
+def refine_outline(
+    image: Float32Array, gate: Gate, rough: Outline, shape: FloatArray, blur_px: float
+) -> Outline | None:
+    """Refine an outline's centre, radius and covariance by the limb; None if there is no ball's limb.
+
+    Args:
+        blur_px: rough blur of the limb, from which the fit starts [px].
+    """
+    fitted = fit_limb(image, gate, rough.centre_px, rough.radius_px, shape, blur_px)
     if fitted is None:
         return None
     if fitted.aliased:
-        return rough
+        return replace(rough, blur_px=fitted.blur_px)
     moved_px = fitted.centre_px - rough.centre_px
     cov_px = fitted.cov_px + _Settings.floor_px**2 * np.eye(2)
     contradiction = float(moved_px @ np.linalg.solve(cov_px + rough.cov_px, moved_px))
@@ -118,15 +126,28 @@ def refine_outline(image: Float32Array, gate: Gate, rough: Outline, shape: Float
         cov_px=cov_px,
         radius_sigma_px=fitted.radius_sigma_px,
         unrest=fitted.unrest,
+        blur_px=fitted.blur_px,
     )
 
 
 def _step(
-    image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray, window_px: float
+    image: Float32Array,
+    gate: Gate,
+    centre_px: FloatArray,
+    radius_px: float,
+    shape: FloatArray,
+    window_px: float,
+    *,
+    is_agreed: bool = False,
 ) -> tuple[_Fit | None, float]:
-    """Fit a circle in a ring of half-width `window_px` about another one; return it and its shift [px]."""
+    """Fit a circle in a ring of half-width `window_px` about another one; return it and its shift [px].
+
+    Args:
+        is_agreed: True if most points agree on the other circle.
+    """
     edges = _find_edges(image, gate, centre_px, radius_px, shape, min(window_px, 0.6 * radius_px))
-    fit = None if edges is None else _fit(edges)
+    agreed = np.array([0.0, 0.0, radius_px]) if is_agreed else None
+    fit = None if edges is None else _fit(edges, agreed)
     if fit is None:
         return None, math.inf
     u, v, radius = fit.solution.tolist()
@@ -189,24 +210,35 @@ def _discriminant(
     return direction, np.einsum("nc,nc->n", direction, apart)
 
 
-def _fit(edges: _Edges) -> _Fit | None:
-    """Fit a circle by least squares; points too far off are left out in turn."""
-    told = edges.weight > 0
-    weight = _agreeing(edges)
+def _fit(edges: _Edges, agreed: FloatArray | None) -> _Fit | None:
+    """Fit a circle by least squares; points too far off are left out in turn.
+
+    Args:
+        agreed: circle (3,) [px] on which most points agree; None if it is to be found.
+    """
+    weight = _agreeing(edges) if agreed is None else _near(edges, edges.distance_px - edges.rays @ agreed)
     fit: _Fit | None = None
     for _ in range(3):
         fitted = None if np.count_nonzero(weight) < len(weight) // 2 else fit_circle(edges.distance_px, weight)
         if fitted is None:
             return None
         residual = edges.distance_px - edges.rays @ fitted[0]
-        spread = 1.4826 * median(np.abs(residual[told]))
-        gate = min(max(_Settings.gate_sigmas * spread, _Settings.least_gate_px), _Settings.narrow_px)
-        agreeing = np.where(np.abs(residual) < gate, edges.weight, 0.0)
+        agreeing = _near(edges, residual)
         fit = _Fit(edges, *fitted, residual, weight, agreeing == 0)
         if np.array_equal(weight, agreeing):
             break
         weight = agreeing
     return fit if fit is not None and fit.solution[2] > 0 else None
+
+
+def _near(edges: _Edges, residual: FloatArray) -> FloatArray:
+    """Return the points' weights (n,), with 0 for those whose residual (n,) [px] is large for most."""
+    told = np.abs(residual[edges.weight > 0])
+    if not len(told):
+        return edges.weight
+    spread = 1.4826 * median(told)
+    gate = min(max(_Settings.gate_sigmas * spread, _Settings.least_gate_px), _Settings.narrow_px)
+    return np.where(np.abs(residual) < gate, edges.weight, 0.0)
 
 
 def _outline(fit: _Fit, centre_px: FloatArray, shape: FloatArray) -> Outline:
