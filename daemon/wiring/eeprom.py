@@ -67,9 +67,8 @@ def configured(config: Config, joints: Sequence[str], bus: str | None) -> list[W
     Raises:
         ConfigError: there are none, or no such joint or bus.
     """
-    tables = config.tables.drivers
-    table = "dynamixel" if tables.dynamixel is not None else "feetech"
-    servos = tables.dynamixel or tables.feetech
+    tables = {name: getattr(config.tables.drivers, name) for name in TABLES}
+    table, servos = next(((name, servos) for name, servos in tables.items() if servos is not None), ("", None))
     if servos is None:
         remedy = "Add [drivers.dynamixel] or [drivers.feetech] (docs/hardware.md), or give --port and --id"
         raise ConfigError("no servos are configured", file=config.file, remedy=remedy)

@@ -37,12 +37,6 @@ def test_the_row_of_an_effect_names_its_numbers(name: str) -> None:
     assert numbers - {"compliance_m_per_N", "width_m", "hold_N"} == set(names)
 
 
-def test_the_change_log_counts_the_effects() -> None:
-    told = re.search(r"\*\*Diagnose\*\*: (\d+) effects", (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"))
-    assert told is not None
-    assert len(EFFECT_TYPES) == int(told[1])
-
-
 def test_the_page_s_extended_toml_can_be_read(tmp_path) -> None:
     robot = arm(tmp_path)
     bases = tuple(JointBasis.orthonormal(-1.5, 1.5) for _ in range(2))
