@@ -130,6 +130,17 @@ def leaves() -> int:
     return of(app)
 
 
+def keys() -> int:
+    """Return the number of keys of robot.toml on its page; kinds of one table share theirs."""
+    table, found = "", set[tuple[str, str]]()
+    for line in (ROOT / "docs" / "reference" / "robot_toml.md").read_text("utf-8").splitlines():
+        if line.startswith("## "):
+            table = line.partition(" of kind ")[0]
+        elif (key := re.match(r"\| `(\w+)`", line)) is not None:
+            found.add((table, key[1]))
+    return len(found)
+
+
 def measures() -> dict[str, float | str]:
     """Return each measure by its name."""
     files = product()
@@ -166,6 +177,7 @@ def measures() -> dict[str, float | str]:
             _words(page) for page in (ROOT / "docs" / "reference").glob("*.md")
         ),
         "commands": leaves(),
+        "keys of robot.toml": keys(),
     }
 
 
