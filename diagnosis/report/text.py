@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from bodyschema.diagnosis.assess.nameless import Nameless
-from bodyschema.diagnosis.assess.rivals import Rival, Standing, apart_on, whole_range, widened
+from bodyschema.diagnosis.assess.rivals import Rival, Standing, apart_on, can_be_measured, whole_range, widened
 from bodyschema.diagnosis.diagnosis import Diagnosis
 from bodyschema.diagnosis.report.presenters.presenter import Found, Workshop
 from bodyschema.diagnosis.report.presenters.registry import named, presenter_of, rival_named
@@ -296,6 +296,8 @@ def advice(diagnosis: Diagnosis, causes: Sequence[Cause], seen_by: str) -> tuple
             one, other = called(cause, seen_by), called(rival.itself, seen_by)
             if not rival.is_same_anywhere:
                 pairs.setdefault(_motion(diagnosis, rival), []).append(f"{one} from {other}")
+            elif can_be_measured(cause, rival.itself):
+                told.append(f"No motion tells {one} from {other}: measure both.")
             elif not rival.is_one:
                 told.append(
                     f"No motion tells {one} from {other}, which can do more besides: "

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import re
+import tomllib
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from planted_cases import BASE, SHOULDER, desk_arm, motion_of, scattered, seen, surveyed_arm, walk
+from planted_cases import BASE, ELBOW, SHOULDER, desk_arm, motion_of, scattered, seen, surveyed_arm, walk
+from walked import DESK_ARM
 
 from bodyschema.diagnosis.assess.rivals import whole_range
 from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
@@ -142,6 +145,37 @@ def test_a_rival_that_can_do_more_than_a_cause_does_not_make_it_surer() -> None:
     assert not rival.is_one
     assert standing.probability < 1.0 - rival.probability + 1e-9
     assert any("from a marker that slipped, which can do more besides" in line for line in conclusion(found).advice)
+
+
+@pytest.fixture(scope="module")
+def arm_of_one_length(tmp_path_factory) -> RobotDescription:
+    """Return a desk arm whose positions show one length alone: all else is free with the marker's place."""
+    file, text = tmp_path_factory.mktemp("arm") / DESK_ARM.name, DESK_ARM.read_text()
+    urdf = DESK_ARM.with_name("desk_arm.urdf").read_text()
+    assert "0.03 0 0.06" in urdf
+    file.with_name("desk_arm.urdf").write_text(urdf.replace("0.03 0 0.06", "0 0 0.06"))
+    return RobotDescription.from_tables(tomllib.loads(text), text, file)
+
+
+@pytest.mark.parametrize(
+    "truth",
+    [("link_geometry", ELBOW, [0.0, 0.0, 0.008, 0.0, 0.0, 0.0]), ("camera_scale", None, [0.03])],
+    ids=["link", "scale"],
+)
+def test_a_length_and_a_scale_that_look_the_same_are_both_told(arm_of_one_length, truth) -> None:
+    robot, (name, where, values) = arm_of_one_length, truth
+    hidden = Effect.at(robot, name, where, values=values)
+    file = conclusion(diagnosed(robot, walk(robot, 2, ROWS), hidden, ("camera_scale", "link_geometry")))
+    (cause,) = file.causes
+    (rival,) = cause.rivals
+    assert (cause.effect, rival.effect, rival.where) == ("camera_scale", "link_geometry", ELBOW)
+    assert 0.4 < rival.probability < 0.6
+    assert cause.probability + rival.probability == pytest.approx(1.0, abs=0.01)
+    assert file.verdict == "undecided"
+    assert f"(or a wrong link before joint {ELBOW})" in file.sentence
+    assert file.advice == (
+        f"No motion tells a wrong scale of all that is measured from a wrong link before joint {ELBOW}: measure both.",
+    )
 
 
 def test_a_cause_that_nothing_else_comes_near_has_no_rivals() -> None:
