@@ -18,7 +18,19 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
 
 from .numbers import told_values
-from .result import SMALL, SURE, Cause, DiagnosisFile, Errors, Gain, Interval, Tolerances, Unexplained, Verdict
+from .result import (
+    OUTLIERS,
+    SMALL,
+    SURE,
+    Cause,
+    DiagnosisFile,
+    Errors,
+    Gain,
+    Interval,
+    Tolerances,
+    Unexplained,
+    Verdict,
+)
 
 
 class _Settings:
@@ -96,7 +108,7 @@ def _if_sure(cause: Cause, remedy: str, diagnosis: DiagnosisFile) -> str:
     """Return the remedy, preceded by what to confirm before any change."""
     open_ones = [rival for rival in cause.rivals if rival.by == "this_motion" and cause.probability < SURE]
     rivals = [rival_named(rival, diagnosis.seen_by) for rival in open_ones[:2]]
-    if diagnosis.verdict == "unexplained":
+    if diagnosis.verdict == "unexplained" and cause.effect != OUTLIERS:
         rivals.append("a part of what remains unexplained")
     if not rivals:
         return remedy
@@ -161,6 +173,8 @@ def _head(causes: Sequence[Cause], tolerances: Tolerances | None, seen_by: str, 
     first = first[: _Settings.named]
     said = [finding(c.effect, c.where, c.source, told_values(c), seen_by, timed=timed, weighed=weighed) for c in first]
     told = [clause + _or(cause, seen_by) for clause, cause in zip(said, first, strict=True)]
+    if everywhere and first and first[-1].effect == OUTLIERS:
+        everywhere.append(told.pop())
     others = [cause.is_outvoted or cause.is_correction for cause in ordered if cause not in first]
     if more := others.count(False):
         everywhere.append(f"{more} {'smaller' if first else 'small'} cause{'s' * (more > 1)}")
