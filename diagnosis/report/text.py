@@ -270,8 +270,8 @@ def modelled(left: Unexplained) -> str:
         over = "the marker's place" if left.model_joints == PLACE else f"the readings of {', '.join(left.model_joints)}"
         told.append(f"extended.toml has a smooth model of it over {over}, as good as the recording is dense.")
     elif left.what:
-        why = "" if left.not_in_model else ": none is right on pairs that it was not fitted to. More pairs may tell one"
-        told.append(f"extended.toml has no model of it{why}.")
+        why = ": none that it can hold is right on pairs that were not fitted. More pairs may tell one"
+        told.append(f"extended.toml has no model of it{'' if left.not_in_model else why}.")
     if left.not_in_model:
         told.append(
             f"What changes with time is in no such model: {'; '.join(left.not_in_model)}. Another recording will "

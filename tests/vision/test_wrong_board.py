@@ -101,7 +101,7 @@ def diagnosed(
         if len(rows) == ROWS:
             break
     q, x, cov = map(np.array, zip(*rows, strict=True))
-    recording = Recording(robot.joints, q=q, x=x, t=4.0 * np.arange(ROWS), cov=cov, segment=np.arange(ROWS))
+    recording = Recording(robot.joints, q=q, x=x, t=np.arange(0.0, 4.0 * ROWS, 4.0), cov=cov, segment=np.arange(ROWS))
     file = conclusion(diagnose(recording, Simulation(robot)))
     none = np.zeros(len(robot.joints))
     return file, remedies(file, robot, none, none)
@@ -130,7 +130,7 @@ def test_two_eyes_measure_too_much_and_the_remedy_is_the_true_baseline() -> None
 
 
 def photographed_tag(rectification: Rectification, truth: TrueRig) -> Callable[[FloatArray], StereoFrame | None]:
-    """Return a function that photographs a tag at a place of the rectified frame, with as many eyes as are calibrated."""
+    """Return a function that photographs a tag at a place of the rectified frame, with all eyes that are calibrated."""
     rng = np.random.default_rng(5)
     photographer = Photographer(truth, PrintedTag(), Taken(), rng)
     maps = [rectification.maps(eye) for eye in range(len(rectification.eyes))]
@@ -143,7 +143,8 @@ def photographed_tag(rectification: Rectification, truth: TrueRig) -> Callable[[
         tilt = np.radians(25.0) * np.append(axis / np.linalg.norm(axis), 0.0)
         R = Rotation.from_rotvec(tilt).as_matrix()
         frame = photographer.pair(R, own - R @ np.array([0.5 * SIDE_M, 0.5 * SIDE_M, 0.0]))
-        images = [cv2.remap(eye, *each, cv2.INTER_LINEAR) for eye, each in zip(frame.images, maps, strict=False)]
+        eyes = zip(frame.images, maps, strict=False)
+        images = [np.asarray(cv2.remap(eye, *each, cv2.INTER_LINEAR), np.uint8) for eye, each in eyes]
         return StereoFrame(0.0, images[0], images[1] if len(images) > 1 else None)
 
     return shown
