@@ -56,8 +56,8 @@ REMEDIES: Mapping[Reason, str] = {
     "max_speed_m_s and [daemon] max_marker_speed_m_s.",
     Reason.EPIPOLAR: "Are the cameras exchanged, one upside down, or moved? `bodyschema calibrate cameras --check` "
     "shows it.",
-    Reason.SIZE_MISMATCH: "Is its size in [vision] right? Else it is the calibration of other cameras, or they were "
-    "moved: `bodyschema calibrate cameras --check`.",
+    Reason.SIZE_MISMATCH: "Is its size in [vision] as measured, and was --square-mm that of the printed board? Else it "
+    "is the calibration of other cameras, or they were moved: `bodyschema calibrate cameras --check`.",
     Reason.AMBIGUOUS: "Take other things of its colour, or the second tag of its number, out of sight. Tilt a single "
     "tag, or come nearer.",
     Reason.NO_JOINTS: "Do the encoders answer, and is [vision.cameras] latency_s right? `bodyschema calibrate latency` "

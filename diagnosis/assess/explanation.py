@@ -166,14 +166,18 @@ def useful(explanation: Explanation, search: Search, blocks: Blocks, tell: Calla
     while fit.causes:
         markers, error = is_marker(fit), _missed(fit, blocks)
         whole = max(float(error[markers].sum()), 1e-300)
+        beyond = [beyond_tolerances(fit, cause, search.multiplicity) for cause in fit.causes]
         fewer = [search.beside(fit, cause).without for cause in fit.causes]
+        # Tolerances that are more probable than a cause have their own size without it.
+        fewer = [
+            one.tolerating(tolerated(one).scales) if cause.kind.rigid and is_beyond is False else one
+            for one, cause, is_beyond in zip(fewer, fit.causes, beyond, strict=True)
+        ]
         losses = [float((_missed(one, blocks) - error)[markers].sum()) for one in fewer]
         told = [
             # Negative backlash or compliance is no cause, whatever it gains.
-            cause.is_possible
-            and search.worth(fit, cause) >= 0.0
-            and _is_told(cause, beyond_tolerances(fit, cause, search.multiplicity), loss / whole)
-            for cause, loss in zip(fit.causes, losses, strict=True)
+            cause.is_possible and search.worth(fit, cause) >= 0.0 and _is_told(cause, is_beyond, loss / whole)
+            for cause, is_beyond, loss in zip(fit.causes, beyond, losses, strict=True)
         ]
         if all(told):
             break

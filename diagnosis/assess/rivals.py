@@ -54,7 +54,8 @@ class Rival:
         difference: Δχ² by which this motion is expected to separate them.
         anywhere: the same for as many poses over the whole range of the joints.
         signal: Δχ² of the cause itself on those poses.
-        is_one: True if the cause, refitted, also covers this rival on any motion, so that both are equivalent.
+        is_one: True if the cause, refitted, also covers this rival on any motion, and it does not matter which is
+            corrected.
     """
 
     instead: Fit | Nameless
@@ -121,6 +122,9 @@ def _standing(
             continue
         rival = beside.exchanged(candidate, fit.log_likelihood - _Settings.hopeless)
         doubt = float(np.log(max(candidate.trials / max(itself.trials, 1), 1e-3)))
+        if can_be_measured(cause, candidate.effect) and _difference(fit, rival) < SAME:
+            # That one number of a link among many does what a scale does is no chance.
+            doubt = 0.0
         more = rival.log_likelihood - fit.log_likelihood - beside.cost_of(candidate) - doubt
         more += search.for_zero(fit, itself, candidate)
         alike = remembers(cause) and remembers(candidate.effect)
@@ -143,11 +147,17 @@ def _standing(
         if share >= PROBABLE:
             anywhere = apart_on(fit, other, wide)
             one = anywhere < _Settings.same_share * signal and _is_no_more(other, fit, without, wide)
+            one = one and not can_be_measured(cause, alternative)
             rivals.append(Rival(other, alternative, float(share), _difference(fit, other), anywhere, signal, one))
     same = sum(rival.probability for rival in rivals if rival.is_one)
     ordered = tuple(sorted(rivals, key=lambda rival: rival.probability, reverse=True))
     sags = is_like_sag(without, cause, _Settings.comes_near * itself.gain)
     return Standing(itself, float(probable[0]) + same, itself.dof, gain, ordered, sags)
+
+
+def can_be_measured(cause: Effect, rival: Effect | Nameless) -> bool:
+    """Return True if a rule tells a cause from its rival: a wrong scale of all from a wrong length of the arm."""
+    return isinstance(rival, Effect) and cause.kind.scales_all != rival.kind.scales_all
 
 
 def resembles_sag(kind: EffectType) -> bool:

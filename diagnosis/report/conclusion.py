@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import combinations
 
 import msgspec
 import numpy as np
@@ -15,7 +16,7 @@ from bodyschema.diagnosis.fit.worth import NAMED, nats
 from bodyschema.diagnosis.search.aliases import alias_sentences
 from bodyschema.diagnosis.search.scan import Candidate
 from bodyschema.diagnosis.search.together import is_at_limit
-from bodyschema.effects import Effect
+from bodyschema.effects import Effect, Identity
 from bodyschema.interfaces.records import FloatArray
 
 from .residuals import SIGNIFICANT
@@ -37,6 +38,9 @@ from .result import (
 from .text import advice, evidence, sentence
 
 _HALF_WIDTH_95 = 1.959964
+# Cycles over a joint's range by which two of its ripples have to differ. The waves that were found along five curves
+# differed by 1.0 to 1.4.
+_OF_A_CURVE = 2.0
 _UNKNOWN_WEIGHT = "the spread of the arm's weight, which the URDF does not state"
 _UNTESTED_WEIGHT = "sag, which was not tested: robot.toml says that the hand bore the weight"
 
@@ -157,19 +161,38 @@ def _causes(diagnosis: Diagnosis, seen_by: str) -> tuple[Cause, ...]:
     simulation = diagnosis.aligned.simulation
     what = _UNKNOWN_WEIGHT if simulation.bears_weight else _UNTESTED_WEIGHT
     giving = {cause.where for cause in fit.causes if cause.kind.is_spring}
+    merged = merged_ripples(fit)
     for k, (cause, standing) in enumerate(zip(fit.causes, diagnosis.standings, strict=True)):
         beside_spring = not simulation.gravity.known and cause.where in giving and resembles_sag(cause.kind)
         if beside_spring or standing.is_like_sag:
-            causes[k] = _or_sag(causes[k], what)
+            causes[k] = _or_unnamed(causes[k], what)
+        if cause.identity in merged:
+            causes[k] = _or_unnamed(causes[k], f"another error of {cause.where} that depends on its angle")
     if diagnosis.outliers_are_found:
         causes.append(_outliers(diagnosis))
     return tuple(causes)
 
 
-def _or_sag(cause: Cause, what: str) -> Cause:
-    """Return a cause that may be a joint that gives, or a part of that, where the weight is assumed or not tested."""
-    sag = Indistinguishable("unexplained", None, None, "this_motion", EVEN, what)
-    return msgspec.structs.replace(cause, probability=min(cause.probability, EVEN), rivals=(sag, *cause.rivals))
+def merged_ripples(fit: Fit) -> set[Identity]:
+    """Return the ripples of a joint that are so near each other that together they may describe any curve."""
+    found = set[Identity]()
+    ripples = [cause for cause in fit.causes if cause.kind.search == "cycles"]
+    for one, other in combinations(ripples, 2):
+        if one.where == other.where:
+            span = float(np.ptp(fit.observations.motion.q[:, fit.simulation.place(one).joint]))
+            apart = abs(float(one.values[-1] - other.values[-1])) * span
+            found |= (
+                {one.identity, other.identity}
+                if apart < _OF_A_CURVE * (1.0 if one.prismatic else 2.0 * math.pi)
+                else set()
+            )
+    return found
+
+
+def _or_unnamed(cause: Cause, what: str) -> Cause:
+    """Return a cause that may be something without a name, or a part of it."""
+    rival = Indistinguishable("unexplained", None, None, "this_motion", EVEN, what)
+    return msgspec.structs.replace(cause, probability=min(cause.probability, EVEN), rivals=(rival, *cause.rivals))
 
 
 def _named(rival: Rival) -> Indistinguishable:

@@ -94,8 +94,8 @@ class Cause(msgspec.Struct, frozen=True):
 
     @property
     def is_outvoted(self) -> bool:
-        """True where a rival is more probable."""
-        return any(rival.probability > self.probability for rival in self.rivals)
+        """True where a rival is more probable, in the whole percents that a report gives."""
+        return any(round(100.0 * rival.probability) > round(100.0 * self.probability) for rival in self.rivals)
 
     @property
     def is_correction(self) -> bool:

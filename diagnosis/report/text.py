@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from bodyschema.diagnosis.assess.nameless import Nameless
-from bodyschema.diagnosis.assess.rivals import Rival, Standing, apart_on, whole_range, widened
+from bodyschema.diagnosis.assess.rivals import Rival, Standing, apart_on, can_be_measured, whole_range, widened
 from bodyschema.diagnosis.diagnosis import Diagnosis
 from bodyschema.diagnosis.report.presenters.presenter import Found, Workshop
 from bodyschema.diagnosis.report.presenters.registry import named, presenter_of, rival_named
@@ -18,7 +18,19 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
 
 from .numbers import told_values
-from .result import SMALL, SURE, Cause, DiagnosisFile, Errors, Gain, Interval, Tolerances, Unexplained, Verdict
+from .result import (
+    OUTLIERS,
+    SMALL,
+    SURE,
+    Cause,
+    DiagnosisFile,
+    Errors,
+    Gain,
+    Interval,
+    Tolerances,
+    Unexplained,
+    Verdict,
+)
 
 
 class _Settings:
@@ -96,7 +108,7 @@ def _if_sure(cause: Cause, remedy: str, diagnosis: DiagnosisFile) -> str:
     """Return the remedy, preceded by what to confirm before any change."""
     open_ones = [rival for rival in cause.rivals if rival.by == "this_motion" and cause.probability < SURE]
     rivals = [rival_named(rival, diagnosis.seen_by) for rival in open_ones[:2]]
-    if diagnosis.verdict == "unexplained":
+    if diagnosis.verdict == "unexplained" and cause.effect != OUTLIERS:
         rivals.append("a part of what remains unexplained")
     if not rivals:
         return remedy
@@ -161,6 +173,8 @@ def _head(causes: Sequence[Cause], tolerances: Tolerances | None, seen_by: str, 
     first = first[: _Settings.named]
     said = [finding(c.effect, c.where, c.source, told_values(c), seen_by, timed=timed, weighed=weighed) for c in first]
     told = [clause + _or(cause, seen_by) for clause, cause in zip(said, first, strict=True)]
+    if everywhere and first and first[-1].effect == OUTLIERS:
+        everywhere.append(told.pop())
     others = [cause.is_outvoted or cause.is_correction for cause in ordered if cause not in first]
     if more := others.count(False):
         everywhere.append(f"{more} {'smaller' if first else 'small'} cause{'s' * (more > 1)}")
@@ -256,8 +270,8 @@ def modelled(left: Unexplained) -> str:
         over = "the marker's place" if left.model_joints == PLACE else f"the readings of {', '.join(left.model_joints)}"
         told.append(f"extended.toml has a smooth model of it over {over}, as good as the recording is dense.")
     elif left.what:
-        why = "" if left.not_in_model else ": none is right on pairs that it was not fitted to. More pairs may tell one"
-        told.append(f"extended.toml has no model of it{why}.")
+        why = ": none that it can hold is right on pairs that were not fitted. More pairs may tell one"
+        told.append(f"extended.toml has no model of it{'' if left.not_in_model else why}.")
     if left.not_in_model:
         told.append(
             f"What changes with time is in no such model: {'; '.join(left.not_in_model)}. Another recording will "
@@ -296,6 +310,8 @@ def advice(diagnosis: Diagnosis, causes: Sequence[Cause], seen_by: str) -> tuple
             one, other = called(cause, seen_by), called(rival.itself, seen_by)
             if not rival.is_same_anywhere:
                 pairs.setdefault(_motion(diagnosis, rival), []).append(f"{one} from {other}")
+            elif can_be_measured(cause, rival.itself):
+                told.append(f"No motion tells {one} from {other}: measure both.")
             elif not rival.is_one:
                 told.append(
                     f"No motion tells {one} from {other}, which can do more besides: "

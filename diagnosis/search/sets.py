@@ -147,6 +147,8 @@ class Sets:
         self._begins = {k for k, one in enumerate(self.effects) if one.kind.begins and one.identity not in known}
         # The camera's pose and scale and the marker's place, which tolerances of the links beside them can follow.
         self._poses = [k for k, one in enumerate(self.effects) if one.kind.is_like_tolerances and not one.kind.at_joint]
+        # A pose is off by 0.05 mm or by 50. A scale is off as prints are, by a few percent.
+        self._sized = [k for k in self._poses if not self.effects[k].kind.scales_all]
 
     def climbed(self, starts: Iterable[tuple[int, ...]]) -> list[Together]:
         """Improve each start by single changes, and return the sets reached, without causes that cannot be.
@@ -326,7 +328,7 @@ class Sets:
         at[places] = np.arange(len(places))
         own = [at[self._places_of(group)] for group in open_groups]
         numbers, worths = np.array([len(one) for one in own]), np.full(len(own), -np.inf)
-        fixed = np.array([group[0] not in self._poses for group in open_groups])
+        fixed = np.array([group[0] not in self._sized for group in open_groups])
         for log in _SIZES:
             narrow = inner + math.exp(-2.0 * log) * np.eye(len(inner))
             squares, volumes = _in_groups(narrow, gradient, own)
@@ -430,11 +432,11 @@ class Sets:
     def _group(self, columns: NDArray[np.intp], chosen: Sequence[int]) -> tuple[NDArray[np.int64], FloatArray]:
         """Return the index of each column's prior width (p,), -1 where it is 1, and the largest logarithms of these.
 
-        First come the scales of tolerances, then the sizes of poses: a camera may be off by 0.05 mm or by 50.
+        First come the scales of tolerances, then the sizes of poses.
         """
         group = np.full(len(columns), -1)
         group[self._nuisances : self._nuisances + self._tolerances] = self._of_scale
-        sized = [k for k in chosen if k in self._poses]
+        sized = [k for k in chosen if k in self._sized]
         for index, k in enumerate(sized, SCALES):
             group[np.searchsorted(columns, self._places[k])] = index
         return group, np.append(np.full(SCALES, self._log_most), np.full(len(sized), _LOG_MOST))

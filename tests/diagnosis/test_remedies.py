@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -88,6 +89,14 @@ def test_beside_what_is_unexplained_a_remedy_is_conditional(robot) -> None:
     effect = Effect.at(robot, "joint_coupling", "elbow_pitch", "base_yaw", values=[3e-4])
     (remedy,) = told(robot, cause(effect), verdict="unexplained")
     assert remedy.startswith("If it is joint elbow_pitch moving with joint base_yaw and not a part of what remains")
+
+
+def test_a_laser_tracker_has_no_images_to_look_at(robot) -> None:
+    outliers = Cause("outliers", None, None, {"share": Interval(0.006, (0.002, 0.01))}, 1.0, 0.0, 0.0, (), (), "")
+    assert told(robot, outliers)[0].startswith("Look at the images of the 0.6 % of fixes")
+    assert told(replace(robot, calibration=None), outliers, verdict="unexplained") == [
+        "Look for what else was measured in 0.6 % of the fixes, or was in the way. They were left out here."
+    ]
 
 
 @pytest.mark.parametrize("step", [1e-4, np.radians(0.01)])

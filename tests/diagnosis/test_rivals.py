@@ -3,15 +3,30 @@
 from __future__ import annotations
 
 import re
+import tomllib
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from planted_cases import BASE, SHOULDER, desk_arm, motion_of, scattered, seen, surveyed_arm, walk
+from planted_cases import (
+    BASE,
+    ELBOW,
+    SHOULDER,
+    desk_arm,
+    measured,
+    motion_of,
+    scattered,
+    seen,
+    start_of,
+    surveyed_arm,
+    walk,
+)
+from walked import DESK_ARM
 
 from bodyschema.diagnosis.assess.rivals import whole_range
 from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
-from bodyschema.diagnosis.report.conclusion import conclusion
+from bodyschema.diagnosis.report.conclusion import conclusion, merged_ripples
 from bodyschema.effects import Effect, Motion, Simulation
 from bodyschema.robot.description import RobotDescription
 
@@ -142,6 +157,66 @@ def test_a_rival_that_can_do_more_than_a_cause_does_not_make_it_surer() -> None:
     assert not rival.is_one
     assert standing.probability < 1.0 - rival.probability + 1e-9
     assert any("from a marker that slipped, which can do more besides" in line for line in conclusion(found).advice)
+
+
+@pytest.fixture(scope="module")
+def arm_of_one_length(tmp_path_factory) -> RobotDescription:
+    """Return a desk arm whose positions show one length alone: all else is free with the marker's place."""
+    file, text = tmp_path_factory.mktemp("arm") / DESK_ARM.name, DESK_ARM.read_text()
+    urdf = DESK_ARM.with_name("desk_arm.urdf").read_text()
+    assert "0.03 0 0.06" in urdf
+    file.with_name("desk_arm.urdf").write_text(urdf.replace("0.03 0 0.06", "0 0 0.06"))
+    return RobotDescription.from_tables(tomllib.loads(text), text, file)
+
+
+@pytest.mark.parametrize(
+    "truth",
+    [("link_geometry", ELBOW, [0.0, 0.0, 0.008, 0.0, 0.0, 0.0]), ("camera_scale", None, [0.03])],
+    ids=["link", "scale"],
+)
+def test_a_length_and_a_scale_that_look_the_same_are_both_told(arm_of_one_length, truth) -> None:
+    robot, (name, where, values) = arm_of_one_length, truth
+    hidden = Effect.at(robot, name, where, values=values)
+    file = conclusion(diagnosed(robot, walk(robot, 2, ROWS), hidden, ("camera_scale", "link_geometry")))
+    (cause,) = file.causes
+    (rival,) = cause.rivals
+    assert (cause.effect, rival.effect, rival.where) == ("camera_scale", "link_geometry", ELBOW)
+    assert 0.4 < rival.probability < 0.6
+    assert cause.probability + rival.probability == pytest.approx(1.0, abs=0.01)
+    assert file.verdict == "undecided"
+    assert f"(or a wrong link before joint {ELBOW})" in file.sentence
+    assert file.advice == (
+        f"No motion tells a wrong scale of all that is measured from a wrong link before joint {ELBOW}: measure both.",
+    )
+
+
+@pytest.mark.parametrize(("cycles", "sure"), [((4.0, 7.0), False), ((4.0, 9.0), True)])
+def test_ripples_that_the_range_of_a_joint_does_not_separate_are_not_sure(cycles, sure) -> None:
+    robot = surveyed_arm()
+    motion = scattered(robot, 3, ROWS)
+    assert np.ptp(motion.q[:, 1]) < 0.9 * 2.0 * np.pi
+    values = [[0.01, 0.0, cycles[0]], [0.0, 0.01, cycles[1]]]
+    ripples = [
+        replace(Effect.at(robot, "joint_ripple", SHOULDER, values=each), ordinal=k) for k, each in enumerate(values)
+    ]
+    fit = start_of(robot, motion, tuple(ripples), 3).with_causes(ripples)
+    assert merged_ripples(fit) == (set() if sure else {ripple.identity for ripple in ripples})
+
+
+def test_several_ripples_that_describe_one_curve_leave_the_verdict_open() -> None:
+    robot = surveyed_arm()
+    motion = scattered(robot, 3)
+    q = motion.q.copy()
+    q[:, 1] += 0.05 * np.exp(-0.5 * np.square((q[:, 1] - 0.4) / 0.2))
+    x = Simulation(robot).positions(replace(motion, q=q))
+    x += 3e-4 * np.random.default_rng(3).normal(size=x.shape)
+    file = conclusion(
+        diagnose(measured(robot, motion, x), Simulation(robot), only=("joint_ripple", "joint_eccentricity"))
+    )
+    assert sum(cause.effect == "joint_ripple" for cause in file.causes) > 1
+    assert all(cause.probability <= 0.5 for cause in file.causes if cause.effect == "joint_ripple")
+    assert file.verdict == "undecided"
+    assert f"(or another error of {SHOULDER} that depends on its angle)" in file.sentence
 
 
 def test_a_cause_that_nothing_else_comes_near_has_no_rivals() -> None:

@@ -245,3 +245,12 @@ def test_the_choices_of_a_links_numbers_are_as_probable_together_as_one() -> Non
 def test_all_shifts_are_more_probable_than_two_of_them_and_a_turn() -> None:
     ways = ways_to_choose(Effect.at(desk_arm(), "link_geometry", BASE))
     assert ways[0b000111] == ways[0b111000] < 0.1 * ways[0b100011]
+
+
+def test_a_pose_has_a_size_of_its_own_and_a_scale_that_of_prints() -> None:
+    robot = surveyed_arm()
+    fit = fit_of(robot, Effect.at(robot, "camera_scale", values=[0.03]))
+    sizes = [
+        len(sets(fit, Effect.at(robot, name)).of((0,)).logs) - len(Scales()) for name in ("camera_pose", "camera_scale")
+    ]
+    assert sizes == [1, 0]

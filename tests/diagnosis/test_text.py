@@ -184,3 +184,11 @@ def test_small_causes_less_probable_than_others_stand_in_no_table_and_change_not
     assert [said.split(":")[0] for said in small] == [
         "Change nothing because of 2 corrections whose cause is not known"
     ]
+
+
+def test_fixes_that_are_not_the_marker_follow_small_errors_everywhere() -> None:
+    of, gain = Interval(0.1, (0.05, 0.2)), Gain(80.0, (75.0, 85.0))
+    outliers = Cause("outliers", None, None, {"share": Interval(0.006, (0.002, 0.01))}, 1.0, 0.0, 0.0, (), (), "")
+    rough = Tolerances(of, of, of, links_share_percent=90.0)
+    said = sentence("unexplained", [outliers], Errors(5.0, 5.0, 1.0, 1.0, 0.9), gain, rough)
+    assert said.startswith("Small errors everywhere and 0.6 % of the fixes are not the marker. ")

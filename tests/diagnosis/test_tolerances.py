@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from planted_cases import ELBOW, SHOULDER, desk_arm, measured, motion_of, scattered, start_of, surveyed_arm
+from planted_cases import ELBOW, SHOULDER, desk_arm, measured, motion_of, scattered, start_of, surveyed_arm, walk
 
 from bodyschema.diagnosis.assess.explanation import _is_told
 from bodyschema.diagnosis.diagnosis import diagnose
@@ -265,3 +265,17 @@ def test_intervals_do_not_depend_on_how_far_away_the_instrument_stands() -> None
         fit = start.with_causes([ratio]).tolerating(Scales())
         widths.append(np.sqrt(np.diag(fit.covariance))[6:])
     np.testing.assert_allclose(widths[1], widths[0], rtol=0.02)
+
+
+def test_the_links_of_a_roughly_made_arm_are_not_named_one_and_all() -> None:
+    robot, rng = desk_arm(), np.random.default_rng([4, 46])
+    sizes = [np.append(1.8e-3 * rng.normal(size=3), np.radians(0.36) * rng.normal(size=3)) for _ in robot.joints]
+    pairs = zip(robot.joints, sizes, strict=True)
+    made = tuple(Effect.at(robot, "link_geometry", joint, values=size) for joint, size in pairs)
+    motion = walk(robot, 4, 200)
+    x = Simulation(robot, (), None, made).positions(motion) + 3e-4 * rng.normal(size=(200, 3))
+    recording = measured(robot, motion, x)
+    file = conclusion(diagnose(recording, Simulation(robot), only=("joint_offset", "link_geometry")))
+    assert (file.causes, file.verdict == "explained") == ((), False)
+    assert file.tolerances is not None
+    assert 0.1 < file.tolerances.angle_deg.value < 1.0

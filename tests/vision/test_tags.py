@@ -292,7 +292,7 @@ def test_the_same_tag_twice_is_ambiguous() -> None:
     assert reason(tracker().track(twice)) is Reason.AMBIGUOUS
 
 
-@pytest.mark.parametrize("printed", [0.9, 1.1])
+@pytest.mark.parametrize("printed", [0.9, 0.97, 0.98, 0.99, 1.01, 1.03, 1.1])
 def test_a_tag_printed_in_another_size_is_a_size_mismatch(printed) -> None:
     assert reason(tracker().track(seen(sheet(side_m=printed * SIDE_M)))) is Reason.SIZE_MISMATCH
 

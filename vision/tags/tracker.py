@@ -209,13 +209,14 @@ class TagTracker:
         if not poses:
             return Reason.EPIPOLAR if self.calibration.is_stereo else Reason.REPROJECTION
         best = poses[0]
+        freedom = sum(sighting.pixels.size for sighting in sightings) - 6
+        misfit, most = best.squares / freedom, self.config.max_reprojection**2
         if self.calibration.is_stereo:
             grown, sigma = estimator.scale(best)
-            if abs(grown) > self.config.size_tolerance + 4.0 * sigma:
+            by_size = misfit > most and grown**2 > 0.5 * best.squares * sigma**2  # the larger part of the misfit
+            if by_size or abs(grown) > self.config.size_tolerance + 4.0 * sigma:
                 return Reason.SIZE_MISMATCH
-        freedom = sum(sighting.pixels.size for sighting in sightings) - 6
-        misfit = best.squares / freedom
-        if misfit > self.config.max_reprojection**2:
+        if misfit > most:
             return Reason.REPROJECTION
         if len(poses) > 1 and (poses[1].squares - best.squares) / max(misfit, 1.0) < _Settings.clearly_worse:
             stayed = self._stayed(t, poses[:2])

@@ -21,9 +21,14 @@ class Outliers(Presenter):
         return f"{100 * found.numbers['share']:.2g} % of the fixes are not the marker"
 
     def remedy(self, workshop: Workshop, found: Found) -> str:
+        share = f"{100 * found.numbers['share']:.2g} %"
+        if workshop.robot.calibration is None:
+            return (
+                f"Look for what else was measured in {share} of the fixes, or was in the way. They were left out here."
+            )
         return (
-            f"Look at the images of the {100 * found.numbers['share']:.2g} % of fixes that are not the marker: cover "
-            "what else looks like it, and keep people out of the view. They were left out here."
+            f"Look at the images of the {share} of fixes that are not the marker: cover what else looks like it, and "
+            "keep people out of the view. They were left out here."
         )
 
 
