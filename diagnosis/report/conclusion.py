@@ -180,12 +180,9 @@ def merged_ripples(fit: Fit) -> set[Identity]:
     for one, other in combinations(ripples, 2):
         if one.where == other.where:
             span = float(np.ptp(fit.observations.motion.q[:, fit.simulation.place(one).joint]))
-            apart = abs(float(one.values[-1] - other.values[-1])) * span
-            found |= (
-                {one.identity, other.identity}
-                if apart < _OF_A_CURVE * (1.0 if one.prismatic else 2.0 * math.pi)
-                else set()
-            )
+            turns = span if one.prismatic else span / (2.0 * math.pi)
+            if abs(float(one.values[-1] - other.values[-1])) * turns < _OF_A_CURVE:
+                found |= {one.identity, other.identity}
     return found
 
 
