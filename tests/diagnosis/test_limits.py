@@ -58,7 +58,7 @@ def test_what_is_rejected_though_chance_hardly_brings_it_about_has_a_word_why(sm
 def test_a_play_that_runs_hardly_cross_is_told_with_what_to_record() -> None:
     robot = desk_arm()
     way = walk(robot, 1)
-    short = Motion(way.q, way.t, np.arange(len(way.q)) // 4)
+    short = Motion(way.q, way.t, np.arange(len(way.q)) // 2)
     truth = Effect.at(robot, "backlash", SHOULDER, values=[0.12])
     found = diagnose(seen(robot, short, (truth,), 1), Simulation(robot), only=("backlash",))
     (told,) = [line for line in conclusion(found).limitations if "side of its backlash" in line]
