@@ -90,7 +90,8 @@ def _rivals(diagnosis: DiagnosisFile) -> list[str]:
     """Return one sentence for each alternative explanation of a cause."""
     told, by = [cause for cause in diagnosis.causes if not cause.is_correction], diagnosis.seen_by
     names = [named(cause.effect, cause.where, cause.source, by) for cause in told]
-    return [_rival(name, rival, by) for name, cause in zip(names, told, strict=True) for rival in cause.rivals]
+    pairs = zip(names, told, strict=True)
+    return list(dict.fromkeys(_rival(name, rival, by) for name, cause in pairs for rival in cause.rivals))
 
 
 def _rival(itself: str, rival: Indistinguishable, seen_by: str) -> str:

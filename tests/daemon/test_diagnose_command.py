@@ -175,6 +175,13 @@ def printed(file: DiagnosisFile) -> str:
     return console.file.getvalue()
 
 
+def test_an_alternative_of_two_causes_of_a_joint_is_said_once(found) -> None:
+    (cause,) = found.causes[:1]
+    wave = Indistinguishable("unexplained", None, None, "this_motion", 0.5, "another error of shoulder_pitch")
+    twice = (msgspec.structs.replace(cause, rivals=(wave,)),) * 2
+    assert printed(msgspec.structs.replace(found, causes=twice)).count("may be another error of shoulder_pitch") == 1
+
+
 def test_each_verdict_begins_differently(found) -> None:
     heads = {
         "explained": "EXPLAINED",
