@@ -95,9 +95,10 @@ def _filtered(rays: FloatArray, channels: Float32Array, both: tuple[Filters, Fil
     wider_px = float((contrast * widening)[:, 1:].sum()) / widening_information
     information, moved = informations.sum(axis=1), shifts.sum(axis=1)
     mean = moved / np.maximum(information, _NOTHING)
-    doubt, excess = _doubt(informations, shifts, mean, information > _Settings.worst_sigma_px**-2)
+    least = (_Settings.worst_sigma_blurs * blur_px) ** -2
+    doubt, excess = _doubt(informations, shifts, mean, information > least)
     information /= doubt
-    told = information > _Settings.worst_sigma_px**-2
+    told = information > least
     information[~told] = 1.0
     return Limb(
         rays,

@@ -44,10 +44,10 @@ class OutlineSettings:
 class LimbSettings:
     """Settings of the limb: filters across the edge, the ellipse through it, and the waves that it leaves.
 
-    What matters: `aliased_px` (20 of 181 other outcomes), `worst_sigma_px` and `farthest_px` at 0.3 times (22, 20),
-    `looks` at 1 (15), `wave_radius_px` at 1 (13), `smoothing_px` at 3 (115), `best_sigma_px` at 3 times (sigma + 50 %).
-    The four densities change sigma by - 10 to + 30 % and no outcome. The others change at most 9 outcomes, and half of
-    the positions by less than 0.7 sigma.
+    What matters: `aliased_px` (20 of 181 other outcomes), `worst_sigma_blurs` (as 0.5 px), `farthest_px` at 0.3 times
+    (22, 20), `looks` at 1 (15), `wave_radius_px` at 1 (13), `smoothing_px` at 3 (115), `best_sigma_px` at 3 times
+    (sigma + 50 %). The four densities change sigma by - 10 to + 30 % and no outcome. The others change at most 9
+    outcomes, and half of the positions by less than 0.7 sigma.
     """
 
     # Between samples [px]; sampled lengths on the ball and beyond [px], for the usual blur; a wider one needs longer.
@@ -66,8 +66,8 @@ class LimbSettings:
     # Least noise of a sample [grey levels]; share of the rays whose background is assumed to show little but noise.
     least_noise, even_rays = 1.0, 0.3
     beyond_blurs = 2.0  # from the edge, the ball no longer shows
-    # Smallest sigma of a ray's edge; a ray with a sigma above the largest is ignored [px].
-    best_sigma_px, worst_sigma_px = 0.03, 0.5
+    # Smallest sigma of a ray's edge [px]; a ray with a sigma above the largest (share of the blur) is ignored.
+    best_sigma_px, worst_sigma_blurs = 0.03, 0.6
     # The channels' disagreement (chi-squared, 2 degrees of freedom): more than this, and than this times the median of
     # the ball's rays, is no noise, and makes a ray's variance larger by that power of it; what its median is of noise.
     least_disagreement, usual_disagreement, disagreement_power, of_noise = 2.0, 1.5, 3, 3.0
