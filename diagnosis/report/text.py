@@ -38,7 +38,9 @@ class _Settings:
 
     by_tolerances = 0.95  # tolerances that leave at most this share of the error are mentioned
     untold = 10.0  # an interval with a larger ratio of its ends is given by its upper end
-    named, pairs = 2, 3  # causes in a headline, to fit two lines; pairs of causes with a motion that tells them apart
+    # Causes in a headline, and their characters beyond one cause, to fit two lines on a screen and four on a phone.
+    named, longest = 2, 120
+    pairs = 3  # pairs of causes with a motion that tells them apart
     worth_a_motion = 25.0  # smallest Δχ² between two causes at which a motion is advised
 
 
@@ -173,6 +175,8 @@ def _head(causes: Sequence[Cause], tolerances: Tolerances | None, seen_by: str, 
     first = first[: _Settings.named]
     said = [finding(c.effect, c.where, c.source, told_values(c), seen_by, timed=timed, weighed=weighed) for c in first]
     told = [clause + _or(cause, seen_by) for clause, cause in zip(said, first, strict=True)]
+    if len(", ".join(told)) > _Settings.longest:
+        first, told = first[:1], told[:1]
     if everywhere and first and first[-1].effect == OUTLIERS:
         everywhere.append(told.pop())
     others = [cause.is_outvoted or cause.is_correction for cause in ordered if cause not in first]

@@ -88,6 +88,15 @@ def test_the_headline_of_many_causes_fits_two_lines():
     assert len(said) < 2 * 96
 
 
+def test_two_long_causes_do_not_both_stand_in_the_headline():
+    causes = [_zero(f"shoulder_pitch_of_arm_{k}", 0.6, share=10.0 + k) for k in range(2)]
+    said = sentence("undecided", causes, Errors(5.0, 5.0, 1.0, 1.0, 0.9), Gain(80.0, (75.0, 85.0)))
+    head = said.partition(". RMS")[0]
+    assert "or a wrong link before joint shoulder_pitch_of_arm_1" in head
+    assert "shoulder_pitch_of_arm_0" not in head
+    assert head.endswith("and 1 smaller cause")
+
+
 def test_tolerances_come_before_causes_of_little_weight():
     arm = Tolerances(Interval(0.3, (0.2, 0.4)), Interval(0.06, (0.05, 0.07)), Interval(0.01, (0.0, 0.02)), 60.0, 9.0)
     causes = [_zero("slight", share=0.4), _zero("elbow", share=30.0)]
