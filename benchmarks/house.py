@@ -136,8 +136,8 @@ def keys() -> int:
     for line in (ROOT / "docs" / "reference" / "robot_toml.md").read_text("utf-8").splitlines():
         if line.startswith("## "):
             table = line.partition(" of kind ")[0]
-        elif (key := re.match(r"\| `(\w+)`", line)) is not None:
-            found.add((table, key[1]))
+        elif line.startswith("| `"):
+            found |= {(table, key) for key in re.findall(r"`(\w+)`", line.split("|")[1])}
     return len(found)
 
 

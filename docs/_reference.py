@@ -48,8 +48,8 @@ def robot_toml() -> str:
         if kind in first:
             sections.append(f"\n`{heading}`: as `{first[kind]}`.\n")
         else:
-            first[kind] = heading
-            sections.append(_table(heading, kind))
+            sections.append(_table(heading, kind, first))
+            first |= dict.fromkeys((base for base in kind.__mro__ if base not in first), heading)
     return TOML_HEAD + "".join(sections)
 
 
@@ -58,13 +58,24 @@ def _tables(prefix: str, kind: type[msgspec.Struct]) -> Iterator[Table]:
     for name, annotation in typing.get_type_hints(kind, include_extras=True).items():
         if name.startswith("__"):
             continue
-        inner = [SECTIONS[name]] if not prefix and name in SECTIONS else list(_structs(annotation))
+        inner = [SECTIONS[name]] if not prefix and name in SECTIONS else list(_structs(_bound(annotation, kind)))
         path = f"{prefix}{name}"
+        if inner and any(typing.get_origin(part) is dict for part in _parts(annotation)) and name not in SECTIONS:
+            path += ".NAME"
         several = any(typing.get_origin(part) in SEVERAL for part in _parts(annotation))
         for struct in inner:
             told = f" of kind {struct.__name__.removesuffix('Table').lower()}" if len(inner) > 1 else ""
             yield (f"[[{path}]]" if several else f"[{path}]") + told, struct
             yield from _tables(f"{path}.", struct)
+
+
+def _bound(annotation: object, kind: type[msgspec.Struct]) -> object:
+    """Return the type that a dictionary of a generic table has in this one; any other as it is."""
+    last = (typing.get_args(annotation) or (None,))[-1]
+    if not isinstance(last, typing.TypeVar):
+        return annotation
+    [generic] = (base for base in kind.__orig_bases__ if typing.get_args(base))  # pyright: ignore[reportAttributeAccessIssue]
+    return typing.get_args(generic)[0]
 
 
 def _parts(annotation: object) -> Iterator[object]:
@@ -82,20 +93,36 @@ def _structs(annotation: object) -> Iterator[type[msgspec.Struct]]:
             yield kind
 
 
-def _table(heading: str, kind: type[msgspec.Struct]) -> str:
-    """Return the section of one table; keys that are tables themselves have their own."""
+def _table(heading: str, kind: type[msgspec.Struct], first: dict[type[msgspec.Struct], str]) -> str:
+    """Return the section of one table; keys that are tables themselves have their own.
+
+    Args:
+        first: the table that describes the keys of a class, of those before this one.
+    """
     told = _documented(kind)
     fields = [field for field in msgspec.structs.fields(kind) if not list(_structs(field.type))]
     by_text: dict[str, list[msgspec.structs.FieldInfo]] = {}
+    described: dict[str, list[str]] = {}
     for field in fields:
-        by_text.setdefault(told.get(field.name, ""), []).append(field)
+        where = first.get(_definer(kind, field.name))
+        if where is None:
+            by_text.setdefault(told.get(field.name, ""), []).append(field)
+        else:
+            described.setdefault(where, []).append(f"`{field.encode_name}`")
+    shared = "".join(f"\nAs in `{where}`: {', '.join(names)}.\n" for where, names in described.items())
     rows = []
     for text, keys in by_text.items():
         names = ", ".join(f"`{key.encode_name}`" for key in keys)
         rows.append(f"| {names} | {', '.join(dict.fromkeys(map(_default, keys)))} | {text} |")
     if not rows:
-        return ""
-    return f"\n## {heading}\n\n| key | default | meaning |\n| --- | --- | --- |\n" + "\n".join(rows) + "\n"
+        return f"\n## {heading}\n{shared}" if shared else ""
+    table = "| key | default | meaning |\n| --- | --- | --- |\n" + "\n".join(rows) + "\n"
+    return f"\n## {heading}\n{shared}\n{table}"
+
+
+def _definer(kind: type[msgspec.Struct], name: str) -> type[msgspec.Struct]:
+    """Return the class, of a table and its bases, that says what a key is."""
+    return next(base for base in kind.__mro__ if name in inspect.get_annotations(base))
 
 
 def _default(field: msgspec.structs.FieldInfo) -> str:
