@@ -81,7 +81,7 @@ RIVALS: dict[str, Detector] = {
 
 
 def ours(image: ImageArray, region: Region) -> FloatArray | None:
-    for patch in find_patches(image, region, GATE, CONFIG):
+    for patch in find_patches(image, region, GATE):
         disc = measure(image, patch, EYE, GATE, CONFIG)
         if isinstance(disc, Disc):
             return disc.centre_px

@@ -98,7 +98,7 @@ def _paint_own_hue(
 def is_in_full_view(x: FloatArray) -> bool:
     """Return True if the ball at `x` (3,) [m] clears the borders of both images, with a pixel to spare."""
     eye = Pinhole(SMALL.focal_px, SMALL.principal_point_px)
-    margin_px = CONFIG.border_margin_px + 1.0
+    margin_px = PatchSettings.border_px + 1.0
     for x_eye in in_eyes(x, SMALL):
         outline = eye.outline(x_eye, RADIUS_M)
         assert outline is not None

@@ -52,8 +52,8 @@ REMEDIES: Mapping[Reason, str] = {
     Reason.REFLECTION: "Turn the lamp or what mirrors it away, or mask it.",
     Reason.REPROJECTION: "Is the paper flat, the light not too bright, and is each tag where robot.toml has it?",
     Reason.DISAGREEING: "The sampler's health says by how much, and what would make them agree: `bodyschema status`.",
-    Reason.IMPLAUSIBLE_SPEED: "Is another thing of its colour in sight? If it really is so fast, raise [vision] "
-    "max_speed_m_s and [daemon] max_marker_speed_m_s.",
+    Reason.IMPLAUSIBLE_SPEED: "Is another thing of its colour in sight? Else guide the arm more slowly, or raise "
+    "[daemon] max_marker_speed_m_s.",
     Reason.EPIPOLAR: "Are the cameras exchanged, one upside down, or moved? `bodyschema calibrate cameras --check` "
     "shows it.",
     Reason.SIZE_MISMATCH: "Is its size in [vision] as measured, and was --square-mm that of the printed board? Else it "

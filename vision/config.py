@@ -13,8 +13,6 @@ from bodyschema.robot.toml_file import Fraction, Positive
 from bodyschema.vision.cameras.config import CamerasConfig, FurtherCameras
 from bodyschema.vision.tags.config import ChessboardConfig, ClusterConfig, TagConfig
 
-Ratio = Annotated[float, Meta(gt=1)]
-
 # After a longer pause the last fixes of a marker predict nothing [s].
 LONGEST_PAUSE_S = 0.5
 
@@ -44,7 +42,7 @@ NAMED_COLOURS: dict[str, HueBand] = {
 
 
 class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [vision]: appearance of the marker, and limits for doubtful detections."""
+    """The table [vision]: appearance of the marker, and the cameras that see it."""
 
     # what is looked for: a coloured ball, a ball that is brighter than all around it, one tag ([vision.tag]), a rigid
     # cluster of tags ([vision.cluster]), a plain chessboard ([vision.chessboard]), or what a tracker of another package
@@ -54,30 +52,11 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     radius_m: Positive = 0.020  # radius of the marker ball [m]
     # of a bright ball, where 1 is the brightest that the camera can tell
     min_brightness: Annotated[float, Meta(gt=0, le=1)] = 0.6
-    # a patch of the marker's colour smaller than this is no candidate [px²]
-    min_pixels: Annotated[int, Meta(ge=12)] = 30
-    # how far the ball's outline has to stay from the image border [px]
-    border_margin_px: Annotated[float, Meta(ge=0)] = 3.0
-    # share of the outline that has to be seen where the fitted ellipse says
-    min_visible: Annotated[float, Meta(ge=0.5, le=1)] = 0.75
-    # a centre less certain than this is doubtful: what was fitted is no ellipse [px]. It applies up to a radius of 5
-    # px, and in proportion to larger ones.
-    max_centre_sigma_px: Positive = 0.4
-    # largest difference of the eyes' rows [px], on top of the noise of the two centres times `epipolar_sigmas`
-    epipolar_px: Annotated[float, Meta(ge=0)] = 0.5
-    epipolar_sigmas: Annotated[float, Meta(ge=0)] = 4.0  # how many times that noise counts, in sizes too
-    eye_size_ratio: Ratio = 1.05  # largest ratio of the sizes the two eyes claim for the ball, besides noise
-    # largest ratio between the radius seen and the one expected at the triangulated depth
-    depth_size_ratio: Ratio = 1.3
-    # faster than this the marker does not move; what is farther off is something else [m/s]
-    max_speed_m_s: Positive = 3.0
-    # at most this many patches per eye are looked at closely, the most disc-like first
-    max_candidates: Annotated[int, Meta(ge=1, le=1000)] = 12
     cameras: CamerasConfig | None = None  # where images come from; without it there are none
     further_cameras: tuple[FurtherCameras, ...] = ()  # others that see the same marker; their positions are fused
     tag: TagConfig = TagConfig()  # the tag, or what the tags of a cluster have in common
     cluster: ClusterConfig = ClusterConfig()  # where on the marker which tag is
-    chessboard: ChessboardConfig | None = None  # the squares of a chessboard; the limits are those of [vision.tag]
+    chessboard: ChessboardConfig | None = None  # the squares of a chessboard
     plugin: PluginConfig | None = None  # the tracker of another package
 
     @property

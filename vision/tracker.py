@@ -193,7 +193,7 @@ class StereoTracker:
         Once a disc fits the prediction, patches that are not whole are skipped.
         """
         region = self._whole if expected is None else expected.region
-        patches = find_patches(image, region, self._gate, self.config)
+        patches = find_patches(image, region, self._gate)
         discs: list[Disc] = []
         rough: list[Disc] = []
         reason: Reason | None = None
@@ -279,7 +279,7 @@ class StereoTracker:
 
     def _within_reach(self, x: FloatArray, from_x: FloatArray, seconds: float) -> bool:
         """Return True if an object can have moved from one place (3,) [m] to another in that time."""
-        reach_m = _Settings.jump_radii * self.config.radius_m + self.config.max_speed_m_s * min(
+        reach_m = _Settings.jump_radii * self.config.radius_m + _Settings.fastest_m_s * min(
             seconds, _Settings.fair_pause_s
         )
         return float(np.linalg.norm(x - from_x)) <= reach_m
@@ -291,7 +291,7 @@ class StereoTracker:
             return Reason.AMBIGUOUS
         is_copy = any(
             0 <= t - seen.t <= _Settings.longest_memory_s
-            and is_reflection_of(found, seen.level, self.config.depth_size_ratio * seen.distance_m)
+            and is_reflection_of(found, seen.level, _Settings.depth_size_ratio * seen.distance_m)
             for seen in self._sighted
         )
         return Reason.REFLECTION if is_copy else None

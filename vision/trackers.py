@@ -27,7 +27,7 @@ def tracker_of(calibration: StereoCalibration, config: VisionConfig) -> MarkerTr
             from bodyschema.vision.tags.chessboard import ChessboardFinder
             from bodyschema.vision.tags.tracker import TagTracker
 
-            board = ChessboardFinder(config.board, config.tag) if config.marker == "chessboard" else None
+            board = ChessboardFinder(config.board) if config.marker == "chessboard" else None
             return TagTracker(calibration, TagBody.of(config), config.tag, board, *config.readout)
         case "plugin":
             if config.plugin is None:

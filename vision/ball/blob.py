@@ -82,15 +82,15 @@ class Disc:
         return float(np.linalg.norm(self.centre_px - other.centre_px)) < max(self.radius_px, other.radius_px)
 
 
-def find_patches(image: ImageArray, region: Region, gate: Gate, config: VisionConfig) -> list[Patch]:
+def find_patches(image: ImageArray, region: Region, gate: Gate) -> list[Patch]:
     """Return patches of the marker's colour in `region` of a BGR image, the most disc-like first."""
-    patches = _patches(gate.mask(region.crop(image)), region, config)
+    patches = _patches(gate.mask(region.crop(image)), region)
     for patch in list(patches):
         if not patch.is_whole:
-            for part in _brighter_parts(image, patch, gate, config):
+            for part in _brighter_parts(image, patch, gate):
                 if not any(part.box == other.box for other in patches):
                     patches.append(part)
-    return sorted(patches, key=lambda patch: -patch.fill)[: config.max_candidates]
+    return sorted(patches, key=lambda patch: -patch.fill)[: _Settings.most_patches]
 
 
 def patch_at(image: ImageArray, centre_px: FloatArray, radius_px: float, gate: Gate) -> Patch | None:
@@ -123,7 +123,7 @@ def measure(
         blur_px: rough blur of its contour (1-sigma) [px], such as it had in the last frame; it saves time.
     """
     height, width = image.shape[:2]
-    if not _clear_of_border(patch.box, config.border_margin_px, (width, height)):
+    if not _clear_of_border(patch.box, _Settings.border_px, (width, height)):
         return Reason.AT_BORDER
     if config.marker != "bright_ball" and _washed_out(image, patch):
         return Reason.SATURATED
@@ -135,14 +135,14 @@ def measure(
     outline = fit_outline(pixels, gate, patch.centre_px - corner, patch.radius_px, shape)
     if outline is None:
         return Reason.OCCLUDED
-    reason = _not_whole(outline, config)
+    reason = _not_whole(outline)
     if reason is not None:
         return reason
     outline = refine_outline(pixels, gate, outline, shape, blur_px)
-    if outline is None or not _is_sure(outline, config):
+    if outline is None or not _is_sure(outline):
         return Reason.NOT_ROUND
     centre_px = outline.centre_px + corner
-    reach = outline.radius_px + config.border_margin_px
+    reach = outline.radius_px + _Settings.border_px
     if (centre_px - reach < 0).any() or (centre_px + reach > (width - 1, height - 1)).any():
         return Reason.AT_BORDER
     # Over the whole ball: the patch may be only its brighter part.
@@ -188,15 +188,15 @@ def _cut_circle(image: ImageArray, patch: Patch, gate: Gate) -> tuple[FloatArray
     return centre_px, radius_px + 0.5
 
 
-def _is_sure(outline: Outline, config: VisionConfig) -> bool:
+def _is_sure(outline: Outline) -> bool:
     """Return True if the centre is sure enough; the limit is that of a small ball and grows with the radius."""
-    limit_px = config.max_centre_sigma_px * max(1.0, outline.radius_px / _Settings.small_px)
+    limit_px = _Settings.most_sigma_px * max(1.0, outline.radius_px / _Settings.small_px)
     return math.sqrt(float(outline.cov_px.diagonal().max())) <= limit_px
 
 
-def _not_whole(outline: Outline, config: VisionConfig) -> Reason | None:
+def _not_whole(outline: Outline) -> Reason | None:
     """Return the reason why an outline is not that of a whole ball, or None."""
-    if outline.visible < config.min_visible or outline.off > _Settings.most_off:
+    if outline.visible < _Settings.least_visible or outline.off > _Settings.most_off:
         return Reason.OCCLUDED
     return Reason.LOW_CONTRAST if outline.uneven > _Settings.most_uneven else None
 
@@ -224,7 +224,7 @@ def _clear_of_border(box: Region, margin_px: float, size: tuple[int, int]) -> bo
     )
 
 
-def _patches(mask: ImageArray, region: Region, config: VisionConfig) -> list[Patch]:
+def _patches(mask: ImageArray, region: Region) -> list[Patch]:
     points = cv2.findNonZero(mask)
     if points is None:
         return []
@@ -232,11 +232,11 @@ def _patches(mask: ImageArray, region: Region, config: VisionConfig) -> list[Pat
     points = np.reshape(points, (-1, 2)).astype(np.int32, copy=False)
     label = cv2.connectedComponents(mask, connectivity=4)[1][mask > 0].astype(np.intp)
     areas = np.bincount(label)
-    by_size = np.argsort(-areas, kind="stable")[: 4 * config.max_candidates]
+    by_size = np.argsort(-areas, kind="stable")[: 4 * _Settings.most_patches]
     patches = (
         _patch(mask, points.compress(label == number, axis=0), region)
         for number in by_size
-        if areas[number] >= config.min_pixels
+        if areas[number] >= _Settings.least_pixels
     )
     return [patch for patch in patches if patch is not None]
 
@@ -263,7 +263,7 @@ def _patch(mask: ImageArray, points: NDArray[np.int32], region: Region) -> Patch
     return Patch(whole, np.array([left + x, top + y]), radius, fill)
 
 
-def _brighter_parts(image: ImageArray, patch: Patch, gate: Gate, config: VisionConfig) -> list[Patch]:
+def _brighter_parts(image: ImageArray, patch: Patch, gate: Gate) -> list[Patch]:
     """Return the parts of a patch that keep much of its strongest colour: the ball in front of a brick wall, for
     example.
     """
@@ -271,10 +271,10 @@ def _brighter_parts(image: ImageArray, patch: Patch, gate: Gate, config: VisionC
     amount = gate.amount(pixels)
     own = gate.mask(pixels) > 0
     # The ball may be a small part of the patch: use the level that half of the smallest ball reaches.
-    place = -config.min_pixels // 2
+    place = -_Settings.least_pixels // 2
     strongest = float(np.partition(amount[own], place)[place])
     return [
         part
         for share in _Settings.strong_shares
-        for part in _patches((own & (amount > share * strongest)).astype(np.uint8), patch.box, config)
+        for part in _patches((own & (amount > share * strongest)).astype(np.uint8), patch.box)
     ]

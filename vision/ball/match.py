@@ -70,7 +70,7 @@ class StereoMatcher:
             return False
         u, v = disc.centre_px
         disparity_px = self._calibration.baseline_m * disc.radius_px / self._config.radius_m
-        ends_px = disparity_px / self._config.depth_size_ratio, disparity_px * self._config.depth_size_ratio
+        ends_px = disparity_px / _Settings.depth_size_ratio, disparity_px * _Settings.depth_size_ratio
         first, last = (u - ends_px[1], u - ends_px[0]) if in_left else (u + ends_px[0], u + ends_px[1])
         # The square inside the disc.
         half = max(1, round(disc.radius_px / math.sqrt(2.0)))
@@ -91,7 +91,7 @@ class StereoMatcher:
             return Reason.EPIPOLAR
         _, vl, _, vr = location.centres_px
         sigma = math.sqrt(location.variances_px[1] + location.variances_px[3])
-        if abs(vl - vr) > self._config.epipolar_px + self._config.epipolar_sigmas * sigma:
+        if abs(vl - vr) > _Settings.epipolar_px + _Settings.epipolar_sigmas * sigma:
             return Reason.EPIPOLAR
         # How far apart noise may bring the sizes that the two eyes see.
         size_sigma = math.hypot(*location.size_sigmas.tolist())
@@ -108,12 +108,12 @@ class StereoMatcher:
         """Return True if two discs, one of each eye, are at the same row and of the same size."""
         size = max(one.radius_px, other.radius_px) / min(one.radius_px, other.radius_px)
         rows_px = abs(float(one.centre_px[1] - other.centre_px[1]))
-        return size <= self._config.eye_size_ratio and rows_px <= self._config.epipolar_px
+        return size <= _Settings.eye_size_ratio and rows_px <= _Settings.epipolar_px
 
     def _sizes_fit(self, sizes: Sequence[float], sigma: float) -> bool:
-        between_eyes = max(sizes) / min(sizes) / (1.0 + self._config.epipolar_sigmas * sigma)
+        between_eyes = max(sizes) / min(sizes) / (1.0 + _Settings.epipolar_sigmas * sigma)
         against_depth = max(*sizes, 1.0 / min(sizes))
-        return between_eyes <= self._config.eye_size_ratio and against_depth <= self._config.depth_size_ratio
+        return between_eyes <= _Settings.eye_size_ratio and against_depth <= _Settings.depth_size_ratio
 
 
 def _without_reflections(found: list[Location]) -> list[Location]:

@@ -52,7 +52,7 @@ class OneEyeBallTracker:
         """Return the one ball in the image, or the reason for a miss."""
         discs: list[Disc] = []
         reason = Reason.NO_MARKER
-        for patch in find_patches(frame.left, self._whole, self._gate, self.config):
+        for patch in find_patches(frame.left, self._whole, self._gate):
             outcome = measure(frame.left, patch, self._eye, self._gate, self.config)
             if isinstance(outcome, Reason):
                 reason = outcome if reason is Reason.NO_MARKER else reason

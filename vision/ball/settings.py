@@ -111,7 +111,13 @@ class PatchSettings:
     most_uneven = 0.3
     most_off = 0.15  # the ball is occluded if a larger share of its outline leaves the ellipse
     most_white = 0.35  # share of over-exposed pixels on a ball that can be measured
-    small_px = 5.0  # radius of the ball to which `max_centre_sigma_px` applies
+    least_pixels = 30  # a patch of the marker's colour smaller than this is no candidate [px²]
+    most_patches = 12  # so many patches of an eye are looked at closely, the most disc-like first
+    border_px = 3.0  # how far the outline has to stay from the border of the image
+    least_visible = 0.75  # share of the outline that has to be seen where the fitted ellipse says
+    # A centre less certain than this [px] is doubtful: what was fitted is no ellipse. It applies up to this radius
+    # [px], and in proportion to larger ones.
+    most_sigma_px, small_px = 0.4, 5.0
     # A circle about a patch that could not be measured, or that the border cuts, is right to this share of its radius.
     rough_share = 0.1
     apron_px = 12  # around a patch, for its outline
@@ -144,6 +150,11 @@ class TrackSettings:
     times (6), `alike_levels` (4). The others change no outcome; sigmas of size change single sigmas by 15 to 200 %.
     """
 
+    # Largest difference of the eyes' rows [px], on top of so many sigmas of the two centres, which count in sizes too.
+    epipolar_px, epipolar_sigmas = 0.5, 4.0
+    eye_size_ratio = 1.05  # largest ratio of the sizes that the two eyes see, besides noise
+    depth_size_ratio = 1.3  # largest ratio between the radius seen and the one expected at the triangulated depth
+    fastest_m_s = 3.0  # the marker does not move faster; what is farther off is something else
     mirrored_light = 0.8  # a mirror gives back less than this of the light, and its copy stands farther off
     # Fingertips over a limb show in both eyes: where both limbs leave their ellipses by more, in variances of the
     # samples, something covers the ball. What is behind it is not the same in both.

@@ -49,7 +49,7 @@ class Annotator:
         if not self._is_ball:
             return []
         found = []
-        for patch in find_patches(image, self._whole, self._gate, self._config):
+        for patch in find_patches(image, self._whole, self._gate):
             outcome = measure(image, patch, self._eye, self._gate, self._config)
             if isinstance(outcome, Reason):
                 found.append(Sight(_pair(patch.centre_px), patch.radius_px, outcome))

@@ -43,7 +43,7 @@ class TagDrawing:
         self._board: ChessboardFinder | None = None
         if config.marker == "chessboard":
             across = config.board.columns - 1
-            self._board, self._side_m = ChessboardFinder(config.board, config.tag), 2.0 * config.board.square_m
+            self._board, self._side_m = ChessboardFinder(config.board), 2.0 * config.board.square_m
             self._rim = [0, across - 1, -1, -across]
 
     def sights(self, image: ImageArray) -> Iterator[TagSight]:

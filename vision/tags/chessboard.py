@@ -12,9 +12,10 @@ from bodyschema.vision.board.board import Board
 from bodyschema.vision.board.detector import any_grid, measured_grid, on_plane
 from bodyschema.vision.images import is_black, too_white
 
-from .config import ChessboardConfig, TagConfig
+from .config import ChessboardConfig
 from .finder import Region, Seen
 from .image import TagImage
+from .settings import EdgeSettings, TagSettings
 
 _log = logging.getLogger(__name__)
 _FLAGS = cv2.CALIB_CB_ADAPTIVE_THRESH + cv2.CALIB_CB_NORMALIZE_IMAGE + cv2.CALIB_CB_FAST_CHECK
@@ -23,9 +24,9 @@ _FLAGS = cv2.CALIB_CB_ADAPTIVE_THRESH + cv2.CALIB_CB_NORMALIZE_IMAGE + cv2.CALIB
 class ChessboardFinder:
     """Detector of a chessboard, all of which has to be in view. It is number 0 of its body."""
 
-    def __init__(self, shape: ChessboardConfig, config: TagConfig) -> None:
+    def __init__(self, shape: ChessboardConfig) -> None:
         self._board = Board(shape.columns, shape.rows, shape.square_m, pattern="chessboard")
-        self._config, self._warned = config, False
+        self._warned = False
 
     def suspicion(self, grey: ImageArray) -> Reason | None:
         """Return what is wrong with the light of the whole image, if anything is."""
@@ -77,7 +78,7 @@ class ChessboardFinder:
         variance = self._variance(px)
         grid = px.reshape(self._board.rows - 1, self._board.columns - 1, 2)
         side_px = min(float(np.linalg.norm(np.diff(grid, axis=axis), axis=2).mean()) for axis in (0, 1))
-        if variance > (self._config.max_corner_sigma * side_px) ** 2:
+        if variance > (TagSettings.most_corner_sigma * side_px) ** 2:
             return Reason.NOT_STRAIGHT
         return TagImage(0, px, variance * np.eye(px.size))
 
@@ -102,7 +103,7 @@ class ChessboardFinder:
         dark = (columns + rows) % 2 == 0
         inner = np.s_[1:-1, 1:-1]
         contrast = levels[inner][~dark[inner]].mean() - levels[inner][dark[inner]].mean()
-        if contrast < self._config.min_contrast:
+        if contrast < EdgeSettings.least_contrast:
             return Reason.LOW_CONTRAST
         # A margin has 0 of the contrast, another row of squares all of it: 0.3 to 0.85 change no outcome of the tests.
         for side in (np.s_[0, 1:-1], np.s_[-1, 1:-1], np.s_[1:-1, 0], np.s_[1:-1, -1]):

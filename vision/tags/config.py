@@ -17,7 +17,7 @@ Vector = tuple[float, float, float]
 
 
 class TagConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The table [vision.tag]: the tag, or what all tags of a cluster have in common, and when a find is doubtful.
+    """The table [vision.tag]: the tag, or what all tags of a cluster have in common.
 
     Attributes:
         dictionary: which tags there are.
@@ -25,28 +25,12 @@ class TagConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
         side_m: side of its black square as printed [m]: measure it.
         side_sigma_m: how far that may be off, 1-sigma [m]: a caliper on printed edges. One camera takes all distances
             from it.
-        min_side_px: a shorter side is too small to be measured [px].
-        min_contrast: least difference of white and black [grey levels].
-        min_visible: share of each edge that has to be on a line.
-        max_corner_sigma: largest 1-sigma of a corner, as a share of the side: edges that are not straight.
-        epipolar_px: largest difference of the eyes' rows [px], on top of the noise ...
-        epipolar_sigmas: ... which counts this many times.
-        size_tolerance: largest part by which the printed size may contradict the stereo depth, on top of its noise.
-        max_reprojection: largest misfit of the corners to the marker's shape, in units of their own sigma (RMS).
     """
 
     dictionary: Dictionary = "apriltag_36h11"
     id: Annotated[int, Meta(ge=0)] = 0
     side_m: Positive = 0.04
     side_sigma_m: Annotated[float, Meta(ge=0)] = 0.0001
-    min_side_px: Annotated[float, Meta(ge=12)] = 16.0
-    min_contrast: Annotated[float, Meta(ge=10)] = 20.0
-    min_visible: Annotated[float, Meta(ge=0.5, le=1)] = 0.7
-    max_corner_sigma: Positive = 0.05
-    epipolar_px: Annotated[float, Meta(ge=0)] = 0.5
-    epipolar_sigmas: Annotated[float, Meta(ge=0)] = 4.0
-    size_tolerance: Annotated[float, Meta(ge=0)] = 0.03
-    max_reprojection: Positive = 4.0
 
 
 class PlacedTag(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -20,7 +20,6 @@ from scipy.special import ndtr
 
 from bodyschema.interfaces.records import FloatArray, ImageArray, Reason
 
-from .config import TagConfig
 from .settings import EdgeSettings as _Settings
 
 # Black border, data and border of all dictionaries that are offered: 6 + 2 modules.
@@ -145,7 +144,7 @@ class _Points:
 
 
 def find_edges(
-    grey: ImageArray, corners_px: FloatArray, blur_px: float, light: Light | None, shorter: float, config: TagConfig
+    grey: ImageArray, corners_px: FloatArray, blur_px: float, light: Light | None, shorter: float
 ) -> Edges | Reason:
     """Measure the edges from each corner to the next one, or return the reason why one cannot be measured.
 
@@ -167,7 +166,7 @@ def find_edges(
         return Reason.AT_BORDER
     profiles = sampled(grey, rays.spots)
     if light is None:
-        points = _rough_points(profiles, rays, blur_px, config.min_contrast)
+        points = _rough_points(profiles, rays, blur_px)
     else:
         ways = np.stack([0.5 * lengths[:, None] * along, normals], axis=2)
         unlit = np.einsum("eiw,kij,ejw->ekw", ways, light.cov, ways)
@@ -175,10 +174,10 @@ def find_edges(
         ideal = _ideal(rays.spots, origins, normals, blur_px)
         cumulants = PIXEL_CUMULANT * (normals**4).sum(axis=1) / blur_px**4
         lit = light.gradients @ ways
-        points = _points(profiles, ideal, rays, beyond, blur_px, cumulants, lit, unlit, config.min_contrast)
+        points = _points(profiles, ideal, rays, beyond, blur_px, cumulants, lit, unlit)
     if isinstance(points, Reason):
         return points
-    fitted = _fitted(rays, points, config)
+    fitted = _fitted(rays, points)
     if isinstance(fitted, Reason):
         return fitted
     ends = np.stack([rays.s[:, 0], rays.s.max(axis=1)], axis=1)[..., None]
@@ -294,14 +293,14 @@ def _interpolated(pixels: list[FloatArray], parts: FloatArray) -> FloatArray:
     return np.asarray(top + (bottom - top) * down, np.float64)
 
 
-def _rough_points(profiles: FloatArray, rays: _Rays, blur_px: float, min_contrast: float) -> _Points | Reason:
+def _rough_points(profiles: FloatArray, rays: _Rays, blur_px: float) -> _Points | Reason:
     """Return the points from the share of black on each line (4, n, m): rough, but from anywhere on the lines."""
     samples = rays.weights.sum(axis=1)[:, None]
     plain = np.maximum(1.0, np.rint(0.5 * _Settings.plain * samples))
     number = np.arange(rays.weights.shape[1])
     ends = np.stack([number < plain, (number >= samples - plain) & (number < samples)], axis=1) / plain[..., None]
     black, white = np.einsum("enm,ekm,en->ke", profiles, ends, rays.used) / rays.counts
-    if (white - black).min() < 0.5 * min_contrast:
+    if (white - black).min() < 0.5 * _Settings.least_contrast:
         return Reason.LOW_CONTRAST
     step = rays.steps[:, 1] - rays.steps[:, 0]
     shares = (white[:, None, None] - profiles) / (white - black)[:, None, None]
@@ -324,7 +323,6 @@ def _points(
     cumulants: FloatArray,
     gradients: FloatArray,
     unlit: FloatArray,
-    min_contrast: float,
 ) -> _Points | Reason:
     """Return the edges' points on the lines across them, or the reason why there are none: too little contrast.
 
@@ -350,7 +348,7 @@ def _points(
     slopes = gradients[:, None, :, 1:] * rays.steps[:, None, None]
     profiles = profiles - (lit[..., :1] + slopes[:, :, 0]) * (1.0 - side) - (lit[..., 1:] + slopes[:, :, 1]) * side
     black, white = np.moveaxis(levels(profiles), 2, 0)
-    if rays.mean(white - black).min() < min_contrast:
+    if rays.mean(white - black).min() < _Settings.least_contrast:
         return Reason.LOW_CONTRAST
     around = rays.steps[:, None]
     cumulant = cumulants[:, None, None]
@@ -361,7 +359,7 @@ def _points(
     fitted = levels(cleared)
     contrast = fitted[..., 1] - fitted[..., 0]
     usual = rays.mean(contrast)[:, None]
-    if usual.min() < min_contrast:
+    if usual.min() < _Settings.least_contrast:
         return Reason.LOW_CONTRAST
     contrast = np.maximum(contrast, 0.5 * usual)
     own = cleared @ filters.mT
@@ -434,14 +432,14 @@ def _line_filters(s: FloatArray, kept: Mask) -> FloatArray:
 
 
 def _fitted(
-    rays: _Rays, points: _Points, config: TagConfig
+    rays: _Rays, points: _Points
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, tuple[FloatArray, ...]] | Reason:
     """Fit lines through the points; return the reason if there is none.
 
     The result is `places`, `slopes`, `scatter`, `shared` and `residuals`, see `Edges`.
     """
     kept = points.clear
-    fewest = np.maximum(config.min_visible * rays.counts, _Settings.fewest_points - 1)
+    fewest = np.maximum(_Settings.least_visible * rays.counts, _Settings.fewest_points - 1)
     for _ in range(3):
         if (kept.sum(axis=1) < fewest).any():
             return Reason.OCCLUDED

@@ -52,7 +52,7 @@ class TagFinder:
         else:
             detector = _detector(cv2.aruco.getPredefinedDictionary(self._others[name]), exact=True)
             large = [
-                quad for _, quad in _seen(detector, grey) if cv2.arcLength(quad, True) > 4.0 * self._config.min_side_px
+                quad for _, quad in _seen(detector, grey) if cv2.arcLength(quad, True) > 4.0 * _Settings.least_side_px
             ]
             reason = Reason.OTHER_FAMILY if large else None
         if reason is None:

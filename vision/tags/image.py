@@ -60,7 +60,7 @@ def _measured(
     light: Light | None = None
     number, before_px = 0, math.inf
     while True:
-        edges = find_edges(grey, corners_px, blur_px, light, shorter, config)
+        edges = find_edges(grey, corners_px, blur_px, light, shorter)
         if isinstance(edges, Reason):
             return edges
         number += 1
@@ -80,12 +80,12 @@ def _measured(
             break
         before_px = moved_px
     shortest_px = 2.0 * float(edges.half_lengths.min())
-    if shortest_px < config.min_side_px:
+    if shortest_px < _Settings.least_side_px:
         return Reason.NO_MARKER
     bled_px, bled_var = bleed(grey, corners_px, blur_px, tag_modules(config.dictionary, id))
     edges = replace(edges, places=edges.places + bled_px)
     cov_px = _corner_covariance(edges, bled_var)
-    if math.sqrt(float(np.diag(cov_px).max())) > config.max_corner_sigma * shortest_px:
+    if math.sqrt(float(np.diag(cov_px).max())) > _Settings.most_corner_sigma * shortest_px:
         return Reason.BLURRED if blur_px * MODULES > _Settings.most_blur * shortest_px else Reason.NOT_STRAIGHT
     return TagImage(id, _meetings(edges), cov_px)
 

@@ -12,6 +12,8 @@ class EdgeSettings:
     `sharpest_px` at 3 times.
     """
 
+    least_contrast = 20.0  # difference of white and black [grey levels]
+    least_visible = 0.7  # share of each edge that has to be on a line
     # Distance in blurs that lines across an edge keep from the ends of black border and white margin (one module each),
     # so that little of the modules beyond shows; on small tags they reach over this share of the module. Their distance
     # in blurs from the tag's corners, which are rounded off: at 1.8 without noise tags come out larger by 0.0004 px an
@@ -44,6 +46,11 @@ class TagSettings:
     at 0.3 times (sigma + 32 %). The numbers of search and pose change nothing there.
     """
 
+    least_side_px = 16.0  # a shorter side is too small to be measured
+    most_corner_sigma = 0.05  # 1-sigma of a corner, as a share of the side: edges that are not straight have more
+    epipolar_px, epipolar_sigmas = 0.5, 4.0  # largest difference of the eyes' rows [px], on top of so many sigmas
+    size_tolerance = 0.03  # largest part by which the printed size may contradict the stereo depth, besides noise
+    most_reprojection = 4.0  # largest misfit of the corners to the marker's shape (RMS, in their own sigmas)
     # Most rounds with rough corners, and half of all; converged when no corner would move by more than this [px].
     rounds, settled_px = 4, 0.003
     rough_share = 0.3  # corners are rough until they move by less than this share of a module

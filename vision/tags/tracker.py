@@ -182,7 +182,7 @@ class TagTracker:
         rows = np.arange(1, len(left.cov_px), 2)
         cov = (left.cov_px + right.cov_px)[np.ix_(rows, rows)]
         sigma = math.sqrt(float(cov.mean()) + 2.0 * self.calibration.pixel_sigma**2)
-        allowed = self.config.epipolar_px + self.config.epipolar_sigmas * sigma
+        allowed = _Settings.epipolar_px + _Settings.epipolar_sigmas * sigma
         return abs(float(apart[:, 1].mean())) <= allowed and bool((apart[:, 0] > 0.0).all())
 
     def _pose(self, t: float, seen: list[dict[int, TagImage]]) -> Pose | Reason:
@@ -210,11 +210,11 @@ class TagTracker:
             return Reason.EPIPOLAR if self.calibration.is_stereo else Reason.REPROJECTION
         best = poses[0]
         freedom = sum(sighting.pixels.size for sighting in sightings) - 6
-        misfit, most = best.squares / freedom, self.config.max_reprojection**2
+        misfit, most = best.squares / freedom, _Settings.most_reprojection**2
         if self.calibration.is_stereo:
             grown, sigma = estimator.scale(best)
             by_size = misfit > most and grown**2 > 0.5 * best.squares * sigma**2  # the larger part of the misfit
-            if by_size or abs(grown) > self.config.size_tolerance + 4.0 * sigma:
+            if by_size or abs(grown) > _Settings.size_tolerance + 4.0 * sigma:
                 return Reason.SIZE_MISMATCH
         if misfit > most:
             return Reason.REPROJECTION
