@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 
 from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, StereoFrame
+from bodyschema.vision.ball.settings import PatchSettings
 from bodyschema.vision.ball.sphere import Pinhole
 from bodyschema.vision.config import VisionConfig
 from bodyschema.vision.tracker import StereoTracker

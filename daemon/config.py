@@ -6,10 +6,12 @@ word), then the file.
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 import tomllib
 from collections.abc import Mapping
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -23,7 +25,7 @@ from bodyschema.learning.config import LearnerConfig
 from bodyschema.robot.calibrated_files import EXTENSIONS
 from bodyschema.robot.description import CameraSection, RobotDescription, RobotSection
 from bodyschema.robot.suggest import did_you_mean, hint_at, with_choices
-from bodyschema.robot.toml_file import Count, Positive, convert, line_of, line_of_endless_key, read_toml
+from bodyschema.robot.toml_file import Positive, convert, line_of, line_of_endless_key, read_toml
 from bodyschema.sim_backend.config import SimConfig
 from bodyschema.vision.config import VisionConfig
 
@@ -32,6 +34,8 @@ from .transport.zenoh_config import ZenohConfig
 
 if TYPE_CHECKING:
     from bodyschema.effects import Simulation
+
+log = logging.getLogger(__name__)
 
 ENVIRONMENT = "BODYSCHEMA_"
 # Control points of a map that the learner keeps up with: 12 joints that turn. Learning and replaying a pair take 25 ms
@@ -57,14 +61,36 @@ class DaemonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # joints that move farther than this while the time of a frame is uncertain (1-sigma, and what lies between the two
     # eyes' images) are too fast for a pair
     max_time_error_deg: Positive = 0.2
-    segment_gap_s: Positive = 1.0  # a pause between pairs longer than this starts a new segment
-    keep_days: Positive | None = None  # pairs older than this are deleted; without it, age does not matter
-    # maximum size of the store in 10^6 bytes; the oldest pairs beyond it are deleted. Without it, the disk is the
-    # limit.
+    # pairs older than this are deleted, but never the newest 20,000; without it, age does not matter
+    keep_days: Positive | None = None
+    # maximum size of the store in 10^6 bytes; the oldest pairs beyond it are deleted, but never the newest 20,000.
+    # Without it, the disk is the limit.
     keep_mb: Positive | None = None
-    keep_newest: Count = 20_000  # this number of newest pairs is kept whatever their age and size
 
 
+# Keys of earlier versions by their tables, whose values are fixed now. The next release knows them no more.
+RETIRED = {
+    ("daemon",): ("segment_gap_s", "keep_newest"),
+    ("drivers", "dynamixel"): ("max_speed_deg_s", "max_move_deg"),
+    ("drivers", "dynamixel", "zero_force"): ("doubtful_cycles", "ramp_s", "overcurrent_s"),
+    ("drivers", "dynamixel", "gaze"): ("doubtful_cycles", "stale_s", "blocked_s", "blocked_deg"),
+    ("drivers", "feetech"): ("max_speed_deg_s", "max_move_deg"),
+    ("drivers", "serial_lines"): ("max_speed_deg_s", "max_move_deg"),
+    ("drivers", "ros2"): ("max_gap_s", "max_speed_deg_s", "max_speed_m_s"),
+    ("drivers", "ros2", "marker"): ("rate_hz",),
+    ("vision",): (
+        *("min_pixels", "border_margin_px", "min_visible", "max_centre_sigma_px", "max_candidates"),
+        *("epipolar_px", "epipolar_sigmas", "eye_size_ratio", "depth_size_ratio", "max_speed_m_s"),
+    ),
+    ("vision", "tag"): (
+        *("min_side_px", "min_contrast", "min_visible", "max_corner_sigma", "epipolar_px", "epipolar_sigmas"),
+        *("size_tolerance", "max_reprojection"),
+    ),
+    ("vision", "cameras", "two"): ("max_apart_s",),
+    ("learner",): ("step_size", "seed"),
+    ("sim", "camera"): ("scene_step", "supersampling"),
+    ("sim", "guide"): ("force_limit_n", "torque_limit_nm", "gaze_speed_rad_s"),
+}
 # A larger radius is one of another unit [m].
 LARGEST_BALL_M = 0.5
 
@@ -109,6 +135,7 @@ class Config:
             if name not in known:
                 line = line_of(text, (name,))
                 raise ConfigError(f"unknown table [{name}]", file=file, line=line, remedy=did_you_mean(name, known))
+        raw = _without_retired(raw, file, text)
         overridden = _override(raw, [name for name in known if name not in (*EXTENSIONS, MARKER_SOURCE)], environment)
         robot = RobotDescription.from_tables(overridden, text, file)
         extended = None
@@ -285,11 +312,28 @@ def _require_size(robot: RobotDescription, tables: Tables, vision: Mapping[str, 
         )
 
 
+def _without_retired(raw: dict[str, Any], file: Path, text: str) -> dict[str, Any]:
+    """Return the tables without the keys of earlier versions; the log says of each that its value is not used."""
+    tables = deepcopy(raw)
+    for path, keys in RETIRED.items():
+        table: Any = tables
+        for name in path:
+            table = table.get(name) if isinstance(table, dict) else None
+        for key in keys if isinstance(table, dict) else ():
+            if key in table:
+                del table[key]
+                where = f"{file}:{line_of(text, (*path, key))}: [{'.'.join(path)}] {key}"
+                log.warning("%s is no key any more, and its value is not used. Delete the line", where)
+    return tables
+
+
 def _override(raw: dict[str, Any], known: list[str], environment: Mapping[str, str]) -> dict[str, Any]:
     merged = {name: dict(table) if isinstance(table, dict) else table for name, table in raw.items()}
     for variable, value in environment.items():
         table, _, key = variable.removeprefix(ENVIRONMENT).lower().partition("_")
-        if variable.startswith(ENVIRONMENT) and table in known and key:
+        if key in RETIRED.get((table,), ()):
+            log.warning("%s is no key any more, and its value is not used", variable)
+        elif variable.startswith(ENVIRONMENT) and table in known and key:
             merged.setdefault(table, {})[key] = _checked(variable, table, key, _toml_value(value))
     return merged
 

@@ -14,6 +14,7 @@ from .turns import nearest_turn
 log = logging.getLogger(__name__)
 
 LOST_AFTER_S = 0.25  # without a reading; no joint makes half a turn unnoticed in this time
+MOST_MOVED_DEG = 30  # while nothing was read; beyond it the nearest turn may be another one
 LOOK_AGAIN_S = 1.0  # period of checking if a joint was turned back
 
 
@@ -51,17 +52,14 @@ class TurnCount:
         lost: a joint that is not where it was, so that the user must confirm its turn.
     """
 
-    def __init__(
-        self, limits: Sequence[tuple[float, float]], last_pose: Sequence[float] | None, max_move_deg: float, table: str
-    ) -> None:
+    def __init__(self, limits: Sequence[tuple[float, float]], last_pose: Sequence[float] | None) -> None:
         """Start without a reading.
 
         Args:
             limits: of each joint [rad]; a range below one turn determines the turn.
             last_pose: joint angles of the last session [rad], shape (d,).
-            max_move_deg: how far a joint may have moved since then, where only the nearest turn determines it.
         """
-        self._limits, self._max_move_deg, self._table = list(limits), max_move_deg, table
+        self._limits = list(limits)
         self.pose = None if last_pose is None else [float(q) for q in last_pose]
         self.counts: list[int] = []
         self._sensors: list[Sensor] = []
@@ -96,16 +94,15 @@ class TurnCount:
             if self._is_within_a_turn(place):
                 continue
             was, now = self.pose[place], sensor.angle(count)
-            if abs(now - was) > math.radians(self._max_move_deg) and self._is_accepted:
+            if abs(now - was) > math.radians(MOST_MOVED_DEG) and self._is_accepted:
                 log.warning("joint %r: at %.0f°, as a command stated", sensor.joint, math.degrees(now))
-            elif abs(now - was) > math.radians(self._max_move_deg):
+            elif abs(now - was) > math.radians(MOST_MOVED_DEG):
                 self.lost = sensor.joint
                 raise SourceLost(
                     f"joint {sensor.joint!r} ({sensor.label}) was at {math.degrees(was):.0f}° and is now at "
                     f"{math.degrees(now):.0f}°, or whole turns from there: its turn count is lost. "
-                    f"Turn it back to within {self._max_move_deg:.0f}° of where it was. If it really is at "
-                    f"{math.degrees(now):.0f}°: `bodyschema command accept_turns` while the sampler runs, "
-                    f"else max_move_deg = 179 in [{self._table}]",
+                    f"Turn it back to within {MOST_MOVED_DEG}° of where it was. If it really is at "
+                    f"{math.degrees(now):.0f}°: `bodyschema command accept_turns` while the sampler runs",
                     retry_s=LOOK_AGAIN_S,
                 )
             if count != raw[place]:

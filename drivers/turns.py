@@ -5,6 +5,9 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+# No joint of an arm that a hand guides moves faster, turning or sliding: 3 to 10 times what arms reach by motor.
+FASTEST_RAD_S, FASTEST_M_S = math.radians(600.0), 3.0
+
 
 def nearest_turn(raw: int, near: float, per_turn: int | None) -> int:
     """Return `raw` plus whole turns, nearest to `near` [ticks]; `raw` itself for a sensor that does not wrap."""

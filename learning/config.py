@@ -13,7 +13,6 @@ from bodyschema.robot.toml_file import Count, Positive
 class LearnerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The table [learner]."""
 
-    step_size: Annotated[float, Meta(gt=0, lt=2)] = 0.5  # μ0 of the normalised LMS rule, between 0 and 2
     # how often stored pairs are learnt again, on average, for every new one
     replays_per_pair: Annotated[float, Meta(ge=0, le=1000)] = 8.0
     # how many of the newest pairs are kept for replay; the default takes 0.1 GB with seven joints
@@ -27,4 +26,3 @@ class LearnerConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # the same for each coordinate of the marker on the hand and of the cameras' place
     place_tolerance_m: Positive = 0.03
     checkpoint_every_s: Positive = 5.0  # time between checkpoints
-    seed: int = 0  # of the replay's permutations

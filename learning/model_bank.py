@@ -44,11 +44,10 @@ class ModelBank:
         delayed: map of the instant learner when the current solutions were requested; None before any.
     """
 
-    def __init__(self, prior: KBMap, step_size: float) -> None:
-        self._step_size = step_size
+    def __init__(self, prior: KBMap) -> None:
         self._fixed = {PRIOR: prior}
         self._residual: LearntModel | None = None
-        self._instant = NLMS(prior, step_size)
+        self._instant = NLMS(prior)
         self._instant_map: KBMap | None = prior
         self._asked: KBMap | None = None
         self.delayed: KBMap | None = None
@@ -135,9 +134,9 @@ class ModelBank:
         maps = {name: KBMap(self.prior.bases, net) for name, net in nets.items()}
         self._residual, self.delayed, self._instant_map = residual, maps.pop(_DELAYED, None), maps.pop(INSTANT)
         self._fixed |= maps
-        self._instant = NLMS(self._instant_map, self._step_size)
+        self._instant = NLMS(self._instant_map)
 
     def _begun_again(self) -> KBMap:
         """Return the map of an instant learner restarted from the prior."""
-        self._instant, self._instant_map = NLMS(self.prior, self._step_size), self.prior
+        self._instant, self._instant_map = NLMS(self.prior), self.prior
         return self._instant_map

@@ -75,7 +75,7 @@ class Regime:
         settings: LearnerConfig,
         task_numbers: Iterator[int],
     ) -> None:
-        self.models = ModelBank(prior, settings.step_size)
+        self.models = ModelBank(prior)
         self.memory = PairMemory(prior.joints, settings.replay_capacity)
         self.gate = OutlierGate(prior.joints)
         self.orientations = Orientations(arm.chain.chain)
@@ -86,7 +86,7 @@ class Regime:
         claims.expect(arm.chain)
         self._met: list[tuple[Pair, FloatArray]] = []
         self._limit_m = math.inf
-        self._order = Permutations(settings.seed)
+        self._order = Permutations(0)
         self._replays_due = 0.0
         self._solver_prior: KBMap | None = None
         self._task_numbers = task_numbers

@@ -49,9 +49,6 @@ class CameraConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     rate_hz: Rate = 30  # stereo frames a second
     noise: NonNegative = 2.0  # 1-sigma of the image noise [grey levels]
     clutter: Annotated[int, Meta(ge=0, le=1000)] = 60  # number of coloured objects in the background; 0 is a plain wall
-    # 2: the arm is rendered at half resolution, except around the marker; 1 takes four times as long
-    scene_step: Annotated[int, Meta(ge=1, le=4)] = 2
-    supersampling: Annotated[int, Meta(ge=1, le=8)] = 3  # samples across one pixel around the marker
     # how brightly all but the marker is lit; with less than 1 a ball glows, as a lamp does
     light: Annotated[float, Meta(gt=0, le=1)] = 1.0
     ball_radius_m: Positive | None = None  # radius of the marker ball [m]; without this key, as [vision] has it
@@ -94,10 +91,7 @@ class GuideConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
     # speed in joint space, Euclidean norm over all learnt joints, the gaze's included [rad/s]
     speed_rad_s: Positive = 0.87
-    force_limit_n: Positive = 80.0  # strongest pull at wrist and elbow [N]
-    torque_limit_nm: Positive = 15.0  # strongest twist at the wrist [N·m]
     gravity_compensation: bool = True  # the arm's drives bear its weight (zero-force mode); otherwise the hand has to
-    gaze_speed_rad_s: Positive = 1.5  # greatest speed of each head joint [rad/s]
 
 
 class ToolChange(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

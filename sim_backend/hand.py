@@ -34,6 +34,7 @@ class _Settings:
     # grip.
     frequency: float = 16.0
     damping_ratio: float = 0.8
+    force_limit_n, torque_limit_nm = 80.0, 15.0  # strongest pull at wrist and elbow, and twist at the wrist
     # Time constant of the friction in the joints [s].
     friction_time_s: float = 0.15
 
@@ -203,7 +204,7 @@ class VirtualHand:
         self._body.bullet.applyExternalForce(
             self._body.id,
             self._body.links[link],
-            _limited(force, self._config.force_limit_n).tolist(),
+            _limited(force, _Settings.force_limit_n).tolist(),
             x.tolist(),
             self._body.bullet.WORLD_FRAME,
             physicsClientId=self._body.client,
@@ -213,7 +214,7 @@ class VirtualHand:
         self._body.bullet.applyExternalTorque(
             self._body.id,
             self._body.links[link],
-            _limited(torque, self._config.torque_limit_nm).tolist(),
+            _limited(torque, _Settings.torque_limit_nm).tolist(),
             self._body.bullet.WORLD_FRAME,
             physicsClientId=self._body.client,
         )

@@ -170,7 +170,7 @@ class Physics:
             self._seen = self.body if self._paths.plain else stack.enter_context(Body(self.urdf, robot.joints))
             roles = JointRoles.of(robot)
             self._gazing = list(roles.gaze)
-            self._gaze = Gaze(robot, self._calibration, roles.gaze, config.guide.gaze_speed_rad_s)
+            self._gaze = Gaze(robot, self._calibration, roles.gaze)
             self.sight = Sight(self._truth, self._calibration, roles, self._gaze, watched, config.camera)
             self._path = GuidePath(
                 self.sight,

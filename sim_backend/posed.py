@@ -165,7 +165,7 @@ def visible_postures(
     guided, gaze = list(roles.guided), list(roles.gaze)
     found: list[FloatArray] = []
     with Body(physics_urdf(truth), robot.joints) as body:
-        looking = Gaze(robot, calibration, roles.gaze, config.guide.gaze_speed_rad_s)
+        looking = Gaze(robot, calibration, roles.gaze)
         sight = Sight(truth, calibration, roles, looking, body, config.camera)
         for _ in range(_Settings.most_batches):
             q = np.tile((robot.lower + robot.upper) / 2, (_Settings.batch, 1))

@@ -29,6 +29,7 @@ class _Settings:
     # Rays begin this far from the eye [m], outside of the head's own shape, and go to the ball's middle and rim.
     ray_start_m: float = 0.06
     rim: float = 0.8
+    speed_rad_s: float = 1.5  # greatest speed of each head joint
 
 
 class Gaze:
@@ -37,15 +38,11 @@ class Gaze:
     Args:
         robot: the description; the gaze uses only its nominal model.
         joints: indices of the gazing joints in q; may be empty.
-        speed_rad_s: maximum speed of each joint [rad/s].
     """
 
-    def __init__(
-        self, robot: RobotDescription, calibration: StereoCalibration, joints: tuple[int, ...], speed_rad_s: float
-    ) -> None:
+    def __init__(self, robot: RobotDescription, calibration: StereoCalibration, joints: tuple[int, ...]) -> None:
         self._robot = robot
         self._joints = list(joints)
-        self._speed = speed_rad_s
         self._pointing = Pointing(calibration, joints, robot.lower[self._joints], robot.upper[self._joints])
         self._chain = robot.chain
 
@@ -67,7 +64,7 @@ class Gaze:
         if not self._joints:
             return command
         step = _Settings.track_gain * self._pointing.step(q[None], self._chain.positions)[0]
-        return self._pointing.clipped(command + np.clip(step, -self._speed * dt, self._speed * dt))
+        return self._pointing.clipped(command + np.clip(step, -_Settings.speed_rad_s * dt, _Settings.speed_rad_s * dt))
 
 
 def nominal_chain(robot: RobotDescription, marker_xyz: FloatArray) -> RigidChain:

@@ -166,7 +166,7 @@ class SamplerRules:
         rules = self._config.tables.daemon
         most_bytes = None if rules.keep_mb is None else 1e6 * rules.keep_mb
         with self._deciding:
-            deleted = self._store.trim(Keep(rules.keep_days, most_bytes, rules.keep_newest), self._wall.utc())
+            deleted = self._store.trim(Keep(rules.keep_days, most_bytes), self._wall.utc())
         if deleted:
             log.info("the oldest %d pairs were deleted, as [daemon] keep_days and keep_mb say", deleted)
 

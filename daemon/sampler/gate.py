@@ -14,6 +14,7 @@ from .align import joint_difference
 
 # This many consecutive fixes that agree with each other, but not with the previous position, are accepted.
 CONFIRMATIONS = 3
+SEGMENT_GAP_S = 1.0  # a longer pause between pairs starts a new segment
 
 
 class _Fix(NamedTuple):
@@ -26,12 +27,12 @@ class Gate:
 
     A step is the Euclidean norm over all joints in degrees; prismatic joints count with `metres_per_degree`. A step
     below `min_step_deg` is not a pair, also across a restart or a gap, so that an arm at rest does not fill the store.
-    A step above `max_step_deg`, a pause longer than `segment_gap_s`, a `break_segment` and a marker that jumped start a
+    A step above `max_step_deg`, a pause of more than a second, a `break_segment` and a marker that jumped start a
     new segment.
 
     A marker that moved faster than `max_marker_speed_m_s` from its last accepted position is refused. It is accepted
     again after `CONFIRMATIONS` consecutive fixes that agree with each other (a tool change), when it could have moved
-    there in the elapsed time, or after `segment_gap_s`.
+    there in the elapsed time, or after that pause.
 
     With `any_step`, neither step nor speed is checked: a static recording has no path between its poses.
     """
@@ -72,7 +73,7 @@ class Gate:
             step_deg = float(np.linalg.norm(joint_difference(q, self._q, self._prismatic) * self._degrees_per_unit))
         if step_deg < rules.min_step_deg and not rules.any_step:
             return Reason.TOO_NEAR
-        paused = self._t is None or t - self._t > rules.segment_gap_s
+        paused = self._t is None or t - self._t > SEGMENT_GAP_S
         if self._broken or paused or step_deg > rules.max_step_deg:
             self.segment += 1
         self._t, self._q, self._broken = t, q, False
@@ -85,7 +86,7 @@ class Gate:
     def _believe(self, fix: _Fix) -> bool:
         jumped = self._reachable(self._suspect, fix)
         last = self._believed
-        if last is not None and fix.t - last.t <= self._rules.segment_gap_s and not self._reachable(last, fix):
+        if last is not None and fix.t - last.t <= SEGMENT_GAP_S and not self._reachable(last, fix):
             self._suspects = self._suspects + 1 if jumped else 1
             self._suspect = fix
             if self._suspects < CONFIRMATIONS:

@@ -6,12 +6,10 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar, Literal
 
-import msgspec
-
-from bodyschema.drivers.servos.config import ServoConfig, ServosConfig
+from bodyschema.drivers.servos.config import ServoBusConfig, ServoConfig, ServosConfig
 from bodyschema.drivers.servos.model import Model
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.robot.toml_file import NonNegative, line_of
+from bodyschema.robot.toml_file import line_of
 
 from .models import BY_NAME, UNSUPPORTED
 from .powered_config import GazeConfig, ZeroForceConfig
@@ -23,13 +21,10 @@ CYCLES_PER_HEARTBEAT = 4
 Baud = Literal[9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000]
 
 
-class BusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class BusConfig(ServoBusConfig, frozen=True, forbid_unknown_fields=True):
     """The table [drivers.dynamixel.buses.<name>]: a port with servos behind it."""
 
-    port: str  # best one of /dev/serial/by-id, which stays the same when it is plugged in again
     baud: Baud = 1_000_000  # as the servos are set [bit/s]
-    # how long the adapter holds bytes back; without this key the system's value is used
-    latency_ms: NonNegative | None = None
     fast_sync_read: Literal["auto", "never"] = "auto"  # `auto` tests once if the servos support it
 
 

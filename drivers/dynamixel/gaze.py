@@ -22,6 +22,11 @@ SPEED_MARGIN = 3.0  # a head that moves this many times faster than commanded is
 STEP_BASE_S = 0.05  # a longer pause between two cycles moves the head no farther than this one
 
 
+class _Settings:
+    stale_s = 0.5  # without a newer target for this long, the head stands still
+    blocked_s, blocked_deg = 1.0, 15.0  # torque goes off when the head stays this far from its command for this long
+
+
 class Gaze(PoweredJoints):
     """Joints that turn the head towards the latest `aim`; see `PoweredJoints`.
 
@@ -46,14 +51,12 @@ class Gaze(PoweredJoints):
         guard = GuardLimits(
             joints=tuple(self._head),
             heartbeat_s=gaze.heartbeat_s,
-            doubtful_cycles=gaze.doubtful_cycles,
             max_speed=np.full(count, SPEED_MARGIN * speed),
             current_limit=np.full(count, math.inf),
-            overcurrent_s=math.inf,
             max_temperature_c=gaze.max_temperature_c,
         )
         super().__init__(gaze, self._head, Guard(guard), clock)
-        self._gaze, self._speed = gaze, speed
+        self._speed = speed
         narrow = [gaze.limits_deg.get(joint, (-math.inf, math.inf)) for joint in self._head]
         wide = [limits[list(joints).index(joint)] for joint in self._head]
         self.lower = frozen_array([max(w[0], math.radians(n[0])) for w, n in zip(wide, narrow, strict=True)])
@@ -119,18 +122,18 @@ class Gaze(PoweredJoints):
         if self._aim is None:
             return command
         t, angles = self._aim
-        if now - t > self._gaze.stale_s or angles.shape != command.shape or not np.isfinite(angles).all():
+        if now - t > _Settings.stale_s or angles.shape != command.shape or not np.isfinite(angles).all():
             return command
         aim = np.clip(angles, self.lower, self.upper)
         return command + np.clip(aim - command, -self._speed * dt, self._speed * dt)
 
     def _check_astray(self, now: float, off: FloatArray) -> None:
         worst = int(np.argmax(off))
-        if off[worst] <= math.radians(self._gaze.blocked_deg):
+        if off[worst] <= math.radians(_Settings.blocked_deg):
             self._astray_s = math.inf
             return
         self._astray_s = min(self._astray_s, now)
-        if now - self._astray_s > self._gaze.blocked_s:
+        if now - self._astray_s > _Settings.blocked_s:
             raise Drop(
                 f"joint {self._head[worst]!r} stays {math.degrees(off[worst]):.0f}° from where it should be. Free it"
             )

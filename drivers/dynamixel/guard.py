@@ -15,6 +15,9 @@ from bodyschema.interfaces.records import FloatArray, frozen_array
 SHORTEST_BASE_S = 0.02  # shortest interval for a speed from positions: one tick is 4°/s at most
 CURRENT_SLACK, CURRENT_SLACK_A = 0.15, 0.05  # allowance for the servo's own current regulation
 REFUSALS = 3  # consecutive goals that a servo ignored
+DOUBTFUL_CYCLES = 10  # consecutive checks without a reading
+RAMP_S = 1.0  # duration of the ramp of the currents
+OVERCURRENT_S = 0.5  # time that a current exceeds its limit
 
 
 class Drop(Exception):
@@ -27,10 +30,8 @@ class GuardLimits:
 
     joints: tuple[str, ...]  # names, in the order of all arrays (n,)
     heartbeat_s: float  # longest time between two checks
-    doubtful_cycles: int  # torque goes off after this many consecutive checks without a reading
     max_speed: FloatArray  # of each joint [rad/s]
     current_limit: FloatArray  # of each joint [A]; infinite where it is not monitored
-    overcurrent_s: float  # longest time that a current may exceed its limit
     max_temperature_c: float  # a servo at this or above is too hot
 
 
@@ -110,7 +111,7 @@ class Guard:
             )
         if motion is None:
             self._doubts += 1
-            if self._doubts >= self._limits.doubtful_cycles:
+            if self._doubts >= DOUBTFUL_CYCLES:
                 raise Drop(
                     f"{self._doubts} readings in a row could not be believed. "
                     "Look at cable and supply: `bodyschema doctor`"
@@ -151,7 +152,7 @@ class Guard:
                 self._over_since[place] = math.inf
                 continue
             self._over_since[place] = min(self._over_since[place], t)
-            if t - self._over_since[place] >= self._limits.overcurrent_s:
+            if t - self._over_since[place] >= OVERCURRENT_S:
                 raise Drop(
                     f"joint {joint!r} drew {current[place]:.2f} A for {t - self._over_since[place]:.1f} s "
                     f"({self._limits.current_limit[place]:.2f} A are allowed). Free the joint"
@@ -176,7 +177,7 @@ class Currents:
     """Currents that carry the arm: within their limits, ramped up from zero."""
 
     def __init__(
-        self, joints: Sequence[str], torque_constant: FloatArray, current_limit: FloatArray, ramp_s: float, share: float
+        self, joints: Sequence[str], torque_constant: FloatArray, current_limit: FloatArray, share: float
     ) -> None:
         """Store arrays of shape (n,).
 
@@ -187,7 +188,7 @@ class Currents:
         """
         self._joints = tuple(joints)
         self._constant, self._limit = torque_constant, current_limit
-        self._ramp_s, self._share = ramp_s, share
+        self._share = share
         self._begin_s = math.inf
         self.saturated: tuple[str, ...] = ()
 
@@ -197,7 +198,7 @@ class Currents:
 
     def share(self, now: float) -> float:
         """Return the share of the torque that is applied at `now` [s]."""
-        return self._share * min(max((now - self._begin_s) / self._ramp_s, 0.0), 1.0)
+        return self._share * min(max((now - self._begin_s) / RAMP_S, 0.0), 1.0)
 
     def at(self, now: float, torques: FloatArray) -> FloatArray:
         """Return the currents [A] (n,) for the torques that hold the arm [N·m] (n,).

@@ -39,8 +39,6 @@ class PoweredConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     # (Bus Watchdog, steps of 20 ms)
     heartbeat_ms: Heartbeat = 100.0
     max_temperature_c: Annotated[float, Meta(gt=0, le=80)] = 65.0  # torque goes off when a servo is hotter
-    # torque goes off after this many consecutive rejected readings
-    doubtful_cycles: Annotated[int, Meta(ge=1, le=100)] = 10
 
     @property
     def heartbeat_s(self) -> float:
@@ -59,9 +57,6 @@ class ZeroForceConfig(PoweredConfig, frozen=True, forbid_unknown_fields=True, kw
     # those that carry the arm; the torque of the others stays off
     joints: Annotated[dict[str, FloatingJoint], Meta(min_length=1)]
     max_speed_deg_s: Annotated[float, Meta(gt=0, le=360)] = 90.0  # torque goes off when a joint turns faster
-    ramp_s: Annotated[float, Meta(ge=0.2, le=10)] = 1.0  # duration of the ramp of the currents
-    # torque goes off when a current exceeds its limit for this long
-    overcurrent_s: Annotated[float, Meta(gt=0, le=5)] = 0.5
     share: Annotated[float, Meta(gt=0, le=1)] = 1.0  # share of the arm's weight that is carried
 
     def torque_constant_of(self, servo: ServoConfig) -> float:
@@ -98,10 +93,6 @@ class GazeConfig(PoweredConfig, frozen=True, forbid_unknown_fields=True, kw_only
     joints: Annotated[tuple[str, ...], Meta(min_length=1)]  # those of the head; each is also one of [robot] joints
     limits_deg: dict[str, tuple[float, float]] = {}  # by joint, narrower limits than the URDF's [°]
     max_speed_deg_s: Annotated[float, Meta(gt=0, le=180)] = 30.0  # of the head's joints
-    stale_s: Annotated[float, Meta(gt=0, le=5)] = 0.5  # without a newer target for this long, the head stands still
-    # blocked_s, blocked_deg: torque goes off when the head stays this far from its command for this long
-    blocked_s: Positive = 1.0
-    blocked_deg: Positive = 15.0
 
     def mistakes(self, servos: Sequence[ServoConfig], models: Mapping[str, Model]) -> Iterator[Mistake]:
         """Yield what is wrong with the table for these servos, whose models are known."""

@@ -14,7 +14,7 @@ from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import FloatArray, frozen_array
 
 from .config import DynamixelConfig
-from .guard import Currents, Drop, Guard, GuardLimits
+from .guard import RAMP_S, Currents, Drop, Guard, GuardLimits
 from .powered import PoweredJoints
 from .powered_config import ZeroForceConfig
 
@@ -45,17 +45,14 @@ class ZeroForce(PoweredJoints):
         limits = GuardLimits(
             joints=tuple(floating),
             heartbeat_s=zero_force.heartbeat_s,
-            doubtful_cycles=zero_force.doubtful_cycles,
             max_speed=np.full(len(floating), math.radians(zero_force.max_speed_deg_s)),
             current_limit=limit,
-            overcurrent_s=zero_force.overcurrent_s,
             max_temperature_c=zero_force.max_temperature_c,
         )
         super().__init__(zero_force, floating, Guard(limits), clock)
         constants = frozen_array([zero_force.torque_constant_of(servos[joint]) for joint in floating])
         self._limit, self._torques = limit, torques
-        self._currents = Currents(floating, constants, limit, zero_force.ramp_s, zero_force.share)
-        self._ramp_s = zero_force.ramp_s
+        self._currents = Currents(floating, constants, limit, zero_force.share)
         self._saturated_s = math.inf
         self._sinking: tuple[str, ...] = ()
 
@@ -97,7 +94,7 @@ class ZeroForce(PoweredJoints):
 
     def _said_on(self) -> str:
         return (
-            f"zero_force is on: within {self._ramp_s:.1f} s {', '.join(self._joints)} bear the arm. Hold it until "
+            f"zero_force is on: within {RAMP_S:.0f} s {', '.join(self._joints)} bear the arm. Hold it until "
             "then, and stay ready to hold it: any doubt switches torque off"
         )
 

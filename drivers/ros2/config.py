@@ -25,7 +25,6 @@ class MarkerTopic(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     topic: str = "/bodyschema/marker"  # name of the topic
     # `point` is geometry_msgs/PointStamped, `pose` geometry_msgs/PoseWithCovarianceStamped
     message: Literal["point", "pose"] = "point"
-    rate_hz: Positive = 30.0  # highest rate
 
 
 class Ros2Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -38,11 +37,6 @@ class Ros2Config(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     # the name of a joint in ROS, by its name in [robot] joints; joints left out have the same name
     names: dict[str, str] = {}
     max_delay_s: Positive = 0.1  # a message is rejected if it arrives this much later than the fastest one
-    # if several nodes publish the joints, no position is interpolated between two messages farther apart than this
-    max_gap_s: Positive = 0.1
-    # fastest plausible motion of a joint; a position that would need more is rejected
-    max_speed_deg_s: Positive = 600.0
-    max_speed_m_s: Positive = 3.0  # the same for prismatic joints
     marker: MarkerTopic | None = None  # publish predictions
 
     def ros_names(self, joints: Sequence[str]) -> tuple[str, ...]:

@@ -18,6 +18,7 @@ from bodyschema.drivers.ros2.config import Ros2Config
 from bodyschema.drivers.ros2.link import RETRY_S, Link, OpenLink, Sample, open_zenoh
 from bodyschema.drivers.ros2.messages import JOINT_STATE, JointState, decode_joint_state
 from bodyschema.drivers.ros2.senders import Gates, Refusal, Sender
+from bodyschema.drivers.turns import FASTEST_M_S, FASTEST_RAD_S
 from bodyschema.interfaces.errors import SourceError, SourceLost
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import JointReading, frozen_array
@@ -109,9 +110,9 @@ ADVICE = {
     Refusal.DUPLICATE: "its stamp is that of the message before; the positions are not newer than its stamp",
     Refusal.OUT_OF_ORDER: "its stamp is earlier than that of the message before; two nodes may share one publisher",
     Refusal.DELAYED: "it came much later than others; fix the network, or set max_delay_s",
-    Refusal.TOO_FAST: "a joint cannot have come there so fast; fix names, or set max_speed_deg_s",
+    Refusal.TOO_FAST: "a joint cannot have come there so fast; fix names in robot.toml, or the node that publishes it",
     Refusal.RIVAL: "two nodes publish the same joint; end one, joint_state_publisher for example",
-    Refusal.GAP: "the joints come in several messages, too far apart in time; publish faster, or set max_gap_s",
+    Refusal.GAP: "the joints come in several messages, too far apart in time; publish faster",
 }
 
 
@@ -172,6 +173,7 @@ def _unheard(config: Ros2Config, topics: Sequence[rmw.Topic]) -> str:
 log = logging.getLogger(__name__)
 
 SLACK_RAD, SLACK_M = 0.02, 2e-3
+MOST_GAP_S = 0.1  # no position is interpolated between two messages of a joint that are farther apart
 SENDERS = 64
 NAMES = 256  # upper bound of the names kept for messages
 
@@ -204,8 +206,7 @@ class Ros2Joints:
         self._config, self.joints, self._clock, self._open_link = config, tuple(joints), clock, open_link
         self._wanted = config.ros_names(joints)
         slides = [False] * len(joints) if prismatic is None else list(prismatic)
-        turning = math.radians(config.max_speed_deg_s)
-        self._fastest = [config.max_speed_m_s if sliding else turning for sliding in slides]
+        self._fastest = [FASTEST_M_S if sliding else FASTEST_RAD_S for sliding in slides]
         self._slack = [SLACK_M if sliding else SLACK_RAD for sliding in slides]
         self._link: Link | None = None
         self._last_t = -math.inf
@@ -278,7 +279,7 @@ class Ros2Joints:
         merged = self._believed(gid or message.names, message, sample.arrived)
         if merged is None:
             return None
-        if merged.gap_s > self._config.max_gap_s:
+        if merged.gap_s > MOST_GAP_S:
             self._refuse(Refusal.GAP, f"{merged.gap_s:.3f} s")
             return None
         if merged.t <= self._last_t:

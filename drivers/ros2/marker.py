@@ -32,10 +32,7 @@ class MarkerPublisher:
         self._tokens: list[zenoh.LivelinessToken] = []
         self._sequence = 0
 
-    @property
-    def period_s(self) -> float:
-        """Shortest time between two positions [s]."""
-        return 1.0 / self._marker.rate_hz
+    period_s = 1.0 / 30.0  # shortest time between two positions
 
     @property
     def has_sigma(self) -> bool:

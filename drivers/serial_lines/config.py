@@ -12,7 +12,7 @@ from msgspec import Meta
 from bodyschema.drivers.servos.config import require_each
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.suggest import did_you_mean
-from bodyschema.robot.toml_file import NonNegative, Positive, line_in_entry
+from bodyschema.robot.toml_file import NonNegative, line_in_entry
 
 TABLE = "drivers.serial_lines"
 
@@ -41,10 +41,6 @@ class SerialLinesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     baud: Annotated[int, Meta(ge=9600, le=4_000_000)] = 115_200  # of the board's UART [bit/s]
     native_usb: bool = False  # the microcontroller has USB itself, so that lines take no time on a wire
     delay_ms: NonNegative = 0.0  # from the middle of a measurement to the first byte of its line on the wire
-    # fastest plausible motion of a joint; a position that would need more is rejected
-    max_speed_deg_s: Positive = 600.0
-    # how far a joint may move while the board is disconnected, where only the nearest turn determines it
-    max_move_deg: Annotated[float, Meta(gt=0, lt=180)] = 30.0
 
     def check(self, joints: Sequence[str], file: Path, text: str) -> None:
         """Raise ConfigError unless each of `joints` has exactly one encoder."""

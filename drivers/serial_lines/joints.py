@@ -13,13 +13,13 @@ from bodyschema.drivers.checks import MANY_TROUBLES, READ_S, Check, aligned, war
 from bodyschema.drivers.echo import BITS_PER_BYTE, Port, close_quietly
 from bodyschema.drivers.serial_line import RETRY_S, SerialLine
 from bodyschema.drivers.turn_count import LOST_AFTER_S, TurnCount
-from bodyschema.drivers.turns import SpeedGate
+from bodyschema.drivers.turns import FASTEST_RAD_S, SpeedGate
 from bodyschema.interfaces.errors import SourceError, SourceLost
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import JointReading, frozen_array
 
 from .board import Board, Counts, Timed
-from .config import TABLE, EncoderConfig, SerialLinesConfig
+from .config import EncoderConfig, SerialLinesConfig
 from .lines import ASK_HEADER, Header
 
 log = logging.getLogger(__name__)
@@ -102,7 +102,7 @@ class SerialLineJoints:
         by_joint = {encoder.joint: encoder for encoder in config.encoders}
         self._wanted = [by_joint[joint] for joint in joints]
         unlimited = [(-math.inf, math.inf)] * len(joints)
-        self._turns = TurnCount(limits or unlimited, last_pose, config.max_move_deg, TABLE)
+        self._turns = TurnCount(limits or unlimited, last_pose)
         self._port: Port | None = None
         self._board = Board(0.0, 0.0)
         self._last_t = self._believed_s = self._heard_s = -math.inf
@@ -190,7 +190,7 @@ class SerialLineJoints:
         self.encoders = self._found(self._introduced(port))
         self._failing.clear()
         self._gate = SpeedGate(
-            [math.radians(self._config.max_speed_deg_s) / encoder.rad_per_tick for encoder in self.encoders],
+            [FASTEST_RAD_S / encoder.rad_per_tick for encoder in self.encoders],
             [2 + encoder.ticks_per_turn / _Settings.slack_ticks_part for encoder in self.encoders],
         )
         self._anchor(port)

@@ -4,30 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, ClassVar, Generic, Literal, Protocol, TypeVar
+from typing import Annotated, ClassVar, Generic, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta
 
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.suggest import did_you_mean
-from bodyschema.robot.toml_file import Positive, line_in_entry, line_of
+from bodyschema.robot.toml_file import NonNegative, Positive, line_in_entry, line_of
 
 from .model import Model, no_driver
 
 
-class AnyBus(Protocol):
-    """Settings that every table of a bus has."""
+class ServoBusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Keys of a port with servos behind it, whatever their make; each make says at which rates they talk."""
 
-    @property
-    def port(self) -> str: ...
-    @property
-    def baud(self) -> int: ...
-    @property
-    def latency_ms(self) -> float | None: ...
+    port: str  # best one of /dev/serial/by-id, which stays the same when it is plugged in again
+    baud: int = 1_000_000  # as the servos are set [bit/s]
+    # how long the adapter holds bytes back; without this key the system's value is used
+    latency_ms: NonNegative | None = None
 
 
-BusT = TypeVar("BusT", bound=AnyBus)
+BusT = TypeVar("BusT", bound=ServoBusConfig)
 
 
 def require_each(joints: Sequence[str], given: Sequence[str], what: str, table: str, file: Path, text: str) -> None:
@@ -62,9 +60,6 @@ class ServosConfig(msgspec.Struct, Generic[BusT], frozen=True, forbid_unknown_fi
     buses: dict[str, BusT]
     servos: Annotated[tuple[ServoConfig, ...], Meta(min_length=1)]
     rate_hz: Positive = 250.0  # readings are not asked for more often than this
-    max_speed_deg_s: Positive = 600.0  # no joint moves faster; a position that would need it is not believed
-    # how far a joint may have been moved while the bus was away, where only the nearest turn tells
-    max_move_deg: Annotated[float, Meta(gt=0, lt=180)] = 30.0
     # switch torque on again at the end where it was on at the start, holding the pose of the end
     restore_torque: bool = False
 

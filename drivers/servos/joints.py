@@ -15,7 +15,7 @@ from typing import Any, Self
 from bodyschema.drivers.echo import Port, close_quietly, without_echo
 from bodyschema.drivers.serial_line import SerialLine, adapter_latency_s
 from bodyschema.drivers.turn_count import LOST_AFTER_S, TurnCount
-from bodyschema.drivers.turns import SpeedGate
+from bodyschema.drivers.turns import FASTEST_RAD_S, SpeedGate
 from bodyschema.interfaces.errors import SourceError, SourceLost
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import JointReading, frozen_array
@@ -23,7 +23,7 @@ from bodyschema.interfaces.servos import BusStatus, ServoStatus
 
 from .bus import Bus, Counts, Request
 from .channel import Channel, Drive, Punctuality, Sample, middle
-from .config import AnyBus, ServosConfig
+from .config import ServoBusConfig, ServosConfig
 from .handshake import RETRY_S, IdentifiedServo, identify, require_all, restore_torque, switch_torque_off
 from .health import Health, Inspection
 from .vendor import Plan, ServoVendor, plans_of
@@ -47,7 +47,7 @@ OpenPort = Callable[[Any, Clock], tuple[Port, float]]
 """Opens the port of a bus; with the latency of its adapter [s]."""
 
 
-def open_serial(config: AnyBus, clock: Clock) -> tuple[Port, float]:
+def open_serial(config: ServoBusConfig, clock: Clock) -> tuple[Port, float]:
     """Open the port of a bus; return it and the latency of its adapter [s]."""
     latency_s = adapter_latency_s(config.port) if config.latency_ms is None else config.latency_ms * 1e-3
     return SerialLine.open(config.port, config.baud, clock.now), latency_s
@@ -87,7 +87,7 @@ class ServoJoints:
         by_joint = {servo.joint: servo for servo in config.servos}
         self._wanted = [by_joint[joint] for joint in joints]
         unlimited = [(-math.inf, math.inf)] * len(joints)
-        self._turns = TurnCount(limits or unlimited, last_pose, config.max_move_deg, config.table)
+        self._turns = TurnCount(limits or unlimited, last_pose)
         self._buses: dict[str, Bus] = {}
         self._plans: dict[str, Plan] = {}
         self._opened = ExitStack()
@@ -230,9 +230,8 @@ class ServoJoints:
         self._plans = plans_of(self.make, self._buses, self.servos, self._config)
         self._channels = [self.make.channel(servo) for servo in self.servos]
         self._at = {(servo.bus, servo.id): place for place, servo in enumerate(self.servos)}
-        speed = math.radians(self._config.max_speed_deg_s)
         self._gate = SpeedGate(
-            [speed / s.model.rad_per_tick for s in self.servos], [_Settings.slack_ticks] * len(self.servos)
+            [FASTEST_RAD_S / s.model.rad_per_tick for s in self.servos], [_Settings.slack_ticks] * len(self.servos)
         )
         self._punctuality = Punctuality()
         now = self._clock.now()

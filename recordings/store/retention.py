@@ -17,7 +17,7 @@ class Keep:
     days: float | None  # maximum age; None: any
     size: float | None  # maximum bytes of the file in use; None: unlimited
     # number of pairs kept whatever their age and size, so that a wall clock that jumps ahead cannot delete all
-    newest: int
+    newest: int = 20_000
 
     def last_to_delete(self, connection: sqlite3.Connection, utc: str, newest: int) -> int | None:
         """Return the newest pair that can be deleted now, with all before it; None to keep all.

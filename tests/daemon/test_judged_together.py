@@ -49,7 +49,7 @@ def test_the_instant_learner_knows_a_pair_before_it_is_judged() -> None:
         SETTINGS,
         itertools.count(),
     )
-    reference = NLMS(NOMINAL.prior(), SETTINGS.step_size)
+    reference = NLMS(NOMINAL.prior())
     for pair in scene.pairs:
         era.meet(pair)
         reference.learn(pair.q, pair.x)

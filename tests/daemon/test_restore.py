@@ -129,8 +129,8 @@ def test_a_state_that_was_learnt_with_another_tolerance_is_not_gone_on_from(tole
         other.restore(learning.state())
 
 
-def test_a_state_that_was_learnt_with_another_step_size_is_gone_on_from() -> None:
-    learning, other = new_learning(), new_learning(settings=LearnerConfig(step_size=0.2))
+def test_a_state_that_was_learnt_with_fewer_replays_is_gone_on_from() -> None:
+    learning, other = new_learning(), new_learning(settings=LearnerConfig(replays_per_pair=1.0))
     teach(learning, Scene.draw(0, 3).pairs)
     other.restore(learning.state())
     assert other.counters.pairs == 3

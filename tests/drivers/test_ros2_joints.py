@@ -51,12 +51,12 @@ def test_joints_of_the_robot_that_are_not_ours_are_passed_over() -> None:
         assert {len(reading.q) for reading in robot.read(0.5)} == {1}
 
 
-def test_a_sliding_joint_is_read_in_metres_and_may_move_faster_than_its_gate_for_turning() -> None:
-    path = {"lift": lambda t: 20.0 * t}
-    turning, sliding = (Robot(joints=("lift",), paths=path, prismatic=[k], max_speed_m_s=21.0) for k in (False, True))
+def test_a_sliding_joint_is_read_in_metres_and_has_a_gate_of_its_own() -> None:
+    path = {"lift": lambda t: 5.0 * t}
+    turning, sliding = (Robot(joints=("lift",), paths=path, prismatic=[k]) for k in (False, True))
     with turning.joints, sliding.joints:
-        assert len(sliding.read(0.055)) == 4
-        assert turning.read(0.055) == []
+        assert len(turning.read(0.055)) == 4
+        assert sliding.read(0.055) == []
 
 
 def test_messages_that_take_their_time_are_told_at_the_time_of_their_stamps() -> None:
@@ -208,11 +208,11 @@ def test_no_wrong_reading_is_believed_among_faults_of_many_kinds(seed) -> None:
 
 @pytest.mark.parametrize("kind", SEEN_BY_THE_GATE)
 def test_what_only_the_gate_can_see_is_wrong_by_no_more_than_a_joint_can_move(kind) -> None:
-    robot = Robot(share=0.2, kinds=(kind,), max_speed_deg_s=180.0)
+    robot = Robot(share=0.2, kinds=(kind,))
     with robot.joints:
         readings = robot.read(10.0)
     gaps = np.diff([reading.t for reading in readings])
-    assert max(map(robot.error, readings)) < (np.radians(180.0) + FASTEST) * gaps.max() + 0.02
+    assert max(map(robot.error, readings)) < (np.radians(600.0) + FASTEST) * gaps.max() + 0.02
     assert len(readings) > 660
 
 

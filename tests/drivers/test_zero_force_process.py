@@ -54,7 +54,6 @@ model = "XM430-W350"
 """
 ZERO_FORCE = f"""[drivers.dynamixel.zero_force]
 heartbeat_ms = {1e3 * HEARTBEAT_S}
-ramp_s = 0.2
 joints.shoulder = {{ current_limit_a = 2.0 }}
 joints.elbow = {{ current_limit_a = 2.0 }}
 """

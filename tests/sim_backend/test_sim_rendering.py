@@ -174,9 +174,7 @@ def test_the_shipped_calibration_has_its_axis_in_the_middle_of_the_image():
     assert calibration.principal_point_px == (319.5, 239.5)
 
 
-TAGS = CameraConfig(
-    noise=0, clutter=0, supersampling=6, tags=(SimTag(id=3, xyz=(0.01, 0.0, 0.0), rpy=(0.0, 0.0, 0.0), side_m=0.06),)
-)
+TAGS = CameraConfig(noise=0, clutter=0, tags=(SimTag(id=3, xyz=(0.01, 0.0, 0.0), rpy=(0.0, 0.0, 0.0), side_m=0.06),))
 FACING = np.diag([1.0, -1.0, -1.0])
 
 

@@ -68,7 +68,7 @@ def test_another_tool_moves_the_true_marker_by_as_much_as_described():
 def test_the_nominal_model_errs_by_60_to_80_mm_on_average_over_many_robots():
     robot = shipped()
     assert robot.calibration is not None
-    q = Gaze(robot, robot.calibration, JointRoles.of(robot).gaze, 1.0).solve(postures(robot, 400, 4))
+    q = Gaze(robot, robot.calibration, JointRoles.of(robot).gaze).solve(postures(robot, 400, 4))
     x = robot.chain.positions(q)
     q, x = q[(x[:, 2] > 0.3) & (x[:, 2] < 0.8)], x[(x[:, 2] > 0.3) & (x[:, 2] < 0.8)]
     errors = [

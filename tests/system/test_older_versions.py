@@ -172,9 +172,12 @@ def test_a_learner_with_an_older_checkpoint_keeps_it_and_learns_every_stored_pai
     assert kept.read_bytes() == (OLDER / "learner_1.ckpt").read_bytes()
 
 
-def test_every_setting_of_the_first_version_is_still_one(tmp_path: Path) -> None:
+def test_a_robot_toml_of_the_first_version_is_read(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "arm.urdf").write_text(URDF)
     shutil.copy(OLDER / "robot_1.toml", tmp_path / "robot.toml")
     config = Config.load(tmp_path / "robot.toml", {})
     assert config.tables.learner.checkpoint_every_s == 0.2
     assert config.tables.sim.tool_changes == ()
+    said = [record.getMessage().partition("robot.toml:")[2] for record in caplog.records]
+    assert "25: [daemon] segment_gap_s is no key any more, and its value is not used. Delete the line" in said
+    assert len(said) == len(set(said)) == 17

@@ -190,7 +190,7 @@ def test_a_sampler_that_is_told_to_read_robot_toml_again_loses_no_frame(config: 
     text = config.file.read_text()
     with started(config, systemd, "sampler") as child:
         systemd.wait_for("READY=1")
-        config.file.write_text(text.replace("any_step = true", "any_step = true\nsegment_gap_s = 7.0"))
+        config.file.write_text(text.replace("any_step = true", "any_step = true\nmax_reading_gap_s = 7.0"))
         child.send_signal(signal.SIGHUP)
         systemd.wait_for("RELOADING=1")
         systemd.wait_for("READY=1")
@@ -199,7 +199,7 @@ def test_a_sampler_that_is_told_to_read_robot_toml_again_loses_no_frame(config: 
             time.sleep(0.05)
         child.terminate()
         assert child.wait(LIMIT_S) == 0
-    assert "in force now: daemon.segment_gap_s = 7.0" in log_of(config).read_text()
+    assert "in force now: daemon.max_reading_gap_s = 7.0" in log_of(config).read_text()
     with PairReader(config.store_file) as store:
         t = [pair.t for pair in store.read()]
     assert max(b - a for a, b in pairwise(t)) < 1.5 / PAIRS_PER_S  # every frame of the recording

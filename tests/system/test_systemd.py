@@ -134,9 +134,9 @@ def test_a_boot_starts_what_is_enabled(machine, robot) -> None:
 def test_reload_follows_robot_toml(machine, robot) -> None:
     started(machine, robot)
     before = machine.show(SAMPLER, "MainPID")
-    robot.write_text(robot.read_text().replace("any_step = true", "any_step = true\nsegment_gap_s = 7.0"))
+    robot.write_text(robot.read_text().replace("any_step = true", "any_step = true\nmax_reading_gap_s = 7.0"))
     machine.systemctl("reload", SAMPLER)
-    machine.until(lambda: "in force now: daemon.segment_gap_s = 7.0" in machine.journal(SAMPLER))
+    machine.until(lambda: "in force now: daemon.max_reading_gap_s = 7.0" in machine.journal(SAMPLER))
     machine.until(lambda: machine.is_active(SAMPLER))
     assert machine.show(SAMPLER, "MainPID") == before
     await_pairs(machine, SAMPLER, LEARNER)

@@ -85,11 +85,6 @@ def test_a_ball_just_clear_of_the_borders_is_found(u, v):
     assert sigmas_off(answer(ball), ball) < FAR_SIGMAS
 
 
-def test_the_margin_to_the_border_is_configured():
-    assert reason(answer(at_pixel(200, 25))) is None
-    assert reason(answer(at_pixel(200, 25), config=VisionConfig(border_margin_px=12.0))) is Reason.AT_BORDER
-
-
 @pytest.mark.parametrize(
     "slab",
     [
@@ -223,12 +218,6 @@ def test_eyes_whose_rows_disagree_fail_the_epipolar_check(rows):
     assert reason(StereoTracker(SMALL).track(tilted)) is Reason.EPIPOLAR
 
 
-def test_the_epipolar_limit_is_configured():
-    frame = stage(BALL)
-    tilted = StereoFrame(0.0, frame.left, np.roll(frame.right, 2, axis=0))
-    assert isinstance(StereoTracker(SMALL, VisionConfig(epipolar_px=2.5)).track(tilted), MarkerFix)
-
-
 def test_interchanged_eyes_fail_the_epipolar_check():
     frame = stage(BALL)
     assert reason(StereoTracker(SMALL).track(StereoFrame(0.0, frame.right, frame.left))) is Reason.EPIPOLAR
@@ -324,7 +313,7 @@ def test_a_copy_beside_a_marker_that_was_not_measured_is_a_reflection():
 def test_a_ball_found_by_its_brighter_part_is_as_bright_as_when_found_whole():
     image, config, gate = stage(BALL).left, VisionConfig(), gate_of(VisionConfig())
     eye = Pinhole(SMALL.focal_px, SMALL.principal_point_px)
-    (patch,) = find_patches(image, Region(0, 0, *SMALL.image_size_px), gate, config)
+    (patch,) = find_patches(image, Region(0, 0, *SMALL.image_size_px), gate)
     # Light falls from above on the left.
     part = replace(patch, box=replace(patch.box, right=patch.box.right - 12, bottom=patch.box.bottom - 12))
     whole, again = (measure(image, one, eye, gate, config) for one in (patch, part))

@@ -25,16 +25,22 @@ UNKNOWN_LATENCY_SIGMA_S = 0.015
 ENUMERATED = re.compile(r"\d+|/dev/video\d+")
 
 
-class UvcSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Settings written to a camera when it is opened, and read back afterwards."""
+class DeviceConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Keys of all cameras that are plugged in."""
 
     image_size_px: tuple[Side, Side]  # width and height of each eye's image
     fps: Positive = 30.0  # frames per second
+    exposure_s: Positive | None = None  # exposure time; without it the camera chooses, and the ball's brightness drifts
+    # in the camera's units, as `v4l2-ctl -l` shows them where it is a webcam; without it unchanged
+    gain: NonNegative | None = None
+
+
+class UvcSettings(DeviceConfig, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Settings written to a webcam when it is opened, and read back afterwards."""
+
     fourcc: Literal["MJPG", "YUYV"] = "MJPG"  # transfer format: MJPG (compressed) or YUYV (about five times as much)
     # kernel buffers. A camera that loses every second frame with 1 needs 2.
     buffers: Annotated[int, Meta(ge=1, le=10)] = 1
-    exposure_s: Positive | None = None  # exposure time; without it the camera chooses, and the ball's brightness drifts
-    gain: NonNegative | None = None  # in the camera's units, as `v4l2-ctl -l` shows them; without it unchanged
     white_balance_k: Positive | None = None  # colour temperature [K]; without it the camera chooses
     # in the camera's units; without it unchanged. A lens that refocuses changes the calibration.
     focus: NonNegative | None = None
@@ -52,12 +58,11 @@ class TwoConfig(UvcSettings, frozen=True, forbid_unknown_fields=True, kw_only=Tr
     # left, right: the devices, by their names in /dev/v4l/by-id or by-path
     left: str
     right: str
-    max_apart_s: Positive | None = None  # largest time difference of a pair; 0.6 of the frame time without it
 
     @property
     def longest_apart_s(self) -> float:
-        """`max_apart_s`, or its default from `fps`: free-running cameras are up to half a frame apart."""
-        return self.max_apart_s or 0.6 / self.fps
+        """Longest time between the two images of a pair: free-running cameras are up to half a frame apart."""
+        return 0.6 / self.fps
 
 
 class SideBySideConfig(UvcSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -66,41 +71,41 @@ class SideBySideConfig(UvcSettings, frozen=True, forbid_unknown_fields=True, kw_
     device: str  # its name in /dev/v4l/by-id or by-path
 
 
-class RealsenseConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class RealsenseConfig(DeviceConfig, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The table [vision.cameras.realsense]: the infra-red eyes of a RealSense camera, by the extra `realsense`."""
 
     serial: str | None = None  # its serial number; needed where several are connected
     image_size_px: tuple[Side, Side] = (848, 480)  # width and height of each eye's image
-    fps: Positive = 30.0  # frames per second
-    exposure_s: Positive | None = None  # exposure time; without it the camera chooses
-    gain: NonNegative | None = None  # in the camera's units; without it unchanged
     emitter: bool = False  # keep the projector on. Its dots disturb the tracker.
     depth_check: bool = True  # compare the marker's depth with the depth image
 
 
-class ImagesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class FilesConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Keys of recorded images."""
+
+    times: str | None = None  # a text file with the time of each frame [s], one a line
+    # in its place: the rate [1/s]; videos take that in the file without either
+    fps: Positive | None = None
+    speed: NonNegative = 1.0  # 1 as recorded, 2 twice as fast, 0 as fast as they are read
+
+
+class ImagesConfig(FilesConfig, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The table [vision.cameras.images]: image files instead of cameras, sorted by name."""
 
     # left, right: patterns relative to robot.toml, such as "left/*.png"; only `left` for a single camera
     left: str
     right: str | None = None
-    times: str | None = None  # a text file with the time of each pair [s], one a line
-    # in its place: the last number in each name is its time, in ticks of this rate (1e9: nanoseconds)
+    # in the place of times: the last number in each name is its time, in ticks of this rate (1e9: nanoseconds)
     name_ticks_per_s: Positive | None = None
-    fps: Positive | None = None  # in the place of both: the rate [1/s]
-    speed: NonNegative = 1.0  # 1 as recorded, 2 twice as fast, 0 as fast as they are read
 
 
-class VideosConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class VideosConfig(FilesConfig, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """The table [vision.cameras.videos]: video files instead of cameras."""
 
     # left, right: a file for each eye, relative to robot.toml; only `left` for a single camera
     left: str | None = None
     right: str | None = None
     side_by_side: str | None = None  # in their place: one file with both eyes' images in each frame, left and right
-    times: str | None = None  # a text file with the time of each frame [s], one a line
-    fps: Positive | None = None  # in its place: the rate [1/s]; without either that in the file
-    speed: NonNegative = 1.0  # 1 as recorded, 2 twice as fast, 0 as fast as it is read
 
 
 class CamerasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
