@@ -101,7 +101,7 @@ class PatchSettings:
     """Settings of patches of the ball's colour.
 
     What matters: `most_uneven` at 0.3 times (20 of 181 other outcomes), `whole_disc_fill` (10) and `strong_shares` (8).
-    The others change at most 5 outcomes; `least_fill` only saves time.
+    The others change at most 6 outcomes; `least_fill` only saves time.
     """
 
     least_fill = 0.45  # a patch that fills a smaller share of its enclosing circle is not a ball
@@ -147,7 +147,8 @@ class TrackSettings:
     """Settings of the two eyes' match, of the ball's size, and of its track.
 
     What matters: `longest_memory_s` at 3 times (25 of 181 other outcomes), `mirrored_light` (10), `most_unrest` at 0.3
-    times (6), `alike_levels` (4). The others change no outcome; sigmas of size change single sigmas by 15 to 200 %.
+    times (6), `fastest_m_s` at 3 times (7), `alike_levels` (4). The others change at most 3 outcomes; sigmas of size
+    change single sigmas by 15 to 200 %.
     """
 
     # Largest difference of the eyes' rows [px], on top of so many sigmas of the two centres, which count in sizes too.
