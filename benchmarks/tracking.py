@@ -33,9 +33,9 @@ from bodyschema.interfaces.errors import SourceEnded
 from bodyschema.interfaces.records import JointReading, MarkerMiss, StereoFrame
 from bodyschema.recordings.store.store import PairStore
 from bodyschema.sim_backend import SimWorld, model_file
+from bodyschema.vision.ball.tracker import StereoTracker
 from bodyschema.vision.config import VisionConfig
 from bodyschema.vision.tracked_camera import TrackedCamera
-from bodyschema.vision.tracker import StereoTracker
 
 CAMERA_HZ = 30.0
 T = TypeVar("T")

@@ -14,6 +14,7 @@ from tag_renderer import Card, Sheet, photograph
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.errors import ConfigError, SourceError
 from bodyschema.interfaces.records import FloatArray, ImageArray, MarkerFix, MarkerMiss, Reason, StereoFrame
+from bodyschema.vision.ball.tracker import StereoTracker
 from bodyschema.vision.config import VisionConfig
 from bodyschema.vision.pose import PoseEstimator, Sighting, mirrored
 from bodyschema.vision.tags.bleed import bleed
@@ -23,7 +24,6 @@ from bodyschema.vision.tags.dictionary import tag_modules
 from bodyschema.vision.tags.edge import PIXEL_CUMULANT, blurred_step
 from bodyschema.vision.tags.image import TagImage, measure_tag
 from bodyschema.vision.tags.tracker import TagTracker
-from bodyschema.vision.tracker import StereoTracker
 from bodyschema.vision.trackers import tracker_of
 from kbmaps import rotation_vectors
 

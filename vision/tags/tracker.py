@@ -21,7 +21,7 @@ from bodyschema.interfaces.records import (
     frozen_array,
 )
 from bodyschema.vision.config import LONGEST_PAUSE_S
-from bodyschema.vision.images import check_calibration, check_images
+from bodyschema.vision.image_checks import check_calibration, check_images
 from bodyschema.vision.pose import Pose, PoseEstimator, Sighting, angle_between, first_pose, fitted_motion, mirrored
 from bodyschema.vision.triangulate import triangulate
 
