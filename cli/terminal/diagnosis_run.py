@@ -17,7 +17,7 @@ from bodyschema.calibration.plausibility.check import plausibility, told_sigma
 from bodyschema.calibration.plausibility.limits import require_units
 from bodyschema.cli.recordings.recorder import History
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import client
+from bodyschema.daemon.transport.session import client
 from bodyschema.diagnosis.assess.stored import predicted_pose_covariance
 from bodyschema.diagnosis.diagnosis import Diagnosis
 from bodyschema.diagnosis.diagnosis import diagnose as diagnosed
