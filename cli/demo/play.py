@@ -25,7 +25,7 @@ from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.session import ZenohSession
 from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import CommandRequest, JointsRequest, PairsReply, PredictReply, decode, encode
-from bodyschema.diagnosis.report.plot import Layout, Plot
+from bodyschema.diagnosis.report.svg_plot import Layout, Plot
 from bodyschema.interfaces.errors import BusError
 from bodyschema.interfaces.interpreter import module_command
 from bodyschema.interfaces.records import FloatArray

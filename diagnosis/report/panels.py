@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray
 
-from .plot import ASPECT, Layout, Plot, round_up, span
 from .residuals import ARROWS, POINTS, Residuals, binned, structure
+from .svg_plot import ASPECT, Layout, Plot, round_up, span
 
 
 @dataclass(frozen=True)
