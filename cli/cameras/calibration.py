@@ -1,4 +1,4 @@
-"""Cameras and the board from the command line: what is asked, what is run, what is written."""
+"""Run `calibrate cameras` and print boards, for the commands; the mathematics is in `vision/calibration`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Calibrating the robot's own cameras: views are taken while a person moves the board, until it is good enough."""
+"""Run `calibrate cameras` on the robot's own cameras: take views while a person moves the board, until they suffice."""
 
 from __future__ import annotations
 
