@@ -119,7 +119,7 @@ def _vendor(servos: Sequence[Candidate]) -> KnownModel:
     vendors = {known[servo.model or ""].table: known[servo.model or ""] for servo in servos}
     if len(vendors) > 1:
         raise ConfigError(
-            f"the servos are of two makes, {' and '.join(vendors)}, and an arm is of one",
+            f"the servos are of two vendors, {' and '.join(vendors)}, and an arm is of one",
             remedy="Give --port with the port of one of them, or - for the other's joints",
         )
     return next(iter(vendors.values()))
