@@ -16,7 +16,7 @@ PEERS_BUDGET_S ?= 240
 GOALS_BUDGET_S ?= 3600
 SMOKE := tests/interfaces tests/effects tests/examples tests/kbmaps/test_rigid_learner.py tests/kbmaps/test_kernels.py \
 	tests/drivers/test_dynamixel_bus.py tests/vision/test_colour_model.py tests/sim_backend/test_sim_postures.py \
-	tests/diagnosis/test_eyes.py tests/daemon/test_sampler.py tests/daemon/test_learner.py tests/system/test_poisoned_pairs.py
+	tests/diagnosis/test_vergence.py tests/daemon/test_sampler.py tests/daemon/test_learner.py tests/system/test_poisoned_pairs.py
 
 .PHONY: help setup demo test smoke check docs soak bench peers goals lock wheel clean
 

@@ -33,8 +33,8 @@ from pathlib import Path
 import numpy as np
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import Request, ZenohSession, client
 from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.session import Request, ZenohSession, client
 from bodyschema.daemon.transport.wire import JointsRequest, PairMessage, PairsReply, PredictReply, decode, encode
 from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.interpreter import module_command

@@ -23,8 +23,8 @@ from bodyschema.interfaces.records import FloatArray, ImageArray, MarkerFix, Ste
 from bodyschema.vision.ball.blob import Disc, Region, find_patches, measure
 from bodyschema.vision.ball.colour import ColourGate
 from bodyschema.vision.ball.sphere import Pinhole
+from bodyschema.vision.ball.tracker import StereoTracker
 from bodyschema.vision.config import VisionConfig
-from bodyschema.vision.tracker import StereoTracker
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "vision"))
 

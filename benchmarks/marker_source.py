@@ -26,8 +26,8 @@ from pathlib import Path
 import numpy as np
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import client
 from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.session import client
 from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import decode
 from bodyschema.drivers.markers.datagram import SCHEMA

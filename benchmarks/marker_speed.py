@@ -19,7 +19,7 @@ import numpy as np
 
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray, MarkerFix, StereoFrame
-from bodyschema.vision.tracker import StereoTracker
+from bodyschema.vision.ball.tracker import StereoTracker
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "vision"))
 

@@ -26,8 +26,8 @@ import numpy as np
 from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, StereoFrame
 from bodyschema.vision.ball.settings import PatchSettings
 from bodyschema.vision.ball.sphere import Pinhole
+from bodyschema.vision.ball.tracker import StereoTracker
 from bodyschema.vision.config import VisionConfig
-from bodyschema.vision.tracker import StereoTracker
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "vision"))
 

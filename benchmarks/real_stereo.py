@@ -26,7 +26,7 @@ from bodyschema.vision.board import Board
 from bodyschema.vision.calibration.bundle import view_residuals
 from bodyschema.vision.calibration.calibrate import Asked, Calibrated, calibrate, fit
 from bodyschema.vision.calibration.gather import gathered
-from bodyschema.vision.calibration.images import pair_files, read_pairs
+from bodyschema.vision.calibration.image_pairs import pair_files, read_pairs
 from bodyschema.vision.calibration.start import pose_of
 from bodyschema.vision.calibration.view import View
 from bodyschema.vision.rig.lens import DISTORTION_NAMES, Model

@@ -26,7 +26,7 @@ from benchmarks.humanoid_arm import JOINTS, guided_path, nominal_chain
 from benchmarks.timing import interleaved_medians_us
 from kbmaps import NLMS, ChainTolerances, ExactLearner, KBMap, RecursiveRigidLearner, SupportSet, learning_bases
 from kbmaps.arrays import FloatArray
-from kbmaps.maps import kernels
+from kbmaps.maps import code_path
 
 ROUGH = ChainTolerances(axes=0.05, points=0.015, tool=0.03)
 PAIRS = 600
@@ -51,9 +51,9 @@ def start_map() -> KBMap:
     return nominal_chain().to_kbmap(learning_bases(-turn, turn))
 
 
-def kbmaps_calls(path: kernels.KernelPath, q: FloatArray, x: FloatArray) -> dict[str, Callable[[], object]]:
+def kbmaps_calls(path: code_path.KernelPath, q: FloatArray, x: FloatArray) -> dict[str, Callable[[], object]]:
     """Return the calls of `GOALS` on this path; each takes one pair unless its name says otherwise."""
-    with kernels.using(path):
+    with code_path.using(path):
         kbmap = start_map()
         learner, replayed = NLMS(kbmap), NLMS(kbmap)
         rigid = RecursiveRigidLearner(nominal_chain(), ROUGH)
@@ -119,7 +119,7 @@ def numba_step(kbmap: KBMap, q: FloatArray, x: FloatArray) -> Callable[[], objec
 def online_costs(q: FloatArray, x: FloatArray, rounds: int = 40) -> dict[str, float]:
     """Return times [us] by name; those of `GOALS` are prefixed by their path."""
     rivals: dict[str, Callable[[], object]] = {}
-    for path in kernels.available():
+    for path in code_path.available():
         rivals |= {f"{path} {name}": call for name, call in kbmaps_calls(path, q, x).items()}
     kbmap = start_map()
     rivals["padasip FilterNLMS x 3, features for free"] = padasip_step(kbmap, q, x)
@@ -220,10 +220,10 @@ def solve_ms(learner: ExactLearner, precision: float | Literal["evidence"] | Non
     return statistics.median(times)
 
 
-def stream_costs(path: kernels.KernelPath, rng: np.random.Generator) -> tuple[float, float]:
+def stream_costs(path: code_path.KernelPath, rng: np.random.Generator) -> tuple[float, float]:
     """Return the cost of `RecursiveRigidLearner` per pair, refits included [us]: first pairs, then a full window."""
     q, x = some_pairs(rng, STREAM)
-    with kernels.using(path):
+    with code_path.using(path):
         learner = RecursiveRigidLearner(nominal_chain(), ROUGH, window=FULL_WINDOW)
     took: list[float] = []
     for one_q, one_x in zip(q, x, strict=True):
@@ -235,7 +235,7 @@ def stream_costs(path: kernels.KernelPath, rng: np.random.Generator) -> tuple[fl
 
 def recursive_stream(rng: np.random.Generator) -> None:
     print("recursive rigid chain, refits included [us a pair]")
-    for path in kernels.available():
+    for path in code_path.available():
         first, full = stream_costs(path, rng)
         print(f"  {path:9s} first {FIRST_PAIRS}: {first:6.0f}; pairs {FULL_WINDOW} to {STREAM}: {full:6.0f}")
 

@@ -26,16 +26,16 @@ from bodyschema.daemon.config import Config
 from bodyschema.daemon.sampler.devices import session_of
 from bodyschema.daemon.sampler.sampler import Sampler
 from bodyschema.daemon.sampler.sources import Sources
-from bodyschema.daemon.transport.bus import ZenohSession
+from bodyschema.daemon.transport.session import ZenohSession
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import SourceEnded
 from bodyschema.interfaces.records import JointReading, MarkerMiss, StereoFrame
 from bodyschema.recordings.store.store import PairStore
 from bodyschema.sim_backend import SimWorld, model_file
+from bodyschema.vision.ball.tracker import StereoTracker
 from bodyschema.vision.config import VisionConfig
 from bodyschema.vision.tracked_camera import TrackedCamera
-from bodyschema.vision.tracker import StereoTracker
 
 CAMERA_HZ = 30.0
 T = TypeVar("T")

@@ -1,4 +1,7 @@
-"""Robot kinematics that calibrates itself. The folders beside this file are the parts; `kbmaps` is the maths."""
+"""Robot kinematics that calibrates itself; `kbmaps` is the maths.
+
+In the repository the folders beside this file are symbolic links to those at its top, where the code is.
+"""
 
 
 def __getattr__(name: str) -> str:

@@ -1,1 +1,1 @@
-"""Mathematics on recordings: calibration, latency, comparison, plausibility."""
+"""Calibration of the arm from recordings, latency, comparison, plausibility; the cameras': `vision/calibration`."""

@@ -11,9 +11,9 @@ from typing import Any, Generic, Self, TypeVar
 
 from bodyschema.cli.recordings.recorder import History
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.identity import Route
 from bodyschema.daemon.transport.keys import CommandName, Keys
+from bodyschema.daemon.transport.session import ZenohSession
 from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import CommandReply, CommandRequest, JointsRequest, PredictReply, decode, encode
 from bodyschema.dashboard.course import Course, Series, expected_outlook

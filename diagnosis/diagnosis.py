@@ -18,7 +18,7 @@ from bodyschema.diagnosis.assess.explanation import (
     useful,
     without_one,
 )
-from bodyschema.diagnosis.assess.leftover import Leftover, leftover
+from bodyschema.diagnosis.assess.residual_structure import ResidualStructure, residual_structure
 from bodyschema.diagnosis.assess.rivals import Standing, standings
 from bodyschema.diagnosis.assess.shares import Shares, shares
 from bodyschema.diagnosis.assess.stored import is_better_with, stored
@@ -35,13 +35,13 @@ from bodyschema.diagnosis.search.hypotheses import Hypotheses
 from bodyschema.diagnosis.search.scan import Candidate, Scan, moment_again
 from bodyschema.diagnosis.search.search import Search, are_a_description
 from bodyschema.diagnosis.search.together import Tolerated, in_place_of_tolerances, together, tolerated
+from bodyschema.diagnosis.unnamed.family_fits import UnnamedFamilies
 from bodyschema.diagnosis.unnamed.rattle import Rattle, likelihood, rattle, rattle_beside
-from bodyschema.diagnosis.unnamed.unknown import Unknowns
 from bodyschema.effects import Effect, Identity, Simulation
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.recordings.recording import Recording
 
-from .stages import NAMELESS, RIVALS, SEARCH, SETS, Stages
+from .stages import RIVALS, SEARCH, SETS, UNNAMED, Stages
 
 Told = Callable[[str], None]
 
@@ -103,7 +103,7 @@ class Diagnosis:
     stored: Fit
     tolerated: Tolerated
     standings: tuple[Standing, ...]
-    left: Leftover
+    left: ResidualStructure
     blocks: Blocks
     seed: int
     part: Observations | None = None
@@ -346,8 +346,8 @@ def diagnose(
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
-    """What a search found in some observations.
+class _SearchResult:
+    """Result of a search in some observations.
 
     Attributes:
         start: fit of the parameters that robot.toml does not know.
@@ -359,20 +359,20 @@ class _Found:
 
     start: Fit
     search: Search
-    unknowns: Unknowns
+    unnamed: UnnamedFamilies
     explanation: Explanation
     standings: Sequence[Standing]
     loose: Rattle | None
     is_reshaped: bool
-    part: _Found | None = None
+    part: _SearchResult | None = None
 
-    def left(self, blocks: Blocks) -> Leftover:
+    def left(self, blocks: Blocks) -> ResidualStructure:
         """Return the residual structure that no effect fits."""
         # In many rows, all families take much memory to find nothing again.
-        asked = self if self.part is None or self.explanation.unknown else self.part
-        return leftover(asked.explanation, asked.unknowns, blocks, self.loose)
+        asked = self if self.part is None or self.explanation.unnamed_causes else self.part
+        return residual_structure(asked.explanation, asked.unnamed, blocks, self.loose)
 
-    def over(self, observations: Observations, simulation: Simulation) -> _Found:
+    def over(self, observations: Observations, simulation: Simulation) -> _SearchResult:
         """Return the same causes, fitted to all observations of which these were a part.
 
         No further ones are sought: no model is exact, and in many rows its smallest error looks like a cause (Miller
@@ -398,15 +398,13 @@ class _Found:
         again = replace(self, explanation=replace(self.explanation, fit=fit), standings=stands, loose=loose, part=self)
         return again.of(observations, simulation)
 
-    def of(self, observations: Observations, simulation: Simulation) -> _Found:
+    def of(self, observations: Observations, simulation: Simulation) -> _SearchResult:
         """Return the same causes, fitted to other observations of the same motion."""
         start = aligned(observations, simulation)
-        unknowns, fit = Unknowns(start), self.explanation.fit.to(observations)
-        chosen = unknowns.again(self.explanation.unknown)
-        apart = unknowns.apart(fit, chosen) if chosen else None
-        return replace(
-            self, start=start, unknowns=unknowns, explanation=replace(self.explanation, fit=fit, apart=apart)
-        )
+        unnamed, fit = UnnamedFamilies(start), self.explanation.fit.to(observations)
+        chosen = unnamed.again(self.explanation.unnamed_causes)
+        apart = unnamed.apart(fit, chosen) if chosen else None
+        return replace(self, start=start, unnamed=unnamed, explanation=replace(self.explanation, fit=fit, apart=apart))
 
 
 def _part_of(begins: NDArray[np.bool_]) -> IntArray:
@@ -451,7 +449,7 @@ def _found(
     blocks: Blocks,
     seed: int,
     told: Stages,
-) -> _Found:
+) -> _SearchResult:
     """Search the causes in some observations, and ask whether something without a name is at work."""
     start = aligned(observations, simulation)
     search = Search(hypotheses, told)
@@ -459,18 +457,20 @@ def _found(
     told.begin(SEARCH, SETS)
     # The set of causes compared best tells the noise, and the rows that they leave out, before the long search.
     begun, start = _counted(begun, start, simulation)
-    unknowns = Unknowns(start)
+    unnamed = UnnamedFamilies(start)
     extended = search.run(begun) if start.is_exact else _searched(begun, search)
     other_shape = None if start.is_exact else reshaped(extended)
-    if other_shape is not None and (rattle(extended) or explain(extended, search.path, unknowns, search, told).unknown):
+    if other_shape is not None and (
+        rattle(extended) or explain(extended, search.path, unnamed, search, told).unnamed_causes
+    ):
         # What is left is not noise alone.
         other_shape = None
     again, start = (extended, start) if search.ended_early else _counted(extended, start, simulation, other_shape)
     if again is not extended:
-        unknowns = Unknowns(start)
+        unnamed = UnnamedFamilies(start)
         extended = _searched(again, search)
-    told.begin(NAMELESS, SEARCH)
-    explanation = explain(extended, search.path, unknowns, search, told)
+    told.begin(UNNAMED, SEARCH)
+    explanation = explain(extended, search.path, unnamed, search, told)
     # What is loose does not slip, and changes of its side may have been named jumps and bumps.
     steady = [cause for cause in extended.causes if cause.kind.stage != "tool" and not cause.kind.begins]
     # Likelihoods compare over the same rows alone.
@@ -485,21 +485,21 @@ def _found(
         fixed = [effect for effect in hypotheses if effect.kind.stage != "tool"]
         search = Search(fixed, told)
         start = aligned(loose.taken_out_of(start.observations), simulation)
-        unknowns = Unknowns(start)
+        unnamed = UnnamedFamilies(start)
         extended = search.run(start) if start.is_exact else _searched(together(start, fixed, told), search)
-        explanation = explain(extended, search.path, unknowns, search, told)
+        explanation = explain(extended, search.path, unnamed, search, told)
         loose = rattle(extended) or loose
     explanation = useful(explanation, search, blocks, told)
-    told.begin(RIVALS, NAMELESS)
-    stands = standings(explanation.beside, search, blocks, seed, None if explanation.unknown else unknowns)
-    while explanation.unknown and any(standing.probability < 0.5 for standing in stands):
+    told.begin(RIVALS, UNNAMED)
+    stands = standings(explanation.beside, search, blocks, seed, None if explanation.unnamed_causes else unnamed)
+    while explanation.unnamed_causes and any(standing.probability < 0.5 for standing in stands):
         weakest = int(np.argmin([standing.probability for standing in stands]))
-        fewer = without_one(explanation, explanation.fit.causes[weakest], unknowns, search)
-        if not fewer.unknown:
+        fewer = without_one(explanation, explanation.fit.causes[weakest], unnamed, search)
+        if not fewer.unnamed_causes:
             break
         explanation = fewer
         stands = standings(explanation.beside, search, blocks, seed)
-    found = _Found(start, search, unknowns, explanation, stands, loose, other_shape is not None)
+    found = _SearchResult(start, search, unnamed, explanation, stands, loose, other_shape is not None)
     if loose is None:
         return found
     # No simulation tells on which side the marker lies.
@@ -539,7 +539,7 @@ def _counted(fit: Fit, start: Fit, simulation: Simulation, shape: Observations |
     return again, aligned(observations, simulation)
 
 
-def _stored(start: Fit, alone: Fit, complete: Fit, left: Leftover, blocks: Blocks) -> Fit:
+def _stored(start: Fit, alone: Fit, complete: Fit, left: ResidualStructure, blocks: Blocks) -> Fit:
     """Return what extended.toml holds: the complete fit, or as much of it as is surely better on another recording.
 
     Args:

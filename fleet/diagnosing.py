@@ -17,7 +17,15 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from bodyschema.cli.terminal.diagnosis_run import Asked, Found, Source, measured, require_writable, run, written
+from bodyschema.cli.terminal.diagnosis_run import (
+    Asked,
+    ReportedDiagnosis,
+    Source,
+    measured,
+    require_writable,
+    run,
+    written,
+)
 from bodyschema.daemon.config import Config
 from bodyschema.diagnosis.report.result import DiagnosisFile
 from bodyschema.interfaces.errors import BodyschemaError, ConfigError
@@ -173,7 +181,7 @@ def _read(job: Job) -> _Read | Diagnosed:
         return Diagnosed(job, config.robot.name, config.robot.joints, error=str(error))
 
 
-def _work(read: _Read, asked: Asked, with_report: bool) -> tuple[bytes, Found | None] | str:
+def _work(read: _Read, asked: Asked, with_report: bool) -> tuple[bytes, ReportedDiagnosis | None] | str:
     """Diagnose on a worker: return diagnosis.json, and the input of the other files if they are written.
 
     Returns the reason as text if there is none: not every exception of ours can be unpickled.

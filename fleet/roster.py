@@ -18,9 +18,9 @@ from rich.text import Text
 from bodyschema.cli.terminal.screen import mm
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.service.remedies import as_typed
-from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.identity import SECURE, Route
 from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.session import ZenohSession
 from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import decode
 from bodyschema.daemon.transport.zenoh_config import ENDPOINT, PROCESSES

@@ -14,9 +14,10 @@ LARGEST_SIDE_PX = 16384
 
 @dataclass(frozen=True, slots=True)
 class StereoCalibration:
-    """A rectified stereo pair; the measurement frame is the left optical frame (x right, y down, z forward).
+    """Calibration of one or two rectified eyes.
 
-    One camera alone is the left eye of a pair without a right one: its baseline is 0.
+    The measurement frame is the left optical frame (x right, y down, z forward). One camera alone is
+    the left eye of a pair without a right one: its baseline is 0.
 
     The right eye stands at (+baseline_m, 0, 0) in the left optical frame and looks the same way, so that
     u_left = cx + f·x/z, u_right = cx + f·(x − baseline)/z and v = cy + f·y/z in both.

@@ -1,4 +1,4 @@
-"""Support the import names that plug-ins used before the prefix `bodyschema`, for one more release."""
+"""Support the import names that plug-ins used before the prefix `bodyschema` or a move, for one release."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ from types import ModuleType
 HOME = Path(__file__).resolve().parents[1]
 # the parts that docs/extending.md told plug-ins to import from
 PARTS = ("drivers", "effects", "interfaces", "vision")
-# modules of `interfaces` that are elsewhere now
+# modules that are elsewhere now
 PLACES = {
+    "bodyschema.vision.tracker": "bodyschema.vision.ball.tracker",
+    "vision.tracker": "bodyschema.vision.ball.tracker",
     **{
         f"interfaces.{name}": f"bodyschema.robot.{name}"
         for name in (
@@ -33,7 +35,10 @@ PLACES = {
 
 
 class OldNames(MetaPathFinder):
-    """Finder of `interfaces.camera` as `bodyschema.interfaces.camera`, unless another package has that name."""
+    """Finder of moved modules, and of `interfaces.camera` as `bodyschema.interfaces.camera`.
+
+    Another package's name stays its own.
+    """
 
     def find_spec(
         self,
@@ -43,7 +48,7 @@ class OldNames(MetaPathFinder):
     ) -> ModuleSpec | None:
         """Return the spec of one of our modules that is imported by its old name."""
         part = fullname.partition(".")[0]
-        if part not in PARTS or _is_anothers(part):
+        if not (part == "bodyschema" and fullname in PLACES) and (part not in PARTS or _is_anothers(part)):
             return None
         present = PLACES.get(fullname, f"bodyschema.{fullname}")
         warnings.warn(

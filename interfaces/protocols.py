@@ -56,7 +56,7 @@ class JointSource(Source, Protocol):
 
 @runtime_checkable
 class StereoEyes(Source, Protocol):
-    """Two cameras, one with two eyes, or one alone, as the images come: neither calibrated nor rectified."""
+    """One or two eyes, in one camera or two, as the images come: neither calibrated nor rectified."""
 
     @property
     def image_size_px(self) -> tuple[int, int]:
@@ -79,7 +79,7 @@ class StereoEyes(Source, Protocol):
 
 @runtime_checkable
 class StereoCamera(Source, Protocol):
-    """Two calibrated eyes, or one, on one clock with the encoders; their images are rectified."""
+    """One or two calibrated eyes, on one clock with the encoders; their images are rectified."""
 
     @property
     def calibration(self) -> StereoCalibration:

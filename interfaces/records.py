@@ -72,7 +72,7 @@ class JointReading:
 
 @dataclass(frozen=True, slots=True)
 class StereoFrame:
-    """Both eyes' images of one instant, or those of the only camera.
+    """Images of one instant, by one or two eyes.
 
     Attributes:
         t: middle of the exposure on the same clock as the joint readings [s].

@@ -44,11 +44,11 @@ from kbmaps.maps.basis import JointBasis as JointBasis
 from kbmaps.maps.basis import learning_bases as learning_bases
 from kbmaps.maps.block_choice import blockwise_precision as blockwise_precision
 from kbmaps.maps.block_choice import follow_a_path as follow_a_path
+from kbmaps.maps.code_path import kernels_in_use as kernels_in_use
 from kbmaps.maps.exact import ExactLearner as ExactLearner
 from kbmaps.maps.exact import ExactSolution as ExactSolution
 from kbmaps.maps.kbmap import KBMap as KBMap
 from kbmaps.maps.kbmap import prediction_errors as prediction_errors
-from kbmaps.maps.kernels import kernels_in_use as kernels_in_use
 from kbmaps.maps.nlms import NLMS as NLMS
 from kbmaps.maps.nlms import StepSize as StepSize
 from kbmaps.maps.support import SUPPORT_LIMIT as SUPPORT_LIMIT

@@ -1,4 +1,4 @@
-"""Image files."""
+"""Read image files; shrink and encode images for a page."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from bodyschema.robot.limited import read_at_most
 
 # The largest camera images, uncompressed, have half of it.
 MOST_BYTES = 2**28
+_QUALITY = 80  # of JPEG for a page: about 100 kB
 
 
 def read_image(file: Path, flags: int = cv2.IMREAD_COLOR) -> ImageArray | None:
@@ -26,3 +27,14 @@ def read_image(file: Path, flags: int = cv2.IMREAD_COLOR) -> ImageArray | None:
     except (OSError, cv2.error):  # of OpenCV: more pixels than it is allowed to make of a file
         return None
     return None if image is None else np.asarray(image, np.uint8)
+
+
+def shrunk(image: ImageArray, widest_px: int) -> ImageArray:
+    """Return an image no wider than this."""
+    scale = min(1.0, widest_px / image.shape[1])
+    return np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def jpeg(image: ImageArray) -> bytes:
+    """Return an image as JPEG, for a page."""
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()

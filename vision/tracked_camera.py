@@ -10,7 +10,7 @@ from typing import Protocol, Self
 from bodyschema.interfaces.protocols import StereoCamera
 from bodyschema.interfaces.records import ImageArray, MarkerFix, MarkerMiss, StereoFrame
 
-from .images import jpeg, shrunk
+from .image_file import jpeg, shrunk
 
 _WIDEST_PX = 1280  # of a picture beside other panels of a page
 

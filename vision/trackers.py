@@ -6,10 +6,10 @@ from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.plugins import load
 from bodyschema.vision.ball.one_eye import OneEyeBallTracker
+from bodyschema.vision.ball.tracker import StereoTracker
 
 from .config import VisionConfig
 from .tracked_camera import MarkerTracker
-from .tracker import StereoTracker
 
 
 def tracker_of(calibration: StereoCalibration, config: VisionConfig) -> MarkerTracker:

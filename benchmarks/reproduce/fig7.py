@@ -25,7 +25,7 @@ RANDOM, NOISY, EACH_JOINT = "random walk", "random walk, σ = 20 mm", "random wa
 _SIGMA_M = 0.020
 _PAPER = "both curves alike"
 
-Found = dict[str, dict[str, dict[str, Curve]]]
+Curves = dict[str, dict[str, dict[str, Curve]]]
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ def fig7(run: Run, *, online: int = 600, cycles: int = 2_200, held_out: int = 40
         streams = _measured(run.rng, found, size) | streams
         noise = found.noise_m
     known = Knowledge(crude, CRUDE, np.pi)
-    learnt: Found = {}
+    learnt: Curves = {}
     for name, stream in streams.items():
         if name in (SAME_POSES, EACH_JOINT):
             learnt[name] = {RULE: papers_rule(bernstein_map(crude), stream, run.say)}
@@ -118,7 +118,7 @@ def _measured(rng: np.random.Generator, found: Measured, size: _Size) -> dict[st
     }
 
 
-def _papers_panel(learnt: Found, apart: Curve) -> Panel:
+def _papers_panel(learnt: Curves, apart: Curve) -> Panel:
     """Return the paper's red and orange curves; without measurements, noise replaces them."""
     if MEASURED in learnt:
         red, orange = learnt[SAME_POSES][RULE][HELD_OUT_TRUE], learnt[MEASURED][RULE][HELD_OUT]
@@ -129,7 +129,7 @@ def _papers_panel(learnt: Found, apart: Curve) -> Panel:
     return Panel("as in the paper", [apart, *curves], as_paper=True)
 
 
-def _models_panel(compared: Found) -> Panel:
+def _models_panel(compared: Curves) -> Panel:
     if MEASURED in compared:
         curves = [replace(of_model[HELD_OUT_TRUE], style="-") for of_model in compared[MEASURED].values()]
         return Panel("other models, measured pairs, against true positions", curves)
@@ -137,7 +137,7 @@ def _models_panel(compared: Found) -> Panel:
     return Panel(f"other models, {NOISY}, {NEAR}", curves)
 
 
-def _readings(learnt: Found, streams: dict[str, Stream], size: _Size) -> list[Reading]:
+def _readings(learnt: Curves, streams: dict[str, Stream], size: _Size) -> list[Reading]:
     return [
         Reading(when, f"{name}; {test}", _PAPER, learnt[name][RULE][test].at(count))
         for when, count in (
@@ -149,7 +149,7 @@ def _readings(learnt: Found, streams: dict[str, Stream], size: _Size) -> list[Re
     ]
 
 
-def _comparison(compared: Found, online: int) -> Comparison:
+def _comparison(compared: Curves, online: int) -> Comparison:
     columns: Sequence[tuple[str, str, int]] = [
         (name, test, count)
         for name, of_model in compared.items()

@@ -14,7 +14,7 @@ from bodyschema.daemon.config import Config
 from bodyschema.daemon.sampler.devices import session_of
 from bodyschema.daemon.sampler.sampler import Sampler
 from bodyschema.daemon.sampler.sources import Sources
-from bodyschema.daemon.transport.bus import ZenohSession
+from bodyschema.daemon.transport.session import ZenohSession
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import SourceEnded, SourceError
 from bodyschema.interfaces.protocols import MarkerSource

@@ -1,4 +1,4 @@
-"""Cameras and the board from the command line: what is asked, what is run, what is written."""
+"""Run `calibrate cameras` and print boards, for the commands; the mathematics is in `vision/calibration`."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from bodyschema.vision.board.page import page as board_page
 from bodyschema.vision.calibration.calibrate import Asked, Calibrated, calibrate
 from bodyschema.vision.calibration.check import Check, check
 from bodyschema.vision.calibration.gather import Gathered, gathered, require_both
-from bodyschema.vision.calibration.images import ImagePair, Images, read_pairs, write_pair
+from bodyschema.vision.calibration.image_pairs import ImagePair, Images, read_pairs, write_pair
 from bodyschema.vision.calibration.live import LiveViews
 from bodyschema.vision.calibration.refocus import refocused
 from bodyschema.vision.calibration.report import page as report_page

@@ -1,4 +1,4 @@
-"""Calibrating the robot's own cameras: views are taken while a person moves the board, until it is good enough."""
+"""Run `calibrate cameras` on the robot's own cameras: take views while a person moves the board, until they suffice."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from bodyschema.vision.calibration.calibrate import Calibrated
 from bodyschema.vision.calibration.check import Check, check
 from bodyschema.vision.calibration.gather import Gathered, require_both
 from bodyschema.vision.calibration.guidance import TILTED_EACH_WAY, WANTED_VIEWS, Coverage, cell_counts
-from bodyschema.vision.calibration.images import ImagePair
+from bodyschema.vision.calibration.image_pairs import ImagePair
 from bodyschema.vision.calibration.live import LiveViews, Look, Outcome
 from bodyschema.vision.calibration.view import Eye, all_px, image_of
 from bodyschema.vision.rig.stereo_rig import CalibrationError

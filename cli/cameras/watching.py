@@ -17,7 +17,7 @@ from bodyschema.interfaces.errors import ConfigError, SourceEnded
 from bodyschema.interfaces.protocols import Clock, Source
 from bodyschema.interfaces.records import ImageArray
 from bodyschema.interfaces.whole_files import writing
-from bodyschema.vision.images import jpeg
+from bodyschema.vision.image_file import jpeg
 
 
 class Pictures(Source, Protocol):

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import ZenohSession, client
 from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.session import ZenohSession, client
 from bodyschema.daemon.transport.wire import JointsRequest, PredictReply, decode, encode
 from bodyschema.interfaces.errors import BusError, RequestError
 

@@ -21,11 +21,11 @@ from bodyschema.cli.demo.scene import Scene
 from bodyschema.cli.replay.processes import Process, end, started
 from bodyschema.cli.terminal.screen import rejected
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.session import ZenohSession
 from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import CommandRequest, JointsRequest, PairsReply, PredictReply, decode, encode
-from bodyschema.diagnosis.report.plot import Layout, Plot
+from bodyschema.diagnosis.report.svg_plot import Layout, Plot
 from bodyschema.interfaces.errors import BusError
 from bodyschema.interfaces.interpreter import module_command
 from bodyschema.interfaces.records import FloatArray

@@ -19,9 +19,9 @@ from rich.text import Text
 from bodyschema.cli.install.units import FOLDER
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.service.remedies import as_typed
-from bodyschema.daemon.transport.bus import ZenohSession, is_alive
 from bodyschema.daemon.transport.identity import Route
 from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.session import ZenohSession, is_alive
 from bodyschema.daemon.transport.status import SamplerStatus
 from bodyschema.daemon.transport.wire import decode
 from bodyschema.daemon.transport.zenoh_config import PROCESSES

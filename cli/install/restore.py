@@ -14,8 +14,8 @@ from typing import Any
 
 from bodyschema.daemon.config import ZenohConfig, state_home
 from bodyschema.daemon.learner.checkpoint import CheckpointError, read_checkpoint, write_checkpoint
-from bodyschema.daemon.transport.bus import is_alive
 from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.session import is_alive
 from bodyschema.interfaces.errors import ConfigError, StoreError
 from bodyschema.interfaces.whole_files import sync_folder, unused_name
 from bodyschema.recordings.store import schema as store_schema

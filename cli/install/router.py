@@ -19,8 +19,8 @@ import msgspec
 from bodyschema.daemon.service.notify import Notifier
 from bodyschema.daemon.service.service import Service
 from bodyschema.daemon.transport.access import EVERY_ROBOT, ROLES, Names, Subjects, access_control
-from bodyschema.daemon.transport.bus import LARGEST_REPLY_BYTES, LEASE_MS, ZenohSession
 from bodyschema.daemon.transport.identity import SECURE, Identity, TlsConfig
+from bodyschema.daemon.transport.session import LARGEST_REPLY_BYTES, LEASE_MS, ZenohSession
 from bodyschema.daemon.transport.zenoh_config import ENDPOINT, HOW_TO
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.protocols import Clock

@@ -9,8 +9,8 @@ from threading import Event
 from typing import TextIO
 
 from bodyschema.cli.recordings.rerun_scene import scene_for
-from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.session import ZenohSession
 from bodyschema.daemon.transport.wire import PairsReply, decode, pair_from_wire
 from bodyschema.interfaces.errors import BusError, RecordingError
 from bodyschema.interfaces.records import Pair

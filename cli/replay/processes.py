@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from bodyschema.daemon.service.signals import with_parent
-from bodyschema.daemon.transport.bus import is_alive
+from bodyschema.daemon.transport.session import is_alive
 from bodyschema.interfaces.errors import BusError
 from bodyschema.interfaces.interpreter import module_command
 

@@ -16,8 +16,8 @@ from bodyschema.cli.replay.processes import Process, free_endpoint, override, st
 from bodyschema.cli.replay.report import AngleFigures, Figures, ReplayReport
 from bodyschema.daemon.config import Config, DaemonConfig
 from bodyschema.daemon.sampler.align import joint_difference
-from bodyschema.daemon.transport.bus import ZenohSession, client
 from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.session import ZenohSession, client
 from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import JointsRequest, PredictReply, decode, encode
 from bodyschema.interfaces.errors import BusError, RecordingError

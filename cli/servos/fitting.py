@@ -93,14 +93,14 @@ def servo_tables(fitting: Fitting) -> str:
         ConfigError: the servos are of two vendors, or those on one port have different baud rates.
     """
     servos, known = list(fitting.servos.values()), known_models()
-    make = _make(servos)
+    vendor = _vendor(servos)
     names = _bus_names(servos)
     lines = ["", "# The servos, as `bodyschema scan` found them. docs/hardware.md has all keys."]
     for (port, baud), name in names.items():
-        lines += [f"[{make.table}.buses.{name}]", f"port = {toml_value(port)}", f"baud = {baud:_}", ""]
+        lines += [f"[{vendor.table}.buses.{name}]", f"port = {toml_value(port)}", f"baud = {baud:_}", ""]
     lines.append("# CHECK each with `bodyschema watch joints`: move the joint, and look where its angle goes.")
     for joint, servo in fitting.servos.items():
-        lines += [f"[[{make.table}.servos]]", f"joint = {toml_value(joint)}", f"id = {servo.id}"]
+        lines += [f"[[{vendor.table}.servos]]", f"joint = {toml_value(joint)}", f"id = {servo.id}"]
         lines.append(f"model = {toml_value(servo.model or '')}")
         if len(names) > 1:
             lines.append(f"bus = {toml_value(names[servo.port, servo.baud])}")
@@ -113,16 +113,16 @@ def servo_tables(fitting: Fitting) -> str:
     return "\n".join(lines)
 
 
-def _make(servos: Sequence[Candidate]) -> KnownModel:
+def _vendor(servos: Sequence[Candidate]) -> KnownModel:
     """Return the properties that the models of all `servos` share."""
     known = known_models()
-    makes = {known[servo.model or ""].table: known[servo.model or ""] for servo in servos}
-    if len(makes) > 1:
+    vendors = {known[servo.model or ""].table: known[servo.model or ""] for servo in servos}
+    if len(vendors) > 1:
         raise ConfigError(
-            f"the servos are of two makes, {' and '.join(makes)}, and an arm is of one",
+            f"the servos are of two vendors, {' and '.join(vendors)}, and an arm is of one",
             remedy="Give --port with the port of one of them, or - for the other's joints",
         )
-    return next(iter(makes.values()))
+    return next(iter(vendors.values()))
 
 
 def _bus_names(servos: Sequence[Candidate]) -> dict[tuple[str, int], str]:

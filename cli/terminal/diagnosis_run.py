@@ -1,4 +1,4 @@
-"""One diagnosis from the command line: where the pairs come from, what is asked, what is written."""
+"""Run a diagnosis for the commands: read the pairs, diagnose, write the files. `diagnosis_view.py` shows the result."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from bodyschema.calibration.plausibility.check import plausibility, told_sigma
 from bodyschema.calibration.plausibility.limits import require_units
 from bodyschema.cli.recordings.recorder import History
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import client
+from bodyschema.daemon.transport.session import client
 from bodyschema.diagnosis.assess.stored import predicted_pose_covariance
 from bodyschema.diagnosis.diagnosis import Diagnosis
 from bodyschema.diagnosis.diagnosis import diagnose as diagnosed
@@ -127,7 +127,7 @@ def _history(history: History, joints: tuple[str, ...]) -> Recording:
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class ReportedDiagnosis:
     """Diagnosis with its context for the report."""
 
     diagnosis: Diagnosis
@@ -181,7 +181,7 @@ class Found:
         return remedies(self.file, self.robot, ticks(self.source.recording.q), torques)
 
 
-def run(config: Config, source: Source, asked: Asked, tell: Tell, *, force: bool = False) -> Found:
+def run(config: Config, source: Source, asked: Asked, tell: Tell, *, force: bool = False) -> ReportedDiagnosis:
     """Diagnose.
 
     Args:
@@ -219,7 +219,7 @@ def run(config: Config, source: Source, asked: Asked, tell: Tell, *, force: bool
         raise DiagnosisError(
             f"{source.name}: nothing to look for. {' '.join(diagnosis.hypotheses.limitations)}".strip()
         )
-    return Found(diagnosis, source, robot, warnings)
+    return ReportedDiagnosis(diagnosis, source, robot, warnings)
 
 
 @contextmanager
@@ -251,7 +251,7 @@ def require_writable(folder: Path) -> None:
             pass
 
 
-def written(found: Found, folder: Path) -> None:
+def written(found: ReportedDiagnosis, folder: Path) -> None:
     """Write the files of DIR; raise ConfigError, RecordingError if they cannot be written."""
     about = About(found.source.name, found.robot.name, version("bodyschema"))
     heading = f"Found by bodyschema {about.version} in {len(found.source.recording)} pairs of {about.recording}"

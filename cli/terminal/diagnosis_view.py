@@ -1,4 +1,4 @@
-"""Show the results of a diagnosis in a terminal of 80 columns."""
+"""Show a finished diagnosis in a terminal of 80 columns."""
 
 from __future__ import annotations
 

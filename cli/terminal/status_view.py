@@ -16,9 +16,9 @@ from bodyschema.cli.terminal.findings_view import calibration_table, outlook_lin
 from bodyschema.cli.terminal.screen import coverage_table, degrees, mm, or_dash, rejected
 from bodyschema.daemon.client_config import ClientConfig
 from bodyschema.daemon.service.remedies import as_typed
-from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.identity import Route
 from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.session import ZenohSession
 from bodyschema.daemon.transport.status import UNDECIDED, LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import decode
 from bodyschema.daemon.transport.zenoh_config import PROCESSES

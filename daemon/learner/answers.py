@@ -9,7 +9,7 @@ from contextlib import ExitStack, contextmanager
 
 from bodyschema.daemon.sampler.reconnect import ReconnectingSource
 from bodyschema.daemon.sampler.sources import MarkerTopic, StampedJoints
-from bodyschema.daemon.transport.bus import Request
+from bodyschema.daemon.transport.session import Request
 from bodyschema.daemon.transport.wire import (
     IkReply,
     IkRequest,

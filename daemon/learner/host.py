@@ -26,9 +26,9 @@ from bodyschema.daemon.service.notify import Notifier
 from bodyschema.daemon.service.service import Service
 from bodyschema.daemon.service.signals import SignalFlags, tell_parent_serving
 from bodyschema.daemon.transport.access import Names, Subjects, access_control
-from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.identity import SECURE
 from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.session import ZenohSession
 from bodyschema.daemon.transport.wire import encode
 from bodyschema.interfaces.errors import ConfigError, StoreUnwritable
 from bodyschema.interfaces.protocols import Clock

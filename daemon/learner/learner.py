@@ -22,8 +22,8 @@ from bodyschema.daemon.learner.findings import Changes, Findings, FindingTurns
 from bodyschema.daemon.sampler.history import Page, read_page
 from bodyschema.daemon.service.reload import reload
 from bodyschema.daemon.service.service import Service, with_health
-from bodyschema.daemon.transport.bus import Request, ZenohSession
 from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.session import Request, ZenohSession
 from bodyschema.daemon.transport.status import LearnerStatus
 from bodyschema.daemon.transport.wire import OCTETS, CommandReply, CommandRequest, decode, encode
 from bodyschema.daemon.wiring.wiring import open_marker_topic

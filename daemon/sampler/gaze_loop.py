@@ -11,8 +11,8 @@ from typing import Self
 
 import numpy as np
 
-from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.session import ZenohSession
 from bodyschema.daemon.transport.wire import JointsRequest, PredictReply, decode, encode
 from bodyschema.interfaces.errors import BusError, ConfigError, RequestError
 from bodyschema.interfaces.protocols import Clock

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import msgspec
 
-from bodyschema.daemon.transport.bus import Request
+from bodyschema.daemon.transport.session import Request
 from bodyschema.daemon.transport.wire import PairMessage, PairsReply, decode, encode, pairs_to_wire
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.recordings.store.store import PairReader

@@ -22,8 +22,8 @@ from bodyschema.daemon.sampler.devices import (
 )
 from bodyschema.daemon.service.service import Service, with_health
 from bodyschema.daemon.service.signals import tell_parent_serving
-from bodyschema.daemon.transport.bus import Request, ZenohSession
 from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.session import Request, ZenohSession
 from bodyschema.daemon.transport.status import SamplerStatus
 from bodyschema.daemon.transport.wire import CommandReply, CommandRequest, decode, encode, pair_to_wire
 from bodyschema.interfaces.clock import SystemClock

@@ -10,7 +10,7 @@ from typing import Protocol, runtime_checkable
 
 import msgspec
 
-from bodyschema.daemon.transport.bus import Request
+from bodyschema.daemon.transport.session import Request
 from bodyschema.daemon.transport.wire import SCHEMA, CommandReply, decode, encode
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.errors import RequestError

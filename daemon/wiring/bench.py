@@ -177,9 +177,9 @@ def bench_robot_file(config: Config, bench: DryRun, port: Path) -> Path:
         case SerialLinesConfig() as board:
             tables["drivers"]["serial_lines"]["port"] = str(Path(board.port).absolute())
         case servos:
-            _, make = servos.table.split(".")
+            _, vendor = servos.table.split(".")
             for name, bus in servos.buses.items():
-                tables["drivers"][make]["buses"][name]["port"] = str(Path(bus.port).absolute())
+                tables["drivers"][vendor]["buses"][name]["port"] = str(Path(bus.port).absolute())
     tables.setdefault("daemon", {})["state_dir"] = str(port.with_name(f"{port.name}.state").absolute())
     if "unexplained" in tables:
         tables["unexplained"]["model"] = str((config.file.parent / tables["unexplained"]["model"]).resolve())

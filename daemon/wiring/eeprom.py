@@ -15,8 +15,8 @@ from bodyschema.drivers.feetech.config import FeetechConfig
 from bodyschema.drivers.feetech.joints import FEETECH
 from bodyschema.drivers.serial_line import SerialLine, adapter_latency_s
 from bodyschema.drivers.servos.config import ServoConfig
-from bodyschema.drivers.servos.handshake import IdentifiedServo
 from bodyschema.drivers.servos.model import Model
+from bodyschema.drivers.servos.servo import IdentifiedServo
 from bodyschema.drivers.servos.settings import BAUD, HOMING_OFFSET, ID, Setting, setting_called
 from bodyschema.drivers.servos.workbench import Change, Done, EepromEditor, Outcome
 from bodyschema.interfaces.clock import SystemClock
@@ -116,7 +116,7 @@ def entry_of(joint: str, id: int, model: Model) -> ServoConfig:
 
 
 def settings_by_name(workbench: EepromEditor, model: Model) -> Mapping[str, Setting]:
-    return {setting.name: setting for setting in workbench.make.settings(model)}
+    return {setting.name: setting for setting in workbench.vendor.settings(model)}
 
 
 def model_called(table: str, name: str) -> Model:

@@ -19,7 +19,7 @@ from bodyschema.interfaces.records import ImageArray, Reason
 from bodyschema.interfaces.waits import READ_S
 from bodyschema.robot.hand_eye import HandEye
 from bodyschema.robot.rpy import pose_of
-from bodyschema.vision.calibration.images import Images, read_pairs
+from bodyschema.vision.calibration.image_pairs import Images, read_pairs
 from bodyschema.vision.cluster.measure import ClusterView, MeasuredCluster, measure_cluster
 from bodyschema.vision.cluster.tables import cluster_tables
 from bodyschema.vision.rig.rectified import Rectification

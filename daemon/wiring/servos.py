@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 # PING is the same in Protocol 1.0 and in Feetech's protocol: one scan finds both.
 SCANNERS = (Protocol2Scanner(), PingScanner(PROTOCOL1, FEETECH_SERVOS))
 
-MAKES = {make.table: make for make in (DYNAMIXEL, FEETECH)}
+VENDORS = {vendor.table: vendor for vendor in (DYNAMIXEL, FEETECH)}
 Servos = DynamixelConfig | FeetechConfig
 
 
@@ -63,9 +63,9 @@ def require_servos(config: Config) -> Servos:
 def known_models() -> dict[str, KnownModel]:
     """Return the servo models that have a driver, by name."""
     return {
-        model.name: KnownModel(make.table, get_args(baud), model.zero_ticks)
-        for make, baud in ((DYNAMIXEL, DynamixelBaud), (FEETECH, FeetechBaud))
-        for model in make.models.values()
+        model.name: KnownModel(vendor.table, get_args(baud), model.zero_ticks)
+        for vendor, baud in ((DYNAMIXEL, DynamixelBaud), (FEETECH, FeetechBaud))
+        for model in vendor.models.values()
     }
 
 
@@ -126,7 +126,7 @@ def other_holders(config: Config) -> list[Holder]:
 def servo_checks(config: Config) -> Iterator[Check]:
     """Check the servos of robot.toml: presence, health, reading rate. Writes nothing."""
     servos = require_servos(config)
-    yield from checks_of_servos(MAKES[servos.table], servos, SystemClock())
+    yield from checks_of_servos(VENDORS[servos.table], servos, SystemClock())
 
 
 def encoder_checks(config: Config) -> Iterator[Check]:

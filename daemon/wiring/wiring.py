@@ -271,8 +271,8 @@ def _seen_by(config: Config) -> str:
 
 def _tracked_cameras(config: Config, clock: Clock) -> tuple[MarkerSource, TellsHealth, StereoCalibration, Picture]:
     """Return the cameras of robot.toml with their tracker, not opened yet, their health, calibration and picture."""
+    from bodyschema.vision.cameras.depth_check import DepthChecked
     from bodyschema.vision.cameras.realsense import RealsenseCamera
-    from bodyschema.vision.depth_check import DepthChecked
 
     from .cameras import camera_of, open_eyes
 

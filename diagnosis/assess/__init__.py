@@ -1,1 +1,1 @@
-"""Assess causes against alternatives, and what they leave unexplained."""
+"""Assess causes against alternatives, and the residual structure that they leave."""

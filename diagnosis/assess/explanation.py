@@ -13,7 +13,7 @@ from bodyschema.diagnosis.fit.worth import NAMED
 from bodyschema.diagnosis.search.held_out import Blocks, held_out_errors, is_marker
 from bodyschema.diagnosis.search.search import Search, describe, named
 from bodyschema.diagnosis.search.together import beyond_tolerances, is_at_limit, tolerated
-from bodyschema.diagnosis.unnamed.unknown import Apart, Unknowns, Way
+from bodyschema.diagnosis.unnamed.family_fits import Apart, UnnamedFamilies, Way
 from bodyschema.effects import Effect
 from bodyschema.interfaces.records import FloatArray
 
@@ -25,7 +25,7 @@ class _Settings:
     """
 
     margin = 8.0  # unnamed causes are accepted if they are more probable than named ones alone by this [nats]
-    most_unknowns = 3
+    most_unnamed = 3
     slack = 1.2  # safety factor on the first-order gain of several unnamed causes
     number = 3.0  # cost of each parameter of a named cause when sets of causes are compared [nats]
     # The imperfect shape of large causes is not an unnamed cause, up to a share of all causes, and a larger share of
@@ -75,18 +75,18 @@ class Explanation:
         return self.fit if self.apart is None else self.apart.fit
 
     @property
-    def unknown(self) -> tuple[Way, ...]:
+    def unnamed_causes(self) -> tuple[Way, ...]:
         """The unnamed causes."""
         return () if self.apart is None else self.apart.chosen
 
     @property
     def is_specific(self) -> bool:
         """True if every unnamed cause is as specific as a named one."""
-        return all(way.family.is_specific for way in self.unknown)
+        return all(way.family.is_specific for way in self.unnamed_causes)
 
 
 def explain(
-    found: Fit, tried: Iterable[Fit], unknowns: Unknowns, search: Search, tell: Callable[[str], None]
+    found: Fit, tried: Iterable[Fit], unnamed: UnnamedFamilies, search: Search, tell: Callable[[str], None]
 ) -> Explanation:
     """Keep the causes found, unless fewer of them with unnamed causes are clearly more probable.
 
@@ -98,28 +98,28 @@ def explain(
         tried: the fits along the search, the first without any cause.
     """
     path = list(tried)
-    best = _compared(found, path, unknowns, search, 1.0)
+    best = _compared(found, path, unnamed, search, 1.0)
     independence = best.beside.independence
     if best.apart is not None and independence < 1.0:
-        best = _compared(found, path, unknowns, search, independence)
+        best = _compared(found, path, unnamed, search, independence)
     if best.apart is not None:
         tell("something that none of the effects explains")
     return best
 
 
-def _compared(found: Fit, path: Sequence[Fit], unknowns: Unknowns, search: Search, counted: float) -> Explanation:
+def _compared(found: Fit, path: Sequence[Fit], unnamed: UnnamedFamilies, search: Search, counted: float) -> Explanation:
     """Return the most probable explanation.
 
     Args:
         counted: effective number of independent rows per row.
     """
     whole = _length(found, found.run.measured - path[0].run.measured)
-    best = _with_unknown(found, unknowns, search, counted)
+    best = _with_unnamed(found, unnamed, search, counted)
     inexact = max(_Settings.of_the_causes * whole, _Settings.of_the_way * _length(found, changed_by_the_way(found)))
     if is_at_limit(found.background.scales):
         # Causes of an arm that no workshop made have not been found, so what is left is not their shape.
         inexact = 0.0
-    if best.apart is not None and (best.size < inexact or not unknowns.predicts(best.apart, found)):
+    if best.apart is not None and (best.size < inexact or not unnamed.predicts(best.apart, found)):
         best = replace(best, apart=None, size=0.0)
     # Named causes that explain nearly everything are not given up for what explains the rest.
     is_rest = best.size < _Settings.rest * whole
@@ -133,24 +133,24 @@ def _compared(found: Fit, path: Sequence[Fit], unknowns: Unknowns, search: Searc
             continue
         looked_at.add(looked)
         narrower = found.background.volume(found.noise.sigma) - fit.background.volume(found.noise.sigma)
-        least = best.worth - (_Settings.as_good if best.unknown else 0.0)
+        least = best.worth - (_Settings.as_good if best.unnamed_causes else 0.0)
         if hope + counted * narrower - cost_of_names(fit.causes, search) < least:
             continue
-        other = _with_unknown(fit, unknowns, search, counted, least)
+        other = _with_unnamed(fit, unnamed, search, counted, least)
         if other.apart is not None and not fit.causes and other.worth > best.worth - _Settings.near:
             # The scales of a fit without causes are those of an arm without unnamed causes, or a guess.
-            other = _rescaled(other, other.apart, unknowns, search)
+            other = _rescaled(other, other.apart, unnamed, search)
         clearly = margin if best.fit is found and not other.is_specific else 0.0
         better = other.worth > best.worth + clearly and not _is_as_good(best, other)
         better = better or _is_as_good(other, best)
-        if other.apart is not None and better and unknowns.predicts(other.apart, found):
+        if other.apart is not None and better and unnamed.predicts(other.apart, found):
             best = other
     if best.apart is not None:
         # Linearised about what is found beside them: without them, tolerances follow them far from there. In the
         # contest nothing is linearised again, where named causes are not either.
         about = best.apart.fit.tolerating(tolerated(best.apart.fit).scales).to(best.fit.observations)
-        best = _rescaled(best, best.apart, unknowns, search, about)
-        best = _pruned(best, unknowns, search, rest=is_rest and best.fit is found)
+        best = _rescaled(best, best.apart, unnamed, search, about)
+        best = _pruned(best, unnamed, search, rest=is_rest and best.fit is found)
     return replace(best, inexact=inexact)
 
 
@@ -161,7 +161,7 @@ def useful(explanation: Explanation, search: Search, blocks: Blocks, tell: Calla
     one by chance. Such a cause stays if it is more probable than these tolerances.
     """
     fit = explanation.fit
-    if explanation.unknown or fit.is_exact:
+    if explanation.unnamed_causes or fit.is_exact:
         return explanation
     while fit.causes:
         markers, error = is_marker(fit), _missed(fit, blocks)
@@ -209,7 +209,7 @@ def _missed(fit: Fit, blocks: Blocks) -> FloatArray:
 
 
 def _rescaled(
-    best: Explanation, apart: Apart, unknowns: Unknowns, search: Search, about: Fit | None = None
+    best: Explanation, apart: Apart, unnamed: UnnamedFamilies, search: Search, about: Fit | None = None
 ) -> Explanation:
     """Refit with the tolerance scales found beside the unnamed causes, where that is more probable.
 
@@ -217,17 +217,17 @@ def _rescaled(
         about: the named causes with these scales, linearised elsewhere.
     """
     scales = tolerated(apart.fit).scales
-    again = _with_unknown(about or best.fit.tolerating(scales), unknowns, search, best.counted)
+    again = _with_unnamed(about or best.fit.tolerating(scales), unnamed, search, best.counted)
     before = best.fit.background.scales
     gained = again.worth - best.worth - scales.doubt + (0.0 if before is None else before.doubt)
-    return again if again.unknown and gained > 0.0 else best
+    return again if again.unnamed_causes and gained > 0.0 else best
 
 
 def _is_as_good(fewer: Explanation, explanation: Explanation) -> bool:
     """Return True if fewer named causes do as well with a subset of the same unnamed causes."""
     if len(fewer.fit.causes) >= len(explanation.fit.causes):
         return False
-    ways, needed = ({way.family.what for way in one.unknown} for one in (explanation, fewer))
+    ways, needed = ({way.family.what for way in one.unnamed_causes} for one in (explanation, fewer))
     return bool(needed) and needed <= ways and fewer.worth > explanation.worth - _Settings.as_good
 
 
@@ -245,27 +245,29 @@ def _length(fit: Fit, change: FloatArray) -> float:
     return float(np.sqrt(np.square(fit.observations.whitened(change[:, :, None])).mean()))
 
 
-def _with_unknown(fit: Fit, unknowns: Unknowns, search: Search, counted: float, least: float = -np.inf) -> Explanation:
+def _with_unnamed(
+    fit: Fit, unnamed: UnnamedFamilies, search: Search, counted: float, least: float = -np.inf
+) -> Explanation:
     """Add worthwhile unnamed causes one by one; stop where the total will hardly reach `least` [nats]."""
     apart: Apart | None = None
     promise, names = -np.inf, cost_of_names(fit.causes, search)
-    while not fit.is_exact and (apart is None or len(apart.chosen) < _Settings.most_unknowns):
+    while not fit.is_exact and (apart is None or len(apart.chosen) < _Settings.most_unnamed):
         here, chosen = (fit, ()) if apart is None else (apart.fit, apart.chosen)
-        near = unknowns.nearest(here, chosen, counted)
+        near = unnamed.nearest(here, chosen, counted)
         way, more = near[0]
         promise = more if apart is None else promise
-        spent = 0.0 if apart is None else unknowns.cost(apart)
+        spent = 0.0 if apart is None else unnamed.cost(apart)
         worth = counted * here.log_likelihood - names - spent
         # Each remaining unnamed cause is worth hardly more than this one.
-        if worth + _Settings.slack * (_Settings.most_unknowns - len(chosen)) * max(more, 0.0) < least:
+        if worth + _Settings.slack * (_Settings.most_unnamed - len(chosen)) * max(more, 0.0) < least:
             break
-        if more < NAMED or (more < _Settings.beyond_doubt and unknowns.agreed(here, chosen, way) < 0.0):
+        if more < NAMED or (more < _Settings.beyond_doubt and unnamed.agreed(here, chosen, way) < 0.0):
             break
-        tried = [unknowns.apart(fit, (*chosen, way), apart) for way, _ in near]
-        apart = max(tried, key=lambda one: counted * one.fit.log_likelihood - unknowns.cost(one))
+        tried = [unnamed.apart(fit, (*chosen, way), apart) for way, _ in near]
+        apart = max(tried, key=lambda one: counted * one.fit.log_likelihood - unnamed.cost(one))
     if apart is None:
         return Explanation(fit, None, counted * fit.log_likelihood - names, promise=promise, counted=counted)
-    worth = counted * apart.fit.log_likelihood - names - unknowns.cost(apart)
+    worth = counted * apart.fit.log_likelihood - names - unnamed.cost(apart)
     return Explanation(fit, apart, worth, _length(fit, apart.predicted - fit.predicted), promise, counted)
 
 
@@ -274,19 +276,19 @@ def cost_of_names(causes: Iterable[Effect], search: Search) -> float:
     return sum(_Settings.number * len(effect.amounts) + search.doubt_of(effect) for effect in causes)
 
 
-def _pruned(explanation: Explanation, unknowns: Unknowns, search: Search, *, rest: bool) -> Explanation:
+def _pruned(explanation: Explanation, unnamed: UnnamedFamilies, search: Search, *, rest: bool) -> Explanation:
     """Remove causes not worth keeping beside unnamed ones; with a remainder, those the unnamed ones can replace."""
     for cause in explanation.fit.causes:
         least = explanation.worth - (_Settings.as_good if rest else NAMED)
-        fewer = without_one(explanation, cause, unknowns, search, least)
+        fewer = without_one(explanation, cause, unnamed, search, least)
         redundant = _is_as_good(fewer, explanation) if rest else fewer.worth > least
-        if fewer.unknown and redundant:
+        if fewer.unnamed_causes and redundant:
             explanation = fewer
     return explanation
 
 
 def without_one(
-    explanation: Explanation, cause: Effect, unknowns: Unknowns, search: Search, least: float = -np.inf
+    explanation: Explanation, cause: Effect, unnamed: UnnamedFamilies, search: Search, least: float = -np.inf
 ) -> Explanation:
     """Return the explanation without one of its causes; it is given up where it will hardly reach `least` [nats]."""
-    return _with_unknown(explanation.fit.without(cause), unknowns, search, explanation.counted, least)
+    return _with_unnamed(explanation.fit.without(cause), unnamed, search, explanation.counted, least)

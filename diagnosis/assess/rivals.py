@@ -14,12 +14,12 @@ from bodyschema.diagnosis.fit.worth import SAME
 from bodyschema.diagnosis.search.held_out import Blocks, beside_fit
 from bodyschema.diagnosis.search.scan import Candidate
 from bodyschema.diagnosis.search.search import Search
-from bodyschema.diagnosis.unnamed.unknown import Unknowns
+from bodyschema.diagnosis.unnamed.family_fits import UnnamedFamilies
 from bodyschema.effects import Effect, EffectType, Motion
 from bodyschema.effects.encoder import EncoderEffect
 from bodyschema.interfaces.records import FloatArray
 
-from .nameless import Nameless
+from .unnamed_alternative import UnnamedAlternative
 
 
 class _Settings:
@@ -58,8 +58,8 @@ class Rival:
             corrected.
     """
 
-    instead: Fit | Nameless
-    itself: Effect | Nameless
+    instead: Fit | UnnamedAlternative
+    itself: Effect | UnnamedAlternative
     probability: float
     difference: float
     anywhere: float
@@ -99,17 +99,19 @@ class Standing:
     is_like_sag: bool = False
 
 
-def standings(fit: Fit, search: Search, blocks: Blocks, seed: int, unknowns: Unknowns | None = None) -> list[Standing]:
+def standings(
+    fit: Fit, search: Search, blocks: Blocks, seed: int, unnamed: UnnamedFamilies | None = None
+) -> list[Standing]:
     """Assess each cause of a fit.
 
     Args:
-        unknowns: unnamed families that may be rivals as well.
+        unnamed: unnamed families that may be rivals as well.
     """
-    return [_standing(fit, cause, search, blocks, seed, unknowns) for cause in fit.causes]
+    return [_standing(fit, cause, search, blocks, seed, unnamed) for cause in fit.causes]
 
 
 def _standing(
-    fit: Fit, cause: Effect, search: Search, blocks: Blocks, seed: int, unknowns: Unknowns | None
+    fit: Fit, cause: Effect, search: Search, blocks: Blocks, seed: int, unnamed: UnnamedFamilies | None
 ) -> Standing:
     beside = search.beside(fit, cause)
     without = beside.without
@@ -130,13 +132,13 @@ def _standing(
         alike = remembers(cause) and remembers(candidate.effect)
         tried.append((rival, candidate.effect))
         behind.append(more + (beyond_single_rows(fit, rival) if alike else 0.0))
-    others: list[tuple[Fit | Nameless, Effect | Nameless]] = [_as_fitted(*one) for one in tried]
-    if unknowns is not None:
-        near = unknowns.specific(without, _Settings.comes_near * itself.gain)
-        aparts = [unknowns.apart(without, (way,)) for way in near]
-        if (nameless := Nameless.in_place_of(cause, fit, aparts, unknowns, search)) is not None:
-            others.append((nameless, nameless))
-            behind.append(nameless.behind)
+    others: list[tuple[Fit | UnnamedAlternative, Effect | UnnamedAlternative]] = [_as_fitted(*one) for one in tried]
+    if unnamed is not None:
+        near = unnamed.specific(without, _Settings.comes_near * itself.gain)
+        aparts = [unnamed.apart(without, (way,)) for way in near]
+        if (alternative := UnnamedAlternative.in_place_of(cause, fit, aparts, unnamed, search)) is not None:
+            others.append((alternative, alternative))
+            behind.append(alternative.behind)
     # What a cause is worth allows for blocks already.
     rows = [np.zeros(len(fit.left)), *(_at_rows(fit, other, cause, itself) for other, itself in others)]
     probable = bagged([-worth, *behind], rows, blocks, seed)
@@ -155,7 +157,7 @@ def _standing(
     return Standing(itself, float(probable[0]) + same, itself.dof, gain, ordered, sags)
 
 
-def can_be_measured(cause: Effect, rival: Effect | Nameless) -> bool:
+def can_be_measured(cause: Effect, rival: Effect | UnnamedAlternative) -> bool:
     """Return True if a rule tells a cause from its rival: a wrong scale of all from a wrong length of the arm."""
     return isinstance(rival, Effect) and cause.kind.scales_all != rival.kind.scales_all
 
@@ -206,7 +208,9 @@ def bagged(behind: Sequence[float], rows: Sequence[FloatArray], blocks: Blocks, 
     return np.asarray((odds / odds.sum(axis=0)).mean(axis=1), dtype=np.float64)
 
 
-def _at_rows(fit: Fit, other: Fit | Nameless, cause: Effect, itself: Effect | Nameless) -> FloatArray:
+def _at_rows(
+    fit: Fit, other: Fit | UnnamedAlternative, cause: Effect, itself: Effect | UnnamedAlternative
+) -> FloatArray:
     """Return the log-likelihood of an alternative over a fit at each row (n,) [nats]."""
     there = other if isinstance(other, Fit) else other.apart.fit
     if isinstance(itself, Effect) and remembers(cause) and remembers(itself):
@@ -214,7 +218,7 @@ def _at_rows(fit: Fit, other: Fit | Nameless, cause: Effect, itself: Effect | Na
     return there.row_log_likelihoods - fit.row_log_likelihoods
 
 
-def _is_no_more(other: Fit | Nameless, fit: Fit, without: Fit, wide: Motion) -> bool:
+def _is_no_more(other: Fit | UnnamedAlternative, fit: Fit, without: Fit, wide: Motion) -> bool:
     """Return True if the cause, refitted, covers all that a rival can do on any motion."""
     if not isinstance(other, Fit):
         return True
@@ -225,7 +229,7 @@ def _as_fitted(fit: Fit, effect: Effect) -> tuple[Fit, Effect]:
     return fit, next(cause for cause in fit.causes if cause.identity == effect.identity)
 
 
-def _difference(one: Fit, other: Fit | Nameless) -> float:
+def _difference(one: Fit, other: Fit | UnnamedAlternative) -> float:
     """Return the Δχ² by which the predictions of two fits differ over their observations."""
     predicted = other.predicted
     apart = one.observations.whitened((one.predicted - predicted)[:, :, None])[:, :, 0]
@@ -263,7 +267,7 @@ def whole_range(fit: Fit, joint: int) -> tuple[float, float]:
     return max(low, float(q.min()) - reach), min(high, float(q.max()) + reach)
 
 
-def apart_on(one: Fit, other: Fit | Nameless, motion: Motion) -> float:
+def apart_on(one: Fit, other: Fit | UnnamedAlternative, motion: Motion) -> float:
     """Return the Δχ² by which two fits differ on a motion as long as theirs, the other refitted to it."""
     there = other.simulation.positions(motion) if isinstance(other, Fit) else other.positions(motion)
     left = _beside(one.simulation.positions(motion) - there, _columns(other, motion))
@@ -272,9 +276,9 @@ def apart_on(one: Fit, other: Fit | Nameless, motion: Motion) -> float:
     return float(np.square(left * scale).sum() / one.noise.sigma**2 * share)
 
 
-def _columns(fit: Fit | Nameless, motion: Motion) -> FloatArray:
+def _columns(fit: Fit | UnnamedAlternative, motion: Motion) -> FloatArray:
     """Return derivatives (n, 3, p) [m] of predictions on a motion by the amounts of a fit."""
-    if isinstance(fit, Nameless):
+    if isinstance(fit, UnnamedAlternative):
         return fit.columns(motion)
     return amount_columns(fit.simulation.run(motion), fit.simulation.effects)
 

@@ -33,7 +33,7 @@ def shares(aligned: Fit, extended: Fit, kept: NDArray[np.bool_], unnamed: FloatA
 
     Args:
         kept: rows that count (n,).
-        unnamed: change (n, 3) [m] by the smooth model of what has no name; None where there is none.
+        unnamed: change (n, 3) [m] by the smooth model of unnamed causes; None where there is none.
     """
     simulation, motion = extended.simulation, extended.observations.motion
     left = _beside_nuisances(extended, (extended.observations.x - aligned.predicted)[kept], kept)

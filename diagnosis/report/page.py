@@ -19,7 +19,7 @@ from bodyschema.diagnosis.report.text import corrections, finding, in_order, mad
 from bodyschema.effects import Effect
 
 from . import tables
-from .panels import Panel, arrows, histogram, panels
+from .panels import Panel, arrows, error_panels, histogram
 from .residuals import Residuals
 
 _STYLE = (Path(__file__).parent / "page.css").read_text(encoding="utf-8")
@@ -189,7 +189,7 @@ _KEY = '<span class="before">■ before</span> <span class="after">■ after</sp
 
 
 def _against(residuals: Residuals) -> str:
-    found = panels(residuals)
+    found = error_panels(residuals)
     telling = [panel for panel in found if panel.is_telling]
     silent = [panel for panel in found if not panel.is_telling]
     shown = f'<div class="panels">{_panels(telling)}</div>' if telling else "<p>Nothing: the error depends on none.</p>"

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray
 
-from .plot import ASPECT, Layout, Plot, round_up, span
 from .residuals import ARROWS, POINTS, Residuals, binned, structure
+from .svg_plot import ASPECT, Layout, Plot, round_up, span
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Panel:
         return f"<figure><figcaption>{escape(self.title)}</figcaption>{self.svg}</figure>"
 
 
-def panels(residuals: Residuals) -> list[Panel]:
+def error_panels(residuals: Residuals) -> list[Panel]:
     """Return all panels, the most informative first; those over time come last, as they show moments."""
     found = [*_by_joint(residuals), *_by_torque(residuals), *_by_image(residuals)]
     direction = _by_direction(residuals)

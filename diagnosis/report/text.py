@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from bodyschema.diagnosis.assess.nameless import Nameless
 from bodyschema.diagnosis.assess.rivals import Rival, Standing, apart_on, can_be_measured, whole_range, widened
+from bodyschema.diagnosis.assess.unnamed_alternative import UnnamedAlternative
 from bodyschema.diagnosis.diagnosis import Diagnosis
-from bodyschema.diagnosis.report.presenters.presenter import Found, Workshop
+from bodyschema.diagnosis.report.presenters.presenter import FoundCause, Workshop
 from bodyschema.diagnosis.report.presenters.registry import named, presenter_of, rival_named
 from bodyschema.effects import Effect
 from bodyschema.effects.unexplained import PLACE
@@ -87,9 +87,9 @@ def finding(
     Args:
         numbers: only the shifts and turns given count.
         seen_by: the kind of measuring device, as in `DiagnosisFile`.
-        timed, weighed: as in `Found`.
+        timed, weighed: as in `FoundCause`.
     """
-    return presenter_of(name).finding(Found(where, source, numbers, seen_by, timed, weighed))
+    return presenter_of(name).finding(FoundCause(where, source, numbers, seen_by, timed, weighed))
 
 
 def remedies(diagnosis: DiagnosisFile, robot: RobotDescription, steps: FloatArray, torques: FloatArray) -> list[str]:
@@ -101,7 +101,7 @@ def remedies(diagnosis: DiagnosisFile, robot: RobotDescription, steps: FloatArra
     """
     workshop = Workshop(robot, steps, torques, {cause.effect: cause for cause in diagnosis.causes})
     causes = in_order(diagnosis.causes)
-    found = [replace(Found.of(cause), weighed=diagnosis.weighed) for cause in causes]
+    found = [replace(FoundCause.of(cause), weighed=diagnosis.weighed) for cause in causes]
     told = [presenter_of(each.effect).remedy(workshop, what) for each, what in zip(causes, found, strict=True)]
     return [_if_sure(cause, remedy, diagnosis) for cause, remedy in zip(causes, told, strict=True)]
 
@@ -137,7 +137,7 @@ def sentence(
         named_mm: RMS without the smooth model of unnamed causes [mm], where there is one.
         tolerated_mm: RMS with small errors everywhere and no cause [mm], where such errors show.
         seen_by: the kind of measuring device, as in `DiagnosisFile`.
-        timed, weighed: as in `Found`.
+        timed, weighed: as in `FoundCause`.
     """
     figures = f"{rms.aligned:.3g} → {rms.extended:.3g} mm on held-out data"
     nothing = not causes and verdict != "unexplained"
@@ -295,7 +295,7 @@ def evidence(standing: Standing, seen_by: str) -> str:
     return f"{text}; the nearest rival: {called(rival.itself, seen_by)} ({100 * rival.probability:.0f} %)."
 
 
-def called(cause: Effect | Nameless, seen_by: str) -> str:
+def called(cause: Effect | UnnamedAlternative, seen_by: str) -> str:
     """Return a cause or an alternative without a name in a few words."""
     return named(*cause.key, seen_by) if isinstance(cause, Effect) else cause.what
 
@@ -323,12 +323,12 @@ def advice(diagnosis: Diagnosis, causes: Sequence[Cause], seen_by: str) -> tuple
                 )
             elif isinstance(rival.itself, Effect):
                 told.append(f"No motion tells {one} from {other}: fix whichever is easier.")
-            if isinstance(rival.itself, Nameless):
+            if isinstance(rival.itself, UnnamedAlternative):
                 told.append(f"Watch whether {other}: {_WATCH[rival.itself.kind]}.")
     told = [f"To tell {_some(told_apart)}, {motion}." for motion, told_apart in pairs.items()] + told
     if diagnosis.left.rattle is not None:
         told.append(f"Fasten the marker: {diagnosis.left.rattle.what}.")
-    if what := diagnosis.left.nameless:
+    if what := diagnosis.left.unnamed:
         joints = [diagnosis.extended.simulation.robot.joints[k] for k in diagnosis.left.joints]
         where = f" Look at {', '.join(joints)} first." if joints else ""
         told.append(f"None of the known effects fits {'; '.join(what)}.{where}{_of_the_model(diagnosis)}")

@@ -1,1 +1,1 @@
-"""Model discrepancies that no effect names."""
+"""Unnamed causes: errors that no effect describes, found as families of smooth functions."""

@@ -16,13 +16,13 @@ from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
 from kbmaps.rotations import cross_matrix
 
-from .eyes import by_turn, undone
+from .vergence import by_turn, undone
 
 
 class _Settings:
     """Settings of the families.
 
-    Sensitivity, each at 0.3 and 3 times over the same three recordings as in unknown.py: `harmonics` at 3 times cost so
+    Sensitivity, each at 0.3 and 3 times over the three recordings of family_fits.py: `harmonics` at 3 times cost so
     much that wrong causes are named; fewer `harmonics` or `times` change what is rejected. The others change nothing.
     """
 

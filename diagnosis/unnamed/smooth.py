@@ -19,7 +19,7 @@ from bodyschema.effects import Motion, Simulated, Unexplained, place_map, smooth
 from bodyschema.interfaces.records import FloatArray
 
 from .families import Family
-from .unknown import Apart
+from .family_fits import Apart
 
 
 class _Settings:

@@ -9,7 +9,7 @@ from bodyschema.drivers.servos.bus import BITS_PER_BYTE, Answer, Exchange, Reque
 from bodyschema.drivers.servos.bus import Bus as ServoBus
 from bodyschema.drivers.servos.model import Layout, Register
 from bodyschema.drivers.servos.packets import Packets
-from bodyschema.drivers.servos.scan import IDS, Kind, PingScanner, heard
+from bodyschema.drivers.servos.scan import IDS, PingScanner, ServoProtocol, heard
 from bodyschema.interfaces.protocols import Clock
 
 from .models import BY_NUMBER, FAST_HEADER, FASTEST1, HARDWARE_ERRORS, PING_SLOT_S, UNSUPPORTED
@@ -65,8 +65,8 @@ class Bus(ServoBus):
 LIKELY_FIRST = (1_000_000, 57_600, 2_000_000, 115_200, 3_000_000, 4_000_000, 9_600)
 
 
-def _kind(version: Version) -> Kind:
-    return Kind(
+def _protocol(version: Version) -> ServoProtocol:
+    return ServoProtocol(
         name=f"Dynamixel {version}.0",
         bauds=tuple(baud for baud in LIKELY_FIRST if version == 2 or baud <= FASTEST1),
         version=version,
@@ -77,7 +77,7 @@ def _kind(version: Version) -> Kind:
     )
 
 
-PROTOCOL1, PROTOCOL2 = _kind(1), _kind(2)
+PROTOCOL1, PROTOCOL2 = _protocol(1), _protocol(2)
 
 
 class Protocol2Scanner(PingScanner):

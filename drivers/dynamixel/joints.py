@@ -18,9 +18,9 @@ from bodyschema.drivers.servos.bus import Answer
 from bodyschema.drivers.servos.bus import Bus as ServoBus
 from bodyschema.drivers.servos.channel import Channel as ServoChannel
 from bodyschema.drivers.servos.channel import Sample
-from bodyschema.drivers.servos.handshake import IdentifiedServo
 from bodyschema.drivers.servos.joints import ServoJoints
 from bodyschema.drivers.servos.model import Model, Register
+from bodyschema.drivers.servos.servo import IdentifiedServo
 from bodyschema.drivers.servos.settings import (
     BAUD,
     HOMING_OFFSET,
@@ -184,4 +184,4 @@ DYNAMIXEL = ServoVendor(
 class DynamixelJoints(ServoJoints):
     """An arm of Dynamixel servos as a `JointSource`; see `ServoJoints`."""
 
-    make = DYNAMIXEL
+    vendor = DYNAMIXEL

@@ -15,8 +15,9 @@ import numpy as np
 
 from bodyschema.drivers.servos.bus import Bus as ServoBus
 from bodyschema.drivers.servos.channel import Sample
-from bodyschema.drivers.servos.handshake import ATTEMPTS, IdentifiedServo, switch_torque_off
+from bodyschema.drivers.servos.handshake import ATTEMPTS, switch_torque_off
 from bodyschema.drivers.servos.model import Register
+from bodyschema.drivers.servos.servo import IdentifiedServo
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import FloatArray, JointReading

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 
 from bodyschema.drivers.servos.channel import Sample
-from bodyschema.drivers.servos.handshake import IdentifiedServo
+from bodyschema.drivers.servos.servo import IdentifiedServo
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import FloatArray, frozen_array

@@ -10,11 +10,11 @@ from bodyschema.drivers.servos.bus import Answer, Request, spare_after
 from bodyschema.drivers.servos.bus import Bus as ServoBus
 from bodyschema.drivers.servos.channel import Channel as ServoChannel
 from bodyschema.drivers.servos.channel import Sample
-from bodyschema.drivers.servos.handshake import IdentifiedServo
 from bodyschema.drivers.servos.joints import ServoJoints
 from bodyschema.drivers.servos.model import Model, Register
 from bodyschema.drivers.servos.packets import Packets, Status, summed, take_summed
-from bodyschema.drivers.servos.scan import Kind
+from bodyschema.drivers.servos.scan import ServoProtocol
+from bodyschema.drivers.servos.servo import IdentifiedServo
 from bodyschema.drivers.servos.settings import (
     BAUD,
     HOMING_OFFSET,
@@ -175,7 +175,9 @@ FEETECH = ServoVendor(FeetechConfig.table, BY_NUMBER, HARDWARE_ERRORS, Bus, Chan
 class FeetechJoints(ServoJoints):
     """An arm of Feetech servos with torque off as a `JointSource`; see `ServoJoints`."""
 
-    make = FEETECH
+    vendor = FEETECH
 
 
-FEETECH_SERVOS = Kind(name="Feetech", bauds=BAUDS, version=STS, models=BY_NUMBER, errors=HARDWARE_ERRORS, bus=Bus)
+FEETECH_SERVOS = ServoProtocol(
+    name="Feetech", bauds=BAUDS, version=STS, models=BY_NUMBER, errors=HARDWARE_ERRORS, bus=Bus
+)

@@ -246,10 +246,10 @@ class FusedMarkers:
         return replace(fix, x=frozen_array(x), cov=frozen_array(cov), centres_px=None)
 
 
-Found = list[tuple[FloatArray, FloatArray]]
+Positions = list[tuple[FloatArray, FloatArray]]
 
 
-def _agreeing(found: Found) -> Found:
+def _agreeing(found: Positions) -> Positions:
     """Return those that agree with the mean of the others, without the worst until all do; empty if no two agree."""
     left = list(found)
     while len(left) > 1:
@@ -264,7 +264,7 @@ def _agreeing(found: Found) -> Found:
     return left if len(found) == 1 else []
 
 
-def _mean(found: Found) -> tuple[FloatArray, FloatArray]:
+def _mean(found: Positions) -> tuple[FloatArray, FloatArray]:
     """Return the mean of positions weighted by their inverse covariances, and its covariance."""
     informations = [np.linalg.inv(cov) for _, cov in found]
     cov = np.linalg.inv(sum(informations, np.zeros((3, 3))))

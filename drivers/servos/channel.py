@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Protocol
 
-from bodyschema.drivers.servos.handshake import IdentifiedServo
+from bodyschema.drivers.servos.servo import IdentifiedServo
 from bodyschema.interfaces.records import JointReading
 
 from .bus import Answer, Bus

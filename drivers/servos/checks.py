@@ -15,8 +15,9 @@ from bodyschema.interfaces.protocols import Clock
 
 from .bus import Bus, Request
 from .config import ServosConfig
-from .handshake import Finding, IdentifiedServo, ask_again, identify
+from .handshake import Finding, ask_again, identify
 from .joints import OpenPort, open_serial
+from .servo import IdentifiedServo
 from .vendor import ServoVendor, plans_of
 
 IDENTIFY_S = 1.0  # servos not yet asked by then are not asked any more
@@ -27,7 +28,7 @@ FAST_BAUD = 1_000_000
 
 
 def servo_checks(
-    make: ServoVendor,
+    vendor: ServoVendor,
     config: ServosConfig[Any],
     clock: Clock,
     open_port: OpenPort = open_serial,
@@ -41,27 +42,27 @@ def servo_checks(
             for name, bus in config.buses.items():
                 port, latency_s = open_port(bus, clock)
                 stack.callback(port.close)
-                buses[name] = make.bus(name, without_echo(port, clock, latency_s), clock, latency_s)
-            found = _identified(make, config, buses, clock)
+                buses[name] = vendor.bus(name, without_echo(port, clock, latency_s), clock, latency_s)
+            found = _identified(vendor, config, buses, clock)
             yield from _presence(found)
             servos = [finding.servo for finding in found if finding.servo is not None]
             for servo in servos:
-                yield from _health(make, buses[servo.bus], servo)
+                yield from _health(vendor, buses[servo.bus], servo)
             yield from _delays(servos)
             if servos:
-                yield from _pace(make, config, buses, servos, clock, read_s)
+                yield from _pace(vendor, config, buses, servos, clock, read_s)
         except SourceError as error:
             yield Check(TYPE, "wrong", str(error))
 
 
-def _identified(make: ServoVendor, config: ServosConfig[Any], buses: dict[str, Bus], clock: Clock) -> list[Finding]:
+def _identified(vendor: ServoVendor, config: ServosConfig[Any], buses: dict[str, Bus], clock: Clock) -> list[Finding]:
     found: list[Finding] = []
     end = clock.now() + IDENTIFY_S
     for servo in config.servos:
         if clock.now() > end:
             found.append(Finding(servo, "not asked"))
         else:
-            found.append(identify(buses[config.bus_of(servo)], servo, config.model_of(servo), make.models))
+            found.append(identify(buses[config.bus_of(servo)], servo, config.model_of(servo), vendor.models))
     return found
 
 
@@ -75,7 +76,7 @@ def _presence(found: Sequence[Finding]) -> Iterator[Check]:
         yield Check(TYPE, "ok", f"all {len(found)} answer, each of the model that robot.toml names")
 
 
-def _health(make: ServoVendor, bus: Bus, servo: IdentifiedServo) -> Iterator[Check]:
+def _health(vendor: ServoVendor, bus: Bus, servo: IdentifiedServo) -> Iterator[Check]:
     layout = servo.model.layout
     exchange = ask_again(bus, bus.read_request(servo.model, servo.id, layout.state))
     if exchange.trouble is not None:
@@ -83,7 +84,7 @@ def _health(make: ServoVendor, bus: Bus, servo: IdentifiedServo) -> Iterator[Che
         yield Check(TYPE, "wrong", said, "look at cable and connectors, then bodyschema doctor once more")
         return
     has_torque, bits = layout.torque_and_errors(exchange.answers[0].status)
-    for bit, text in make.errors.items():
+    for bit, text in vendor.errors.items():
         if bits & bit:
             said, _, fix = text.partition(": ")
             yield Check(TYPE, "wrong", f"joint {servo.joint} (ID {servo.id}): {said}", fix)
@@ -102,7 +103,7 @@ def _delays(servos: Sequence[IdentifiedServo]) -> Iterator[Check]:
 
 
 def _pace(
-    make: ServoVendor,
+    vendor: ServoVendor,
     config: ServosConfig[Any],
     buses: dict[str, Bus],
     servos: Sequence[IdentifiedServo],
@@ -110,7 +111,7 @@ def _pace(
     read_s: float,
 ) -> Iterator[Check]:
     """Read at the highest rate for a while."""
-    plans = plans_of(make, buses, servos, config)
+    plans = plans_of(vendor, buses, servos, config)
     requests = {name: plan.requests for name, plan in plans.items()}
     before = {name: (bus.counts.exchanges, dict(bus.counts.troubles)) for name, bus in buses.items()}
     end, times = clock.now() + read_s, [clock.now()]

@@ -1,4 +1,4 @@
-"""The table of a make of servos in robot.toml: what is the same in all."""
+"""The table of a servo vendor in robot.toml: what is the same in all."""
 
 from __future__ import annotations
 

@@ -12,6 +12,7 @@ from bodyschema.interfaces.errors import SourceError, SourceLost
 from .bus import RETURN_DELAY_UNIT_S, Bus, Exchange, Request, Trouble
 from .config import ServoConfig
 from .model import Model, Register
+from .servo import IdentifiedServo
 
 log = logging.getLogger(__name__)
 
@@ -23,65 +24,6 @@ PASSING = (Trouble.TIMEOUT, Trouble.FOREIGN, Trouble.WRONG_LENGTH, Trouble.EARLY
 RETRY_S = 0.2
 GARBLED = "garbled answers: two servos with this ID, or a bad cable"
 SCAN = "`bodyschema scan --robot robot.toml` looks for them at all rates and IDs, and says what to do"
-
-
-@dataclass(frozen=True, slots=True)
-class IdentifiedServo:
-    joint: str  # whose angle it tells
-    bus: str  # the name of its bus
-    id: int
-    model: Model
-    # direction, zero_ticks: from its position to the joint's angle
-    direction: int
-    zero_ticks: int | float
-    # firmware, drive_mode, operating_mode, homing_offset, return_delay_s: as its control table says; a change of them
-    # between two recordings is a change of calibration
-    firmware: int
-    drive_mode: int
-    operating_mode: int
-    homing_offset: int
-    return_delay_s: float
-    had_torque: bool = False  # its torque was on
-
-    @property
-    def version(self) -> str:
-        """Its firmware, as its maker writes it."""
-        return ".".join(map(str, self.model.layout["firmware"].bytes(self.firmware)))
-
-    @property
-    def label(self) -> str:
-        """Its number, for messages."""
-        return f"ID {self.id}"
-
-    @property
-    def ticks_per_turn(self) -> int | None:
-        """Ticks after which the sensor's position repeats; None if it does not wrap around."""
-        return self.model.ticks_per_turn
-
-    def angle(self, ticks: int) -> float:
-        """Return the joint angle [rad] at a multi-turn position [ticks]."""
-        return self.direction * (ticks - self.zero_ticks) * self.model.rad_per_tick
-
-    def ticks(self, angle: float) -> float:
-        """Return the multi-turn position [ticks] at a joint angle [rad]."""
-        return self.zero_ticks + self.direction * angle / self.model.rad_per_tick
-
-    def record(self) -> Mapping[str, object]:
-        """Return the servo's identity and settings, to be kept with the data."""
-        return {
-            "joint": self.joint,
-            "bus": self.bus,
-            "id": self.id,
-            "model": self.model.name,
-            "firmware": self.firmware,
-            "drive_mode": self.drive_mode,
-            "operating_mode": self.operating_mode,
-            "homing_offset_ticks": self.homing_offset,
-            "zero_ticks": self.zero_ticks,
-            "direction": self.direction,
-            "rad_per_tick": self.model.rad_per_tick,
-            "return_delay_s": self.return_delay_s,
-        }
 
 
 @dataclass(frozen=True, slots=True)

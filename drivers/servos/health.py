@@ -12,8 +12,9 @@ from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.servos import ServoStatus
 
 from .channel import Drive, Sample
-from .handshake import Finding, IdentifiedServo
+from .handshake import Finding
 from .model import Register
+from .servo import IdentifiedServo
 
 log = logging.getLogger(__name__)
 

@@ -24,8 +24,9 @@ from bodyschema.interfaces.servos import BusStatus, ServoStatus
 from .bus import Bus, Counts, Request
 from .channel import Channel, Drive, Punctuality, Sample, middle
 from .config import ServoBusConfig, ServosConfig
-from .handshake import RETRY_S, IdentifiedServo, identify, require_all, restore_torque, switch_torque_off
+from .handshake import RETRY_S, identify, require_all, restore_torque, switch_torque_off
 from .health import Health, Inspection
+from .servo import IdentifiedServo
 from .vendor import Plan, ServoVendor, plans_of
 
 log = logging.getLogger(__name__)
@@ -68,7 +69,7 @@ class ServoJoints:
         epoch: how often it was opened. Only this comparison connects positions of different epochs.
     """
 
-    make: ServoVendor
+    vendor: ServoVendor
 
     def __init__(
         self,
@@ -96,7 +97,7 @@ class ServoJoints:
         self._channels: list[Channel] = []
         self._at: dict[tuple[str, int], int] = {}
         self._last_t = -math.inf
-        self._health = Health(self.make.errors)
+        self._health = Health(self.vendor.errors)
         self._counts = {name: Counts() for name in config.buses}
         self.servos: list[IdentifiedServo] = []
         self.epoch = self.dropped = 0
@@ -148,7 +149,7 @@ class ServoJoints:
             self._open_buses(stack)
             config = self._config
             findings = [
-                identify(self._buses[config.bus_of(servo)], servo, config.model_of(servo), self.make.models)
+                identify(self._buses[config.bus_of(servo)], servo, config.model_of(servo), self.vendor.models)
                 for servo in self._wanted
             ]
             self._health.note_found(findings)
@@ -205,7 +206,7 @@ class ServoJoints:
                 self._polls += 1
                 # The phase relative to the servos' ticks varies, to refine the clock offset.
                 shift = self._polls * GOLDEN % 1 - (self._polls - 1) * GOLDEN % 1
-                next_poll = self._next_poll + 1 / self._config.rate_hz + shift * self.make.tick_s
+                next_poll = self._next_poll + 1 / self._config.rate_hz + shift * self.vendor.tick_s
                 self._next_poll = max(next_poll, self._clock.now())
                 reading = self._poll()
                 if reading is not None:
@@ -222,13 +223,13 @@ class ServoJoints:
             port, latency_s = self._open_port(config, self._clock)
             stack.callback(close_quietly, port)
             heard = without_echo(port, self._clock, latency_s)
-            self._buses[name] = self.make.bus(name, heard, self._clock, latency_s)
+            self._buses[name] = self.vendor.bus(name, heard, self._clock, latency_s)
             self._buses[name].counts = self._counts[name]
             self._health.away.discard(name)
 
     def _prepare(self) -> None:
-        self._plans = plans_of(self.make, self._buses, self.servos, self._config)
-        self._channels = [self.make.channel(servo) for servo in self.servos]
+        self._plans = plans_of(self.vendor, self._buses, self.servos, self._config)
+        self._channels = [self.vendor.channel(servo) for servo in self.servos]
         self._at = {(servo.bus, servo.id): place for place, servo in enumerate(self.servos)}
         self._gate = SpeedGate(
             [FASTEST_RAD_S / s.model.rad_per_tick for s in self.servos], [_Settings.slack_ticks] * len(self.servos)

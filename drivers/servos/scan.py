@@ -24,7 +24,7 @@ VOLT_PER_UNIT = 0.1  # for all series of all vendors; temperatures are in °C
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
+class ServoProtocol:
     """A servo vendor, or its servos with one version of its protocol."""
 
     name: str  # in words
@@ -41,7 +41,7 @@ class Kind:
         return self.bus.packets_of(self.version)
 
     def told(self, head: bytes, id: int) -> Identity | None:
-        """Identify the servo by the start of its control table; None when it is not of this kind."""
+        """Identify the servo by the start of its control table; None when it is not of this protocol."""
         layouts = {model.layout.protocol: model.layout for model in self.models.values()}
         of_id = [layout for layout in layouts.values() if layout.value("id", head) == id]
         for layout in of_id:
@@ -57,32 +57,32 @@ class Kind:
 class Identity:
     """Identity of a servo; `model` is None when it is unknown."""
 
-    kind: Kind
+    protocol: ServoProtocol
     model: Model | None
     number: int
     firmware: str
 
 
 class PingScanner:
-    """Scanner for servos of kinds whose PING is identical.
+    """Scanner for servos of protocols whose PING is identical.
 
     Each ID is asked. The requests do not wait for the answers, which carry an ID. If an answer is unintelligible, each
-    ID is asked by itself. The start of the control table identifies the kind.
+    ID is asked by itself. The start of the control table identifies the protocol.
     """
 
-    def __init__(self, *kinds: Kind) -> None:
-        self._kinds, self._packets = kinds, kinds[0].packets
+    def __init__(self, *protocols: ServoProtocol) -> None:
+        self._protocols, self._packets = protocols, protocols[0].packets
         self._ping_sizes = (len(self._packets.ping(0)), self._packets.overhead + self._packets.ping_size)
 
     @property
     def protocol(self) -> str:
         """Names of the protocols."""
-        return " and ".join(kind.name for kind in self._kinds)
+        return " and ".join(protocol.name for protocol in self._protocols)
 
     @property
     def bauds(self) -> Sequence[int]:
         """Baud rates that robot.toml can name for one of them, likely ones first [bit/s]."""
-        return tuple(dict.fromkeys(baud for kind in self._kinds for baud in kind.bauds))
+        return tuple(dict.fromkeys(baud for protocol in self._protocols for baud in protocol.bauds))
 
     def scan(self, name: str, port: Port, clock: Clock, latency_s: float) -> Iterator[FoundServo]:
         """Yield the servos on the open port `name` in the order of their IDs. Never write to a register."""
@@ -141,50 +141,54 @@ class PingScanner:
 
     def _found(self, name: str, port: Port, clock: Clock, latency_s: float, id: int) -> FoundServo:
         """Return the servo with its identity and state."""
-        kind = self._kinds[0]
-        servo, bus = FoundServo(name, port.baud, self.protocol, id), kind.bus(name, port, clock, latency_s)
-        head = _asked(bus, kind, id, self._head)
+        protocol = self._protocols[0]
+        servo, bus = FoundServo(name, port.baud, self.protocol, id), protocol.bus(name, port, clock, latency_s)
+        head = _asked(bus, protocol, id, self._head)
         if head.trouble is Trouble.TIMEOUT:
-            said = {kind.packets.pinged_only: kind.name for kind in self._kinds}
+            said = {protocol.packets.pinged_only: protocol.name for protocol in self._protocols}
             alone = len(said) == 1
             return replace(
                 servo, troubles=tuple(text if alone else f"if {name}: {text}" for text, name in said.items())
             )
         if head.trouble is not None:
             return replace(servo, is_double=True, troubles=(DOUBLE,))
-        told = [found for kind in self._kinds if (found := kind.told(head.answers[0].status.data, id)) is not None]
-        # The first kind with this model, else the first possible one.
+        told = [
+            found
+            for protocol in self._protocols
+            if (found := protocol.told(head.answers[0].status.data, id)) is not None
+        ]
+        # The first protocol with this model, else the first possible one.
         identity = next((found for found in told if found.model is not None), told[0] if told else None)
-        unsupported = kind.unsupported.get(int.from_bytes(head.answers[0].status.data[:2], "little"))
+        unsupported = protocol.unsupported.get(int.from_bytes(head.answers[0].status.data[:2], "little"))
         if unsupported is not None:
             return replace(servo, model=unsupported, troubles=(no_driver(unsupported),))
         if identity is None:
             return replace(servo, troubles=(UNKNOWN,))
-        kind, model = identity.kind, identity.model
-        servo = replace(servo, protocol=kind.name, firmware=identity.firmware)
+        protocol, model = identity.protocol, identity.model
+        servo = replace(servo, protocol=protocol.name, firmware=identity.firmware)
         if model is None:
             return replace(servo, model=f"model {identity.number}", troubles=(UNKNOWN,))
-        bus = kind.bus(name, port, clock, latency_s)
-        return _with_state(bus, replace(servo, model=model.name), kind, model)
+        bus = protocol.bus(name, port, clock, latency_s)
+        return _with_state(bus, replace(servo, model=model.name), protocol, model)
 
     @property
     def _head(self) -> Register:
         """The part of the control table that identifies the servo."""
-        layouts = [model.layout for kind in self._kinds for model in kind.models.values()]
+        layouts = [model.layout for protocol in self._protocols for model in protocol.models.values()]
         return Register(0, max(layout[name].end for layout in layouts for name in ("model", "firmware", "id")))
 
 
-def _with_state(bus: Bus, servo: FoundServo, kind: Kind, model: Model) -> FoundServo:
+def _with_state(bus: Bus, servo: FoundServo, protocol: ServoProtocol, model: Model) -> FoundServo:
     layout = model.layout
     first, last = layout["torque"].address, layout["temperature"].end
-    told = _asked(bus, kind, servo.id, Register(first, last - first))
+    told = _asked(bus, protocol, servo.id, Register(first, last - first))
     if told.trouble is not None:  # two servos of one model give the same answers until registers that differ are read
         return replace(servo, is_double=True, troubles=(DOUBLE,))
     status = told.answers[0].status
     has_torque, bits = layout.torque_and_errors(status)
-    troubles = [text for bit, text in kind.errors.items() if bits & bit]
-    if servo.baud not in kind.bauds:
-        troubles.append(f"robot.toml has no such rate: give it {kind.bauds[0]:,} bit/s")
+    troubles = [text for bit, text in protocol.errors.items() if bits & bit]
+    if servo.baud not in protocol.bauds:
+        troubles.append(f"robot.toml has no such rate: give it {protocol.bauds[0]:,} bit/s")
     return replace(
         servo,
         voltage_v=VOLT_PER_UNIT * layout.value("voltage", status.data, first),
@@ -194,8 +198,8 @@ def _with_state(bus: Bus, servo: FoundServo, kind: Kind, model: Model) -> FoundS
     )
 
 
-def _asked(bus: Bus, kind: Kind, id: int, register: Register) -> Exchange:
-    request = Request(lambda n: kind.packets.read(id, register.address, n), (id,), register.size, kind.version)
+def _asked(bus: Bus, protocol: ServoProtocol, id: int, register: Register) -> Exchange:
+    request = Request(lambda n: protocol.packets.read(id, register.address, n), (id,), register.size, protocol.version)
     return ask_again(bus, request)
 
 

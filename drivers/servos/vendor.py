@@ -10,8 +10,9 @@ from bodyschema.drivers.servos.bus import Bus, Request
 
 from .channel import Channel
 from .config import ServosConfig
-from .handshake import ATTEMPTS, IdentifiedServo
+from .handshake import ATTEMPTS
 from .model import Model
+from .servo import IdentifiedServo
 from .settings import Setting
 
 
@@ -90,10 +91,10 @@ class ServoVendor:
 
 
 def plans_of(
-    make: ServoVendor, buses: Mapping[str, Bus], servos: Sequence[IdentifiedServo], config: ServosConfig[Any]
+    vendor: ServoVendor, buses: Mapping[str, Bus], servos: Sequence[IdentifiedServo], config: ServosConfig[Any]
 ) -> dict[str, Plan]:
     """Return how the servos of each bus are read, by name of the bus."""
     return {
-        name: Plan(bus, make.ways(bus, [servo for servo in servos if servo.bus == name], config.buses[name]))
+        name: Plan(bus, vendor.ways(bus, [servo for servo in servos if servo.bus == name], config.buses[name]))
         for name, bus in buses.items()
     }

@@ -14,8 +14,9 @@ from bodyschema.interfaces.protocols import Clock
 
 from .bus import Bus, Trouble
 from .config import ServoConfig
-from .handshake import ATTEMPTS, IdentifiedServo, identify, read_register, switch_torque_off
+from .handshake import ATTEMPTS, identify, read_register, switch_torque_off
 from .model import Model, Register
+from .servo import IdentifiedServo
 from .settings import ID, Setting
 from .vendor import ServoVendor
 
@@ -56,8 +57,8 @@ class Done:
 class EepromEditor:
     """Servos whose EEPROM is looked at and changed. A context manager that opens ports (its buses) on demand."""
 
-    def __init__(self, make: ServoVendor, clock: Clock, open_at: OpenAt) -> None:
-        self.make, self._clock, self._open_at = make, clock, open_at
+    def __init__(self, vendor: ServoVendor, clock: Clock, open_at: OpenAt) -> None:
+        self.vendor, self._clock, self._open_at = vendor, clock, open_at
         self._buses: dict[str, tuple[int, Bus]] = {}
 
     def __enter__(self) -> Self:
@@ -79,12 +80,12 @@ class EepromEditor:
             bus.close()
         opened, latency_s = self._open_at(port, baud)
         heard = without_echo(opened, self._clock, latency_s)
-        self._buses[port] = (baud, self.make.bus(port, heard, self._clock, latency_s))
+        self._buses[port] = (baud, self.vendor.bus(port, heard, self._clock, latency_s))
         return self._buses[port][1]
 
     def fitted(self, bus: Bus, config: ServoConfig, model: Model) -> IdentifiedServo:
         """Return the servo as found on the bus; raise SourceError if it is another, or does not answer."""
-        finding = identify(bus, config, model, self.make.models)
+        finding = identify(bus, config, model, self.vendor.models)
         if finding.servo is None:
             raise SourceError(
                 f"joint {config.joint!r} (ID {config.id}, {config.model}) on {bus.name}: {finding.found}. "
@@ -93,11 +94,11 @@ class EepromEditor:
         return finding.servo
 
     def model_at(self, bus: Bus, id: int) -> Model | None:
-        """Identify the model of the servo with an ID by trying every protocol of the make; None if it stays unknown."""
+        """Identify the model of the servo with an ID by trying all protocols of the vendor. None if unknown."""
         for protocol, any_of_it in self._by_protocol.items():
             register = any_of_it.layout["model"]
             data, _ = read_register(bus, any_of_it, id, register)
-            model = None if data is None else self.make.models.get(register.value(data))
+            model = None if data is None else self.vendor.models.get(register.value(data))
             if model is not None and model.protocol == protocol:
                 return model
         return None
@@ -108,7 +109,7 @@ class EepromEditor:
 
     @property
     def _by_protocol(self) -> dict[int, Model]:
-        return {model.protocol: model for model in self.make.models.values()}
+        return {model.protocol: model for model in self.vendor.models.values()}
 
     def value(self, bus: Bus, servo: IdentifiedServo, setting: Setting) -> int:
         """Return the setting's value in the servo's EEPROM; raise SourceError if the servo does not answer."""
@@ -122,7 +123,7 @@ class EepromEditor:
         """Return the homing offset that makes the servo's present position its `zero_ticks`, modulo full turns."""
         moved = round(servo.zero_ticks - self.position(bus, servo))
         turn = servo.ticks_per_turn
-        wanted = servo.homing_offset + self.make.homing_sign * moved
+        wanted = servo.homing_offset + self.vendor.homing_sign * moved
         return wanted if turn is None else (wanted + turn // 2) % turn - turn // 2
 
     def torque_off(self, bus: Bus, servos: Iterable[IdentifiedServo]) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from kbmaps.arrays import BoolArray, FloatArray, IntArray, frozen, rows_or_vector, vector
 from kbmaps.chains.chain import RigidChain
 from kbmaps.errors import ModelFormatError, SettingError
-from kbmaps.maps.kernels import FilterKernel, filter_kernel
+from kbmaps.maps.code_path import FilterKernel, filter_kernel
 from kbmaps.packed import named, or_infinite, unless_infinite
 from kbmaps.rotations import SMALL_ANGLE, cross_matrix, exponentials
 

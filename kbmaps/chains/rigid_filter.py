@@ -14,7 +14,7 @@ from kbmaps.arrays import FloatArray
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.parameters import WIDE, ChainParameters, ChainTolerances
 from kbmaps.errors import NonFiniteError, SettingError, ShapeError
-from kbmaps.maps.kernels import FilterKernel, filter_kernel
+from kbmaps.maps.code_path import FilterKernel, filter_kernel
 from kbmaps.robust import OUTLIER_SIGMAS
 from kbmaps.rotations import SMALL_ANGLE
 

@@ -16,7 +16,7 @@ from kbmaps.arrays import FloatArray, frozen, numbers, rows, rows_or_vector, vec
 from kbmaps.errors import BasisError, NonFiniteError, SettingError, ShapeError
 from kbmaps.maps import serial
 from kbmaps.maps.basis import JointBasis
-from kbmaps.maps.kernels import NetKernel, net_kernel
+from kbmaps.maps.code_path import NetKernel, net_kernel
 from kbmaps.maps.stack import BasisStack
 from kbmaps.rotations import nearest_rotation, nearest_rotation_rates, rotation_matrices
 

@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike
 from kbmaps.arrays import FloatArray, IntArray, rows, rows_or_vector, vector
 from kbmaps.errors import ModelFormatError, SettingError, ShapeError
 from kbmaps.maps.basis import describe_bases, parse_bases
+from kbmaps.maps.code_path import net_kernel
 from kbmaps.maps.kbmap import POSITION_OUTPUTS, KBMap, pose_targets
-from kbmaps.maps.kernels import net_kernel
 from kbmaps.maps.stack import BasisStack
 from kbmaps.packed import complete, count, named, number, or_infinite, pack, restoring, unless_infinite, unpack
 

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import MarkerFix, StereoFrame
-from bodyschema.vision.tracker import StereoTracker
+from bodyschema.vision.ball.tracker import StereoTracker
 
 from .arrays import BoolArray, FloatArray
 from .eyes import TrueEyes

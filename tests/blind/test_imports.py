@@ -11,7 +11,7 @@ import pytest
 HERE = Path(__file__).parent
 OURS = {"kbmaps", "bodyschema", "benchmarks"}
 INSTRUMENT = {
-    "rendered.py": {"bodyschema.interfaces.camera", "bodyschema.interfaces.records", "bodyschema.vision.tracker"}
+    "rendered.py": {"bodyschema.interfaces.camera", "bodyschema.interfaces.records", "bodyschema.vision.ball.tracker"}
 }  # it looks at images
 JUDGE = {
     "judge.py",

@@ -60,6 +60,7 @@ from bodyschema.recordings.recording import Recording
 from bodyschema.robot.description import RobotDescription
 from bodyschema.sim_backend import CameraConfig, SimConfig, SimWorld, model_file
 from bodyschema.sim_backend.config import SimTag
+from bodyschema.vision.ball.tracker import StereoTracker
 from bodyschema.vision.cameras.config import CamerasConfig
 from bodyschema.vision.cameras.ideal import IdealCamera
 from bodyschema.vision.cameras.opened import eyes_of
@@ -69,7 +70,6 @@ from bodyschema.vision.rig.lens import Lens
 from bodyschema.vision.rig.rectified import RectifiedCamera
 from bodyschema.vision.rig.stereo_rig import Made, StereoRig
 from bodyschema.vision.tracked_camera import TrackedCamera
-from bodyschema.vision.tracker import StereoTracker
 from bodyschema.vision.trackers import tracker_of
 
 LIMIT_S = 500.0

@@ -27,8 +27,8 @@ from bodyschema.cli.main import command_line
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.learner.checkpoint import read_checkpoint, write_checkpoint
 from bodyschema.daemon.sampler.devices import session_of
-from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.session import ZenohSession
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import StoreError
 from bodyschema.interfaces.records import MarkerFix, frozen_array

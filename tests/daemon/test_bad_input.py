@@ -21,8 +21,8 @@ from small_arm import ROBOT, URDF, write_long_arm, write_small_arm
 
 from bodyschema.cli.main import main
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import ZenohSession, client
 from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.session import ZenohSession, client
 from bodyschema.daemon.transport.status import LearnerStatus
 from bodyschema.daemon.transport.wire import decode
 from bodyschema.interfaces.errors import BusError, RequestError

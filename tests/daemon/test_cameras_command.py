@@ -19,7 +19,7 @@ from bodyschema.cli.cameras.calibration import NORMAL_95, CamerasFile, CheckFile
 from bodyschema.cli.main import app
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.vision.board import Board, BoardDetector, Corners, NotFound
-from bodyschema.vision.calibration.images import Images
+from bodyschema.vision.calibration.image_pairs import Images
 from bodyschema.vision.calibration.report.page import to_its_interval
 from bodyschema.vision.rig.rig_file import read_rig
 from bodyschema.vision.rig.stereo_rig import CalibrationError

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from bodyschema.cli.hardware.doctor import store_checks
 from bodyschema.daemon.sampler.history import answer_pairs
-from bodyschema.daemon.transport.bus import Request
+from bodyschema.daemon.transport.session import Request
 from bodyschema.daemon.transport.wire import JSON, PairsReply, decode, pair_to_wire
 from bodyschema.interfaces.errors import RecordingError, StoreError
 from bodyschema.interfaces.records import MarkerFix, frozen_array

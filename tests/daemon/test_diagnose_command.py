@@ -19,8 +19,8 @@ from walked import DESK_ARM, walked
 
 from bodyschema.cli.main import main
 from bodyschema.cli.terminal.diagnosis_view import view
-from bodyschema.daemon.transport.bus import Request, ZenohSession
 from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.session import Request, ZenohSession
 from bodyschema.daemon.transport.wire import PairsReply, encode, pair_to_wire
 from bodyschema.diagnosis.report.result import DiagnosisFile, Indistinguishable, Unexplained
 from bodyschema.effects import Effect

@@ -22,9 +22,9 @@ from bodyschema.cli.hardware.doctor import show
 from bodyschema.cli.install.units import FOLDER
 from bodyschema.cli.main import app
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.identity import Route
 from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.session import ZenohSession
 from bodyschema.daemon.transport.status import SamplerStatus
 from bodyschema.daemon.transport.wire import encode
 from bodyschema.daemon.wiring.servos import Check

@@ -16,8 +16,8 @@ from small_arm import write_small_arm
 from told_statuses import LEARNER, SAMPLER
 
 from bodyschema.cli.main import app
-from bodyschema.daemon.transport.bus import Request, ZenohSession
 from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.session import Request, ZenohSession
 from bodyschema.daemon.transport.status import JointRange, LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import JointsRequest, PredictReply, decode, encode
 from bodyschema.fleet.comparison import Model, common_poses, compared, sentences

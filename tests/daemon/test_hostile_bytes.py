@@ -31,7 +31,7 @@ from bodyschema.daemon.learner.answers import Answers
 from bodyschema.daemon.learner.checkpoint import DOES_NOT_FIT, CheckpointError
 from bodyschema.daemon.sampler.history import answer_pairs
 from bodyschema.daemon.transport import wire
-from bodyschema.daemon.transport.bus import Request
+from bodyschema.daemon.transport.session import Request
 from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.effects import Simulation
 from bodyschema.interfaces.errors import BodyschemaError, ConfigError, RecordingError, RequestError

@@ -118,7 +118,7 @@ def test_two_ports_are_two_buses(tmp_path) -> None:
 
 def test_servos_of_two_makes_make_no_arm(tmp_path) -> None:
     mixed = scan(tmp_path / "found.json", (1, "STS3215"), (2, "MX-28"))
-    with pytest.raises(ConfigError, match=r"of two makes, drivers\.feetech and drivers\.dynamixel"):
+    with pytest.raises(ConfigError, match=r"of two vendors, drivers\.feetech and drivers\.dynamixel"):
         new("--from", mixed, "--robot", tmp_path / "robot.toml", "--yes")
     assert not (tmp_path / "robot.toml").exists()
 

@@ -13,8 +13,8 @@ from small_arm import write_small_arm
 
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.learner.learner import Learner
-from bodyschema.daemon.transport.bus import Request, ZenohSession
 from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.session import Request, ZenohSession
 from bodyschema.daemon.transport.status import LearnerStatus
 from bodyschema.daemon.transport.wire import (
     JSON,

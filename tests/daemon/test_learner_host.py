@@ -25,8 +25,8 @@ from bodyschema.daemon.learner.solver_process import SolverLostError
 from bodyschema.daemon.service.notify import Notifier
 from bodyschema.daemon.service.service import Service
 from bodyschema.daemon.service.signals import SignalFlags
-from bodyschema.daemon.transport.bus import client
 from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.session import client
 from bodyschema.daemon.transport.status import LearnerStatus
 from bodyschema.daemon.transport.wire import decode
 from bodyschema.fleet.hosting import configs_of, descriptions, shares

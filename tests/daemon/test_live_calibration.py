@@ -26,7 +26,7 @@ from bodyschema.interfaces.errors import ConfigError, SourceEnded, SourceLost
 from bodyschema.interfaces.records import StereoFrame
 from bodyschema.vision.calibration.calibrate import Calibrated
 from bodyschema.vision.calibration.gather import Gathered
-from bodyschema.vision.calibration.images import pair_files
+from bodyschema.vision.calibration.image_pairs import pair_files
 from bodyschema.vision.calibration.live import LiveViews
 from bodyschema.vision.calibration.view import View
 from bodyschema.vision.rig.rig_file import read_rig, write_rig

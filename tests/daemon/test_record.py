@@ -14,8 +14,8 @@ from small_arm import JOINTS, write_small_arm
 
 from bodyschema.cli.main import app
 from bodyschema.cli.recordings.recorder import History, follow_history
-from bodyschema.daemon.transport.bus import Request, ZenohSession, client
 from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.session import Request, ZenohSession, client
 from bodyschema.daemon.transport.wire import PairsReply, encode, pair_to_wire
 from bodyschema.interfaces.errors import BusError, RecordingError
 from bodyschema.interfaces.records import Pair

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from bodyschema.daemon.sampler.history import answer_pairs
-from bodyschema.daemon.transport.bus import Request
+from bodyschema.daemon.transport.session import Request
 from bodyschema.daemon.transport.wire import JSON, PairsReply, decode
 from bodyschema.interfaces.records import MarkerFix, frozen_array
 from bodyschema.recordings.store.retention import AT_ONCE, Keep, used_bytes

@@ -20,8 +20,8 @@ from bodyschema.daemon.config import Config
 from bodyschema.daemon.sampler.devices import session_of
 from bodyschema.daemon.sampler.sampler import Sampler
 from bodyschema.daemon.sampler.sources import Sources
-from bodyschema.daemon.transport.bus import ZenohSession, client
 from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.session import ZenohSession, client
 from bodyschema.daemon.transport.status import SamplerStatus
 from bodyschema.daemon.transport.wire import MSGPACK, CommandRequest, PairMessage, PairsReply, decode, encode
 from bodyschema.interfaces.clock import SystemClock

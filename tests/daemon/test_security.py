@@ -20,10 +20,10 @@ from small_arm import write_small_arm
 from bodyschema.cli.install.router import RouterConfig
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.transport.access import ROLES
-from bodyschema.daemon.transport.bus import Request, ZenohSession, client
 from bodyschema.daemon.transport.identity import Identity, Route, TlsConfig
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.query_limiter import LIMITS
+from bodyschema.daemon.transport.session import Request, ZenohSession, client
 from bodyschema.interfaces.errors import BusError, ConfigError, RequestError
 
 LIMIT_S = 500.0

@@ -20,8 +20,8 @@ from bodyschema.daemon.client_config import ClientConfig
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.sampler.devices import session_of
 from bodyschema.daemon.sampler.sampler import Sampler
-from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.session import ZenohSession
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.recordings.store.store import PairStore
 

@@ -17,8 +17,8 @@ from small_arm import write_small_arm
 from told_statuses import LEARNER, SAMPLER
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.session import ZenohSession
 from bodyschema.daemon.transport.wire import (
     CommandReply,
     CommandRequest,

@@ -26,8 +26,8 @@ from bodyschema.daemon.sampler.devices import session_of
 from bodyschema.daemon.sampler.sampler import Sampler
 from bodyschema.daemon.sampler.sources import Sources
 from bodyschema.daemon.transport import wire
-from bodyschema.daemon.transport.bus import ZenohSession, client
 from bodyschema.daemon.transport.keys import CommandName, Keys
+from bodyschema.daemon.transport.session import ZenohSession, client
 from bodyschema.daemon.transport.wire import MSGPACK, IkReply, IkRequest, JointsRequest, PredictReply, decode, encode
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import RequestError

@@ -19,7 +19,7 @@ from bodyschema.diagnosis.fit.worth import NAMED
 from bodyschema.diagnosis.search.held_out import Blocks
 from bodyschema.diagnosis.search.search import Search
 from bodyschema.diagnosis.unnamed.families import families
-from bodyschema.diagnosis.unnamed.unknown import Unknowns, Way
+from bodyschema.diagnosis.unnamed.family_fits import UnnamedFamilies, Way
 from bodyschema.effects import Effect, Simulation
 
 
@@ -42,7 +42,7 @@ def explained_beside(fits: list[Fit], worths: list[float], monkeypatch: pytest.M
         for fit, worth in zip(fits, worths, strict=True)
     }
     shorter = {len(fit.causes): one for fit, one in known.items()}
-    monkeypatch.setattr(explanation, "_with_unknown", lambda fit, *_: known.get(fit) or shorter[len(fit.causes)])
+    monkeypatch.setattr(explanation, "_with_unnamed", lambda fit, *_: known.get(fit) or shorter[len(fit.causes)])
     monkeypatch.setattr(explanation, "_rescaled", lambda best, *_: best)
     believing = cast(Any, Believing())
     return explain(fits[-1], fits, believing, believing, lambda _: None)
@@ -78,9 +78,9 @@ def test_what_few_rows_tell_of_a_way_is_no_reason_to_doubt_it() -> None:
     noise = SIGMA_M * np.random.default_rng([1, 1]).normal(size=(len(q), 3))
     recording = measured(robot, motion_of(q), simulation.positions(motion_of(errs)) + noise)
     start = aligned(Observations.of(recording, simulation), simulation)
-    unknowns = Unknowns(start)
+    unnamed = UnnamedFamilies(start)
     (family,) = (one for one in families(start.run) if (one.joint, one.drivers) == (shoulder, (shoulder, elbow)))
-    assert unknowns.predicts(unknowns.apart(start, (Way.of(family, start),)), start)
+    assert unnamed.predicts(unnamed.apart(start, (Way.of(family, start),)), start)
 
 
 def test_noise_that_is_alike_in_neighbouring_rows_puts_no_unnamed_error_in_the_place_of_a_cause() -> None:
@@ -93,9 +93,9 @@ def test_noise_that_is_alike_in_neighbouring_rows_puts_no_unnamed_error_in_the_p
     recording = measured(robot, motion, Simulation(robot, (cause,)).positions(motion) + noise)
     start = aligned(Observations.of(recording, simulation), simulation)
     found = start.with_causes([cause])
-    chosen = explain(found, [start, found], Unknowns(start), Search([cause], lambda _: None), lambda _: None)
+    chosen = explain(found, [start, found], UnnamedFamilies(start), Search([cause], lambda _: None), lambda _: None)
     assert chosen.fit.causes
-    assert not chosen.unknown
+    assert not chosen.unnamed_causes
 
 
 @pytest.mark.parametrize("seed", range(4))

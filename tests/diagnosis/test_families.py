@@ -10,7 +10,7 @@ from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.unnamed.families import Family, families
-from bodyschema.diagnosis.unnamed.unknown import Unknowns, Way
+from bodyschema.diagnosis.unnamed.family_fits import UnnamedFamilies, Way
 from bodyschema.effects import Simulation
 from bodyschema.robot.description import RobotDescription
 from bodyschema.sim_backend import model_file
@@ -67,7 +67,7 @@ def test_a_focal_length_that_wanders_is_told_from_all_other_families() -> None:
     wander = np.convolve(rng.normal(size=len(motion) + 40), np.full(41, 41**-0.5), mode="valid")
     x[:, 2] /= 1.0 + 0.01 * wander
     start = aligned(Observations.of(measured(robot, motion, x), Simulation(robot)), Simulation(robot))
-    way, _ = Unknowns(start).nearest(start)[0]
+    way, _ = UnnamedFamilies(start).nearest(start)[0]
     assert way.family.what == "the lens refocuses: its focal length wanders"
 
 

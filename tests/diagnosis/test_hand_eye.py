@@ -9,7 +9,7 @@ from typing import cast
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bodyschema.cli.terminal.diagnosis_run import Found, Source
+from bodyschema.cli.terminal.diagnosis_run import ReportedDiagnosis, Source
 from bodyschema.diagnosis.assess.stored import predicted_pose_covariance
 from bodyschema.diagnosis.diagnosis import Diagnosis
 from bodyschema.diagnosis.fit.background import Scales
@@ -24,7 +24,9 @@ SHIFT = [0.02, -0.03, 0.01, 0.3, -0.2, 0.4]
 SIGMA_M = 1e-3
 
 
-def found(robot: RobotDescription, truth: Simulation | None, seed: int, effects: tuple[Effect, ...]) -> Found:
+def found(
+    robot: RobotDescription, truth: Simulation | None, seed: int, effects: tuple[Effect, ...]
+) -> ReportedDiagnosis:
     """Return what is left of a diagnosis whose only unknowns are `effects`."""
     rng = np.random.default_rng(seed)
     q = rng.uniform(robot.lower, robot.upper, (60, len(robot.joints)))
@@ -32,7 +34,7 @@ def found(robot: RobotDescription, truth: Simulation | None, seed: int, effects:
     recording = Recording(joints=robot.joints, q=q, x=x + SIGMA_M * rng.normal(size=x.shape))
     nominal = Simulation(robot, effects)
     fit = fitted(Observations.of(recording, nominal), nominal, len(effects))
-    return Found(cast(Diagnosis, SimpleNamespace(stored=fit)), Source(recording, "a test"), robot, ())
+    return ReportedDiagnosis(cast(Diagnosis, SimpleNamespace(stored=fit)), Source(recording, "a test"), robot, ())
 
 
 def test_covariance_of_the_pose_covers_the_truth() -> None:

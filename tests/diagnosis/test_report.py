@@ -16,11 +16,11 @@ from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
 from bodyschema.diagnosis.fit.observations import ticks
 from bodyschema.diagnosis.report.conclusion import conclusion
 from bodyschema.diagnosis.report.page import About, page
-from bodyschema.diagnosis.report.plot import round_up
-from bodyschema.diagnosis.report.plot import ticks as axis_ticks
 from bodyschema.diagnosis.report.presenters.registry import presenter_of
 from bodyschema.diagnosis.report.residuals import Residuals, binned, structure
 from bodyschema.diagnosis.report.result import DiagnosisFile, Interval
+from bodyschema.diagnosis.report.svg_plot import round_up
+from bodyschema.diagnosis.report.svg_plot import ticks as axis_ticks
 from bodyschema.diagnosis.report.text import remedies
 from bodyschema.effects import EFFECT_TYPES, Effect, Simulation
 from bodyschema.robot.description import RobotDescription

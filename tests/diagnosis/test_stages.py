@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from bodyschema.diagnosis.stages import NAMELESS, RIVALS, SEARCH, SETS, Stages
+from bodyschema.diagnosis.stages import RIVALS, SEARCH, SETS, UNNAMED, Stages
 
 
 def test_a_percentage_never_falls_and_its_stage_is_told() -> None:
     lines: list[str] = []
     stages = Stages(lines.append)
-    for stage, before in ((SETS, None), (SEARCH, SETS), (NAMELESS, SEARCH), (RIVALS, NAMELESS)):
+    for stage, before in ((SETS, None), (SEARCH, SETS), (UNNAMED, SEARCH), (RIVALS, UNNAMED)):
         stages.begin(stage, before)
         for _ in range(30):
             stages("a step")

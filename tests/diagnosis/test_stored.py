@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from planted_cases import ELBOW, SHOULDER, SIGMA_M, desk_arm, measured, motion_of, walk
 
-from bodyschema.diagnosis.assess.leftover import Leftover
+from bodyschema.diagnosis.assess.residual_structure import ResidualStructure
 from bodyschema.diagnosis.assess.stored import _Elsewhere, stored
 from bodyschema.diagnosis.diagnosis import _stored
 from bodyschema.diagnosis.fit.alignment import aligned
@@ -98,7 +98,7 @@ def test_tolerances_beside_a_marker_that_hangs_where_gravity_takes_it_are_stored
 def test_rows_that_a_cause_ignored_place_the_arm_that_is_stored_without_it(robot) -> None:
     start = placed(robot, np.zeros(ROWS))
     ignoring = start.to(start.observations.without(np.arange(ROWS) < ROWS // 2))
-    best = _stored(ignoring, ignoring, ignoring, Leftover((), (), False, 1.0), Blocks.cut(ROWS))
+    best = _stored(ignoring, ignoring, ignoring, ResidualStructure((), (), False, 1.0), Blocks.cut(ROWS))
     assert (best.noise.weights > 0.5).all()
 
 

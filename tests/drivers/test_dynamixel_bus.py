@@ -11,7 +11,7 @@ from bodyschema.drivers.dynamixel.bus import Answer, Bus, Trouble, sync_request
 from bodyschema.drivers.dynamixel.joints import Channel
 from bodyschema.drivers.dynamixel.models import BY_NAME
 from bodyschema.drivers.dynamixel.packets import Status
-from bodyschema.drivers.servos.handshake import IdentifiedServo
+from bodyschema.drivers.servos.servo import IdentifiedServo
 
 DATA = bytes(range(16))
 PIECES = st.lists(

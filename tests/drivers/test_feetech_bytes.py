@@ -15,9 +15,9 @@ from bodyschema.drivers.feetech.bench.servo import CALIBRATE, Servo
 from bodyschema.drivers.feetech.joints import PACKETS, Bus, Channel
 from bodyschema.drivers.feetech.models import BY_NAME, MODELS
 from bodyschema.drivers.servos.bus import Answer, Request
-from bodyschema.drivers.servos.handshake import IdentifiedServo
 from bodyschema.drivers.servos.model import Register
 from bodyschema.drivers.servos.packets import Garbled, Status
+from bodyschema.drivers.servos.servo import IdentifiedServo
 
 BAUD = 1_000_000
 NOISE = st.lists(st.one_of(st.binary(max_size=12), st.sampled_from([b"\xff\xff", b"\xff"]))).map(b"".join)

@@ -51,7 +51,7 @@ class Arm:
 
     def change(self, name: str, then: int, id: int = 1) -> Change:
         servo = self.fitted(id)
-        setting = {setting.name: setting for setting in self.bench.make.settings(servo.model)}[name]
+        setting = {setting.name: setting for setting in self.bench.vendor.settings(servo.model)}[name]
         return Change(servo, setting, self.bench.value(self.bus, servo, setting), then)
 
 

@@ -18,19 +18,19 @@ from planted_chains import bases_for, random_chain, random_map, random_q
 from rough_arms import ROUGH, rough_arm
 
 from kbmaps import NLMS, ChainParameters, KBMap, KBMapsError, RecursiveRigidLearner, SettingError, kernels_in_use
-from kbmaps.maps import kernels
+from kbmaps.maps import code_path
 
 seeds = st.integers(0, 2**32 - 1)
 kinds = st.text("RP", min_size=1, max_size=6)
 needs_both = pytest.mark.skipif(
-    len(kernels.available()) < 2, reason="no compiled kernels; to run it: apt-get install gcc"
+    len(code_path.available()) < 2, reason="no compiled kernels; to run it: apt-get install gcc"
 )
 
 
 def on_both_paths(make: Callable[[], object]) -> list[object]:
     results = []
     for path in ("numpy", "compiled"):
-        with kernels.using(path):
+        with code_path.using(path):
             results.append(make())
     return results
 
@@ -114,17 +114,17 @@ def test_the_derivatives_by_some_parameters_are_those_columns():
         np.testing.assert_allclose(jacobian, every[:, :, columns], rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("path", kernels.available())
+@pytest.mark.parametrize("path", code_path.available())
 @pytest.mark.parametrize("columns", [[7, 1], [1, 1], [-1, 0], [[1, 7]]])
 def test_columns_that_do_not_ascend_are_refused(path, columns):
-    with kernels.using(path), pytest.raises(SettingError, match="columns must ascend"):
+    with code_path.using(path), pytest.raises(SettingError, match="columns must ascend"):
         ChainParameters(random_chain(np.random.default_rng(0), "RPR")).lineariser(np.array(columns))
 
 
-@pytest.mark.parametrize("path", kernels.available())
+@pytest.mark.parametrize("path", code_path.available())
 @pytest.mark.parametrize("kind", ["f4", "i8", ">f8"])
 def test_any_numbers_are_linearised(path, kind):
-    with kernels.using(path):
+    with code_path.using(path):
         parameters = ChainParameters(random_chain(np.random.default_rng(0), "RPR"))
     q, change = np.array([[1, 0, -1], [0, 1, 2]]), np.zeros(parameters.size)
     expected, got = parameters.linearised(change, q.astype(float)), parameters.linearised(change, q.astype(kind))
@@ -156,7 +156,7 @@ def test_bad_input_is_refused_in_the_same_words(ask, bad):
     start = random_map(np.random.default_rng(1), bases_for("RR"))
 
     def call(path: str) -> tuple[type[Exception], str]:
-        with kernels.using(path):
+        with code_path.using(path):
             kbmap, learner = KBMap(start.bases, start.net), NLMS(start)
         calls = {
             "predict": kbmap.predict,
@@ -191,7 +191,7 @@ def test_a_bad_pair_of_a_rigid_chain_is_refused_in_the_same_words(bad):
     arm = rough_arm(np.random.default_rng(3), "RR")
 
     def call(path: str) -> tuple[type[Exception], str]:
-        with kernels.using(path):
+        with code_path.using(path):
             learner = RecursiveRigidLearner(arm.nominal, ROUGH)
         learner.learn(np.zeros(2), np.zeros(3))
         before = learner.to_bytes()
@@ -231,7 +231,7 @@ def test_whatever_numpy_understands_is_taken(convert):
 
 @needs_both
 def test_threads_share_a_compiled_map():
-    with kernels.using("compiled"):
+    with code_path.using("compiled"):
         kbmap = random_map(np.random.default_rng(3), bases_for("RRRR"))
     q = random_q(np.random.default_rng(4), "RRRR", 3000, 80)
     expected, results = kbmap.predict(q), [None] * 4
@@ -255,14 +255,14 @@ def test_the_environment_can_ask_for_numpy():
 
 
 def test_a_path_that_is_not_there_is_refused(monkeypatch):
-    monkeypatch.setattr(kernels, "_available", None)
-    with pytest.raises(SettingError, match="C compiler"), kernels.using("compiled"):
+    monkeypatch.setattr(code_path, "_available", None)
+    with pytest.raises(SettingError, match="C compiler"), code_path.using("compiled"):
         pass
 
 
 def test_the_path_is_chosen_for_a_block_only():
     before = kernels_in_use()
-    with kernels.using("numpy"):
+    with code_path.using("numpy"):
         assert kernels_in_use() == "numpy"
     assert kernels_in_use() == before
 

@@ -90,6 +90,13 @@ def test_a_plug_in_gets_the_same_module_by_its_old_name(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.parametrize("old", ["vision.tracker", "bodyschema.vision.tracker"])
+def test_a_plug_in_gets_a_moved_module(tmp_path: Path, old: str) -> None:
+    done = plug_in(tmp_path, f"from {old} import StereoTracker\nprint(StereoTracker.__module__)")
+    assert done.stdout == "bodyschema.vision.ball.tracker\n"
+    assert f"FutureWarning: a plug-in imports {old}, which is bodyschema.vision.ball.tracker now" in done.stderr
+
+
 def test_another_package_keeps_its_name(tmp_path: Path) -> None:
     (tmp_path / "vision").mkdir()
     (tmp_path / "vision" / "__init__.py").write_text("OWN = 1")

@@ -56,7 +56,7 @@ def test_a_client_imports_neither_scipy_nor_opencv() -> None:
     code = f"""
 import sys
 from pathlib import Path
-from bodyschema.daemon.transport import bus
+from bodyschema.daemon.transport import session
 from bodyschema.cli.terminal import status_view
 from bodyschema.cli.commands.run import predict, status
 from bodyschema.calibration.plausibility import limits

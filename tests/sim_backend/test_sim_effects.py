@@ -15,9 +15,9 @@ from bodyschema.sim_backend import EncoderConfig, SimConfig, model_file
 from bodyschema.sim_backend.physics import JointPaths, Physics
 from bodyschema.sim_backend.posed import PosedWorld, visible_postures
 from bodyschema.sim_backend.truth import TrueRobot
+from bodyschema.vision.ball.tracker import StereoTracker
 from bodyschema.vision.config import VisionConfig
 from bodyschema.vision.tracked_camera import TrackedCamera
-from bodyschema.vision.tracker import StereoTracker
 
 CLOSE_M = 1e-6
 LIMIT_S = 500.0  # a busy machine may take half a minute to start the renderer

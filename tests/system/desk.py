@@ -13,9 +13,9 @@ import time
 from pathlib import Path
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import client
 from bodyschema.daemon.transport.identity import Identity, Route
 from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.session import client
 from bodyschema.dashboard.hub import Hub
 from bodyschema.dashboard.watch import Watch
 from bodyschema.interfaces.errors import BodyschemaError, BusError

@@ -17,7 +17,7 @@ from typing import Any
 
 from bodyschema.cli.main import main
 from bodyschema.daemon.learner import checkpoint
-from bodyschema.daemon.transport.bus import ZenohSession
+from bodyschema.daemon.transport.session import ZenohSession
 from bodyschema.recordings.store.store import PairStore
 
 NOWHERE = "at a random moment"  # from outside

@@ -16,8 +16,8 @@ import numpy as np
 import warm
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import ZenohSession
 from bodyschema.daemon.transport.keys import CommandName, Keys
+from bodyschema.daemon.transport.session import ZenohSession
 from bodyschema.daemon.transport.status import SamplerStatus
 from bodyschema.daemon.transport.wire import CommandReply, CommandRequest, decode, encode
 from bodyschema.daemon.wiring.bench import Motion, bench_robot_file, open_bench

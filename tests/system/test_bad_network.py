@@ -27,7 +27,7 @@ from two_processes import (
 )
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import client
+from bodyschema.daemon.transport.session import client
 from bodyschema.daemon.transport.status import LearnerStatus
 from bodyschema.daemon.transport.wire import JointsRequest, encode
 from bodyschema.interfaces.errors import BodyschemaError
@@ -135,14 +135,14 @@ def test_minutes_without_a_link_or_with_a_slow_one_cost_no_pair(tmp_path, how, p
 
 SUBSCRIBER = """
 import sys, time, zenoh
-from bodyschema.daemon.transport.bus import ZenohSession
+from bodyschema.daemon.transport.session import ZenohSession
 with ZenohSession(connect=sys.argv[1]) as bus:
     bus.subscribe(sys.argv[2], lambda payload: (print("heard", flush=True), time.sleep(3600)))
     time.sleep(3600)
 """
 
 
-@pytest.mark.soak  # with bare sessions: tests/daemon/test_bus.py
+@pytest.mark.soak  # with bare sessions: tests/daemon/test_zenoh_session.py
 @pytest.mark.parametrize("stopped", [False, True], ids=["slow", "stopped"])
 def test_a_subscriber_that_takes_nothing_delays_nobody_else(tmp_path, free_endpoint, stopped) -> None:
     config = write_robot(tmp_path, free_endpoint)

@@ -28,7 +28,7 @@ from two_processes import (
 
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.learner.checkpoint import generations
-from bodyschema.daemon.transport.bus import client
+from bodyschema.daemon.transport.session import client
 from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import CommandRequest, encode
 from bodyschema.interfaces.errors import BodyschemaError

@@ -13,8 +13,8 @@ import pytest
 from two_processes import KEYS, expect_each_pair_learnt_once, learner_with, running, write_robot
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import ZenohSession, client
 from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.session import ZenohSession, client
 from bodyschema.daemon.transport.wire import JointsRequest, encode
 
 # By then all that is kept of pairs is full: replay, the solvers' windows, the publisher's cache.

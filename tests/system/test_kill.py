@@ -13,7 +13,7 @@ from killed_at import LEARNER_POINTS, NOWHERE, SAMPLER_POINTS
 from two_processes import KEYS, LIFE_LIMIT_S, learner_with, pause, running, write_robot
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import ZenohSession
+from bodyschema.daemon.transport.session import ZenohSession
 from bodyschema.daemon.transport.status import LearnerStatus
 from bodyschema.daemon.transport.wire import PairMessage, decode, encode, pair_to_wire
 from bodyschema.recordings.store.store import PairReader

@@ -14,7 +14,7 @@ from two_processes import KEYS, LIFE_LIMIT_S, answer, learner_with, running, sta
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.sampler.devices import session_of
 from bodyschema.daemon.sampler.history import answer_pairs
-from bodyschema.daemon.transport.bus import ZenohSession
+from bodyschema.daemon.transport.session import ZenohSession
 from bodyschema.daemon.transport.status import LearnerStatus
 from bodyschema.daemon.transport.wire import JointsRequest, PredictReply, decode, encode, pair_to_wire
 from bodyschema.interfaces.clock import SystemClock

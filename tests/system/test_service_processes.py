@@ -20,7 +20,7 @@ from two_processes import KEYS, write_robot
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.learner import learner
 from bodyschema.daemon.sampler import sampler
-from bodyschema.daemon.transport.bus import client
+from bodyschema.daemon.transport.session import client
 from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import PairsReply, decode
 from bodyschema.recordings.store.store import PairReader

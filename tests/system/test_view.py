@@ -18,8 +18,8 @@ import warm
 
 from bodyschema.cli.demo.scene import prepare
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import is_alive
 from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.session import is_alive
 from bodyschema.recordings.recording import Recording
 
 pytest.importorskip("uvicorn")

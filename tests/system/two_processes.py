@@ -17,8 +17,8 @@ from killed_at import NOWHERE
 from small_arm import URDF
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.transport.bus import client
 from bodyschema.daemon.transport.keys import Keys
+from bodyschema.daemon.transport.session import client
 from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import CommandRequest, decode, encode
 from bodyschema.interfaces.errors import BodyschemaError

@@ -12,7 +12,7 @@ from shown_board import BOARD, SIZE, true_vector
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.vision.calibration.calibrate import Asked, Calibrated, ModelChoice, calibrate
 from bodyschema.vision.calibration.gather import gathered
-from bodyschema.vision.calibration.images import ImagePair
+from bodyschema.vision.calibration.image_pairs import ImagePair
 from bodyschema.vision.rig.stereo_rig import CalibrationError, covariance_of, triangulated
 
 VIEWS = 20

@@ -10,7 +10,7 @@ from ball_renderer import SMALL, Look, Room, in_eyes, paint_ball, take
 
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, StereoFrame
-from bodyschema.vision.tracker import StereoTracker
+from bodyschema.vision.ball.tracker import StereoTracker
 
 RADIUS_M = 0.020
 PLAIN = Look(noise_sd=2.0)

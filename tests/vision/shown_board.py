@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from bodyschema.interfaces.errors import SourceEnded
 from bodyschema.interfaces.records import FloatArray, ImageArray, StereoFrame
 from bodyschema.vision.board import Board, Corners, NotFound
-from bodyschema.vision.calibration.images import ImagePair
+from bodyschema.vision.calibration.image_pairs import ImagePair
 from bodyschema.vision.calibration.view import View
 from bodyschema.vision.rig.lens import Model
 from bodyschema.vision.rig.stereo_rig import Made, StereoRig, parameter_names, split

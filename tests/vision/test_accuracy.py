@@ -13,7 +13,7 @@ from scenes import RADIUS_M, Errors, compare, measure_errors, place
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss
 from bodyschema.vision.ball.contour import Limb
-from bodyschema.vision.tracker import StereoTracker
+from bodyschema.vision.ball.tracker import StereoTracker
 
 LOOKS = {
     "clean": Look(noise_sd=1.0),

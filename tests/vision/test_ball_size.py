@@ -12,7 +12,7 @@ from bodyschema.interfaces.records import MarkerFix, Reason
 from bodyschema.vision.ball.blob import Disc
 from bodyschema.vision.ball.size import BallSize
 from bodyschema.vision.ball.sphere import Pinhole
-from bodyschema.vision.tracker import StereoTracker
+from bodyschema.vision.ball.tracker import StereoTracker
 from bodyschema.vision.triangulate import Location, locate
 
 X = np.array([0.02, 0.01, 0.8])

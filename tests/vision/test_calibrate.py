@@ -20,7 +20,7 @@ from bodyschema.vision.calibration.calibrate import Asked, Fitted, calibrate, fi
 from bodyschema.vision.calibration.gather import Unusable, gathered, require_both, summarised
 from bodyschema.vision.calibration.guidance import Coverage
 from bodyschema.vision.calibration.held_out import covariance
-from bodyschema.vision.calibration.images import ImagePair
+from bodyschema.vision.calibration.image_pairs import ImagePair
 from bodyschema.vision.calibration.view import View
 from bodyschema.vision.calibration.weights import corner_weights
 from bodyschema.vision.rig.lens import Lens

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from bodyschema.interfaces.errors import ConfigError, SourceEnded, SourceError
 from bodyschema.vision.cameras.config import CamerasConfig, ImagesConfig, TwoConfig, VideosConfig
-from bodyschema.vision.cameras.images import ImageRoll
+from bodyschema.vision.cameras.image_roll import ImageRoll
 from bodyschema.vision.cameras.look import of_image
 from bodyschema.vision.cameras.opened import eyes_of
 from bodyschema.vision.cameras.pairing import Pairing

@@ -10,8 +10,8 @@ from scenes import Ball, reason, sigmas_off, stage
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import Reason
 from bodyschema.robot.toml_file import convert, read_toml
+from bodyschema.vision.ball.tracker import StereoTracker
 from bodyschema.vision.config import NAMED_COLOURS, HueBand, VisionConfig
-from bodyschema.vision.tracker import StereoTracker
 
 FAR_SIGMAS = 5.0
 

@@ -13,8 +13,8 @@ from bodyschema.daemon.wiring.markers import learnt_colour_table
 from bodyschema.interfaces.records import MarkerFix
 from bodyschema.vision.ball.colour import ColourGate
 from bodyschema.vision.ball.colour_model import ColourUnlearnt, colour_at, colour_of_the_moving, colour_table
+from bodyschema.vision.ball.tracker import StereoTracker
 from bodyschema.vision.config import HueBand, VisionConfig
-from bodyschema.vision.tracker import StereoTracker
 
 SKIN = (0.78, 0.55, 0.43)
 FAR_SIGMAS = 5.0

@@ -8,10 +8,10 @@ from scenes import Ball, Slab, reason, sigmas_off, stage
 
 from bodyschema.interfaces.errors import SourceLost
 from bodyschema.interfaces.records import MarkerFix, Reason
+from bodyschema.vision.ball.tracker import StereoTracker
 from bodyschema.vision.cameras.annotate import Annotator
 from bodyschema.vision.config import VisionConfig
 from bodyschema.vision.tracked_camera import TrackedCamera
-from bodyschema.vision.tracker import StereoTracker
 
 FRAME_S = 1 / 30
 FAR_SIGMAS = 5.0

@@ -16,9 +16,9 @@ from bodyschema.interfaces.errors import SourceError, SourceLost
 from bodyschema.interfaces.extras import install_command
 from bodyschema.interfaces.records import MarkerFix, frozen_array
 from bodyschema.vision.cameras.config import CamerasConfig, RealsenseConfig
+from bodyschema.vision.cameras.depth_check import DepthChecked
 from bodyschema.vision.cameras.realsense import RealsenseCamera, connected_device
 from bodyschema.vision.config import VisionConfig
-from bodyschema.vision.depth_check import DepthChecked
 from bodyschema.vision.tracked_camera import TrackedCamera
 from bodyschema.vision.trackers import tracker_of
 

@@ -16,8 +16,8 @@ from bodyschema.vision.ball.blob import Disc, Region, find_patches, measure
 from bodyschema.vision.ball.colour import gate_of
 from bodyschema.vision.ball.match import StereoMatcher
 from bodyschema.vision.ball.sphere import Pinhole
+from bodyschema.vision.ball.tracker import StereoTracker
 from bodyschema.vision.config import VisionConfig
-from bodyschema.vision.tracker import StereoTracker
 from bodyschema.vision.triangulate import Location
 
 BALL = Ball((0.02, 0.01, 0.8))

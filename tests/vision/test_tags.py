@@ -14,6 +14,7 @@ from tag_renderer import Card, Sheet, photograph
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.errors import ConfigError, SourceError
 from bodyschema.interfaces.records import FloatArray, ImageArray, MarkerFix, MarkerMiss, Reason, StereoFrame
+from bodyschema.vision.ball.tracker import StereoTracker
 from bodyschema.vision.config import VisionConfig
 from bodyschema.vision.pose import PoseEstimator, Sighting, mirrored
 from bodyschema.vision.tags.bleed import bleed
@@ -23,7 +24,6 @@ from bodyschema.vision.tags.dictionary import tag_modules
 from bodyschema.vision.tags.edge import PIXEL_CUMULANT, blurred_step
 from bodyschema.vision.tags.image import TagImage, measure_tag
 from bodyschema.vision.tags.tracker import TagTracker
-from bodyschema.vision.tracker import StereoTracker
 from bodyschema.vision.trackers import tracker_of
 from kbmaps import rotation_vectors
 
@@ -333,6 +333,22 @@ def test_a_cluster_of_which_one_tag_is_hidden_is_found_as_well() -> None:
     rotation = tilted([0.2, 1.0, 0.3], 40.0)
     frame = seen(cube_at(rotation, MIDDLE)[0])
     assert max(off(TagTracker(SMALL, CUBE, CONFIG).track(frame), rotation, MIDDLE)) < 4.0
+
+
+def test_a_cluster_of_which_the_eyes_see_different_tags_is_no_marker() -> None:
+    one, other = cube_at(tilted([0.2, 1.0, 0.3], 40.0), MIDDLE)
+    frame = StereoFrame(0.0, seen(one).left, seen(other).images[1])
+    assert reason(TagTracker(SMALL, CUBE, CONFIG).track(frame)) is Reason.NO_MARKER
+
+
+def test_a_tag_that_only_one_eye_measures_names_its_fault_in_the_other() -> None:
+    one, other = cube_at(tilted([0.2, 1.0, 0.3], 40.0), MIDDLE)
+    right = seen(one, other).images[1].astype(np.float64)
+    faded = slice(None, int(SMALL.project(np.array([one.x, other.x]))[:, 2].mean()))  # up to the other tag
+    right[:, faded] = 128.0 + 0.2 * (right[:, faded] - 128.0)
+    frame = StereoFrame(0.0, seen(one).left, right.astype(np.uint8))
+    config = TagConfig(side_m=SIDE_M, min_contrast=60.0)
+    assert reason(TagTracker(SMALL, CUBE, config).track(frame)) is Reason.LOW_CONTRAST
 
 
 def test_more_tags_of_the_same_noise_give_a_surer_orientation() -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray, ImageArray, Reason
 from bodyschema.vision.config import VisionConfig
-from bodyschema.vision.images import WHITE
+from bodyschema.vision.image_checks import WHITE
 
 from .colour import Gate
 from .outline import Outline, fit_outline, refine_outline

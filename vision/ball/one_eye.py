@@ -7,7 +7,7 @@ import numpy as np
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, StereoFrame, frozen_array
 from bodyschema.vision.config import VisionConfig
-from bodyschema.vision.images import check_calibration, check_images
+from bodyschema.vision.image_checks import check_calibration, check_images
 
 from .blob import Disc, Region, find_patches, measure
 from .colour import gate_of

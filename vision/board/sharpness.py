@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from bodyschema.interfaces.records import FloatArray, ImageArray
-from bodyschema.vision.images import is_black, too_white
+from bodyschema.vision.image_checks import is_black, too_white
 
 from .board import Board
 

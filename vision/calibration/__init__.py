@@ -1,1 +1,1 @@
-"""Calibration of two cameras' lenses and relative pose from images of a board."""
+"""Calibration of lenses and of two cameras' relative pose from images of a board; the arm's is in `calibration`."""

@@ -13,7 +13,7 @@ from bodyschema.vision.board import OTHER_BOARD, Board, BoardDetector, Corners, 
 from bodyschema.vision.rig.stereo_rig import CalibrationError
 
 from .guidance import Coverage
-from .images import ImagePair, require_equal_sizes
+from .image_pairs import ImagePair, require_equal_sizes
 from .view import EYES, ONE_EYE, Eye, View, image_of
 
 _MOST_NAMES = 4

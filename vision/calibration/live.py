@@ -14,7 +14,7 @@ from bodyschema.vision.board import Board, BoardDetector
 
 from .gather import Detector, Gathered, Unusable, eyes_of, looked_at
 from .guidance import CORNERS_A_CELL, cell_counts, rough_tilt_deg
-from .images import ImagePair
+from .image_pairs import ImagePair
 from .settings import ViewSettings as _Settings
 from .view import EYES, Eye, View, all_px
 

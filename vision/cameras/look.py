@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from bodyschema.interfaces.records import ImageArray
-from bodyschema.vision.images import is_black, too_white
+from bodyschema.vision.image_checks import is_black, too_white
 
 EVERY_S = 0.5  # an image is looked at
 OVER_S = 3.0  # the frame rate is measured

@@ -9,7 +9,7 @@ from bodyschema.interfaces.protocols import Clock
 
 from .config import CamerasConfig, ImagesConfig, OneConfig, RealsenseConfig, SideBySideConfig, TwoConfig, VideosConfig
 from .film import Film, Roll
-from .images import ImageRoll
+from .image_roll import ImageRoll
 from .live import LiveEyes
 from .realsense import RealsenseCamera
 from .v4l2.device import OpenCapture, open_v4l2

@@ -10,7 +10,7 @@ import numpy as np
 from bodyschema.interfaces.records import FloatArray, ImageArray, Reason
 from bodyschema.vision.board.board import Board
 from bodyschema.vision.board.detector import any_grid, measured_grid, on_plane
-from bodyschema.vision.images import is_black, too_white
+from bodyschema.vision.image_checks import is_black, too_white
 
 from .config import ChessboardConfig
 from .finder import Region, Seen

@@ -21,7 +21,7 @@ from bodyschema.interfaces.records import (
     frozen_array,
 )
 from bodyschema.vision.config import LONGEST_PAUSE_S
-from bodyschema.vision.images import check_calibration, check_images
+from bodyschema.vision.image_checks import check_calibration, check_images
 from bodyschema.vision.pose import Pose, PoseEstimator, Sighting, angle_between, first_pose, fitted_motion, mirrored
 from bodyschema.vision.triangulate import triangulate
 
@@ -129,6 +129,8 @@ class TagTracker:
         if not all(seen):
             return _why(eye for eye, tags in zip(found, seen, strict=True) if not tags)
         if len(seen) > 1:
+            if seen[0].keys().isdisjoint(seen[1]):
+                return _why(found)
             seen = self._agreeing(*seen)
             if isinstance(seen, Reason):
                 return seen
@@ -167,10 +169,8 @@ class TagTracker:
         return moved
 
     def _agreeing(self, left: dict[int, TagImage], right: dict[int, TagImage]) -> list[dict[int, TagImage]] | Reason:
-        """Return both eyes' tags without those whose rows differ."""
-        both = sorted(left.keys() & right.keys())
-        if not both:
-            return Reason.OCCLUDED
+        """Return both eyes' tags, of which they share some, without those whose rows differ."""
+        both = left.keys() & right.keys()
         apart = {id for id in both if not self._rows_agree(left[id], right[id])}
         if apart.issuperset(both):
             return Reason.EPIPOLAR
@@ -301,8 +301,8 @@ def _ids(seen: Iterable[dict[int, TagImage]]) -> set[int]:
 
 
 def _why(eyes: Iterable[Seen]) -> Reason:
-    """Return the most informative reason for eyes without a measured tag."""
-    reasons = {reason for eye in eyes for reason in eye.values()}
+    """Return the most informative reason why tags were not measured; NO_MARKER where none was found."""
+    reasons = {tag for eye in eyes for tag in eye.values() if isinstance(tag, Reason)}
     return next((reason for reason in _TELLING if reason in reasons), Reason.NO_MARKER)
 
 

@@ -1,4 +1,4 @@
-"""`bodyschema diagnose`."""
+"""`bodyschema diagnose`: its options; `cli/terminal/diagnosis_run.py` does the work."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from bodyschema.cli.commands.options import (
 from bodyschema.interfaces.errors import RequestError
 
 if TYPE_CHECKING:
-    from bodyschema.cli.terminal.diagnosis_run import Found
+    from bodyschema.cli.terminal.diagnosis_run import ReportedDiagnosis
 
 
 def diagnose(
@@ -88,7 +88,7 @@ def diagnose(
     _show(found, lines, out)
 
 
-def _joint_offsets(found: Found) -> dict[str, float]:
+def _joint_offsets(found: ReportedDiagnosis) -> dict[str, float]:
     """Return the joint offsets among the causes [rad], by joint."""
     return {
         cause.where: cause.parameters["offset_rad"].value
@@ -97,7 +97,7 @@ def _joint_offsets(found: Found) -> dict[str, float]:
     }
 
 
-def _show(found: Found, lines: list[str], out: Path | None) -> None:
+def _show(found: ReportedDiagnosis, lines: list[str], out: Path | None) -> None:
     from bodyschema.cli.terminal.diagnosis_view import view
 
     Console(highlight=False).print(view(found.file, found.remedies, timed=found.timed))

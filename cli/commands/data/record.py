@@ -34,7 +34,7 @@ def record(
     """
     from bodyschema.cli.recordings.recorder import History, copy_history, follow_history
     from bodyschema.daemon.config import Config
-    from bodyschema.daemon.transport.bus import client
+    from bodyschema.daemon.transport.session import client
     from bodyschema.recordings import files as recordings
 
     recordings.check_target(out, force=force)

@@ -38,8 +38,8 @@ def command(
     Next: `bodyschema status`.
     """
     from bodyschema.daemon.client_config import ClientConfig
-    from bodyschema.daemon.transport.bus import client
     from bodyschema.daemon.transport.keys import Keys
+    from bodyschema.daemon.transport.session import client
     from bodyschema.daemon.transport.wire import CommandReply, CommandRequest, decode, encode
 
     process: Process = to or ("sampler" if name in SAMPLERS else "learner")

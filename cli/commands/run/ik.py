@@ -48,8 +48,8 @@ def ik(
     Next: the same from your own program, starting at your arm's current angles: docs/zenoh.md.
     """
     from bodyschema.daemon.client_config import ClientConfig
-    from bodyschema.daemon.transport.bus import client
     from bodyschema.daemon.transport.keys import Keys
+    from bodyschema.daemon.transport.session import client
     from bodyschema.daemon.transport.wire import IkReply, IkRequest, decode, encode
 
     config = ClientConfig.load(robot)

@@ -38,8 +38,8 @@ def predict(
     Next: the same from your own program, over zenoh: docs/zenoh.md.
     """
     from bodyschema.daemon.client_config import ClientConfig
-    from bodyschema.daemon.transport.bus import client
     from bodyschema.daemon.transport.keys import Keys
+    from bodyschema.daemon.transport.session import client
     from bodyschema.daemon.transport.wire import JointsRequest, PredictReply, decode, encode
 
     config = ClientConfig.load(robot)

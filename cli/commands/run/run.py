@@ -103,7 +103,7 @@ def _sampler(robot: Path, state_dir: Path | None, *, sim: bool, exit_at_end: boo
     from bodyschema.daemon.sampler.sampler import LOOPS, Sampler
     from bodyschema.daemon.service.notify import Notifier
     from bodyschema.daemon.service.service import Service
-    from bodyschema.daemon.transport.bus import ZenohSession
+    from bodyschema.daemon.transport.session import ZenohSession
     from bodyschema.daemon.wiring.wiring import open_sources
     from bodyschema.recordings.store.store import PairStore
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from bodyschema.diagnosis.report.panels import Panel
-from bodyschema.diagnosis.report.plot import Layout, Plot, span
 from bodyschema.diagnosis.report.residuals import POINTS, Residuals, binned
+from bodyschema.diagnosis.report.svg_plot import Layout, Plot, span
 from bodyschema.effects import Effect
 
-from .plots import attributed
-from .presenter import Found, Presenter, Workshop
+from .evidence import attributed
+from .presenter import FoundCause, Presenter, Workshop
 
 
 class Backlash(Presenter):
@@ -19,10 +19,10 @@ class Backlash(Presenter):
     effect = "backlash"
     noun = "play of joint {joint}"
 
-    def finding(self, found: Found) -> str:
+    def finding(self, found: FoundCause) -> str:
         return f"{found.at} has {found.size('width')} of play"
 
-    def remedy(self, workshop: Workshop, found: Found) -> str:
+    def remedy(self, workshop: Workshop, found: FoundCause) -> str:
         play = workshop.amount(found, "width").replace("+", "")
         return (
             f"Tighten or preload the gear of {found.where}. Until then come to each pose from the same side, by more "

@@ -6,8 +6,8 @@ from bodyschema.diagnosis.report.panels import Panel
 from bodyschema.diagnosis.report.residuals import Residuals
 from bodyschema.effects import Effect
 
-from .plots import by_distance
-from .presenter import Found, Presenter, Workshop
+from .evidence import by_distance
+from .presenter import FoundCause, Presenter, Workshop
 
 
 class CameraFocal(Presenter):
@@ -16,10 +16,10 @@ class CameraFocal(Presenter):
     effect = "camera_focal"
     noun = "a wrong focal length"
 
-    def finding(self, found: Found) -> str:
+    def finding(self, found: FoundCause) -> str:
         return f"the focal length is {100 * found.numbers['focal_error']:+.3g} % off: depth is scaled"
 
-    def remedy(self, workshop: Workshop, found: Found) -> str:
+    def remedy(self, workshop: Workshop, found: FoundCause) -> str:
         assert workshop.robot.calibration is not None
         focal = workshop.robot.calibration.focal_px * (1.0 + found.numbers["focal_error"])
         return f"Calibrate the cameras again; or set focal_px = {focal:.6g} in robot.toml."

@@ -8,8 +8,8 @@ from bodyschema.diagnosis.report.panels import Panel
 from bodyschema.diagnosis.report.residuals import Residuals
 from bodyschema.effects import Effect
 
-from .plots import attributed, scatter_plot
-from .presenter import Found, Presenter, Workshop
+from .evidence import attributed, scatter_plot
+from .presenter import FoundCause, Presenter, Workshop
 
 
 class CameraLatency(Presenter):
@@ -18,10 +18,10 @@ class CameraLatency(Presenter):
     effect = "camera_latency"
     noun = "late images"
 
-    def finding(self, found: Found) -> str:
+    def finding(self, found: FoundCause) -> str:
         return f"images are stamped {1e3 * found.numbers['latency_s']:.3g} ms late"
 
-    def remedy(self, workshop: Workshop, found: Found) -> str:
+    def remedy(self, workshop: Workshop, found: FoundCause) -> str:
         late = found.numbers["latency_s"]
         what = "Subtract" if late > 0.0 else "Add"
         where = "from" if late > 0.0 else "to"

@@ -6,8 +6,8 @@ from bodyschema.diagnosis.report.panels import Panel
 from bodyschema.diagnosis.report.residuals import Residuals
 from bodyschema.effects import Effect
 
-from .plots import over_time_since
-from .presenter import Found, Presenter, Workshop, pose, toml_pose
+from .evidence import over_time_since
+from .presenter import FoundCause, Presenter, Workshop, pose, toml_pose
 
 
 class CameraMoved(Presenter):
@@ -16,11 +16,11 @@ class CameraMoved(Presenter):
     effect = "camera_moved"
     noun = "the {seen_by} having moved"
 
-    def finding(self, found: Found) -> str:
+    def finding(self, found: FoundCause) -> str:
         moved = "was bumped" if found.seen_by == "camera" else "moved"
         return f"the {found.seen_by} {moved} by {found.moved}{found.when}"
 
-    def remedy(self, workshop: Workshop, found: Found) -> str:
+    def remedy(self, workshop: Workshop, found: FoundCause) -> str:
         camera = workshop.robot.camera
         seen_by = "instrument" if workshop.robot.calibration is None else "camera"
         advice = f"Fasten the {seen_by}, and the arm's foot: one of them moved."

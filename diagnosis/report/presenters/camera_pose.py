@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .presenter import Found, Presenter, Workshop, pose, toml_pose
+from .presenter import FoundCause, Presenter, Workshop, pose, toml_pose
 
 
 class CameraPose(Presenter):
@@ -11,8 +11,8 @@ class CameraPose(Presenter):
     effect = "camera_pose"
     noun = "a wrong place of the {seen_by}"
 
-    def finding(self, found: Found) -> str:
+    def finding(self, found: FoundCause) -> str:
         return f"the {found.seen_by} stands {found.moved} off"
 
-    def remedy(self, workshop: Workshop, found: Found) -> str:
+    def remedy(self, workshop: Workshop, found: FoundCause) -> str:
         return f"In [camera] of robot.toml: {toml_pose(workshop.robot.camera.pose @ pose(found.numbers))}."

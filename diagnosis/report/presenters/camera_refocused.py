@@ -6,8 +6,8 @@ from bodyschema.diagnosis.report.panels import Panel
 from bodyschema.diagnosis.report.residuals import Residuals
 from bodyschema.effects import Effect
 
-from .plots import over_time_since
-from .presenter import Found, Presenter, Workshop
+from .evidence import over_time_since
+from .presenter import FoundCause, Presenter, Workshop
 
 
 class CameraRefocused(Presenter):
@@ -16,10 +16,10 @@ class CameraRefocused(Presenter):
     effect = "camera_refocused"
     noun = "a lens that refocused"
 
-    def finding(self, found: Found) -> str:
+    def finding(self, found: FoundCause) -> str:
         return f"a lens refocused: its focal length changed by {100 * found.numbers['focal_error']:+.3g} %{found.when}"
 
-    def remedy(self, workshop: Workshop, found: Found) -> str:
+    def remedy(self, workshop: Workshop, found: FoundCause) -> str:
         return "Switch autofocus off: set focus in [vision.cameras.…]. Then calibrate the cameras again."
 
     def panel(self, residuals: Residuals, effect: Effect) -> Panel:

@@ -6,8 +6,8 @@ from bodyschema.diagnosis.report.panels import Panel
 from bodyschema.diagnosis.report.residuals import Residuals
 from bodyschema.effects import Effect
 
-from .plots import by_distance
-from .presenter import Found, Presenter, Workshop
+from .evidence import by_distance
+from .presenter import FoundCause, Presenter, Workshop
 
 
 class CameraScale(Presenter):
@@ -16,12 +16,12 @@ class CameraScale(Presenter):
     effect = "camera_scale"
     noun = "a wrong scale of all that is measured"
 
-    def finding(self, found: Found) -> str:
+    def finding(self, found: FoundCause) -> str:
         error = found.numbers["scale_error"]
         said = f"all that is measured is {100 * abs(error):.3g} % too {'large' if error > 0.0 else 'small'}"
         return said if found.seen_by != "camera" else f"{said}: a tag, ball or board has another size than stated"
 
-    def remedy(self, workshop: Workshop, found: Found) -> str:
+    def remedy(self, workshop: Workshop, found: FoundCause) -> str:
         factor, calibration = 1.0 + found.numbers["scale_error"], workshop.robot.calibration
         if calibration is None:
             return (

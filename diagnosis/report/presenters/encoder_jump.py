@@ -6,8 +6,8 @@ from bodyschema.diagnosis.report.panels import Panel
 from bodyschema.diagnosis.report.residuals import Residuals
 from bodyschema.effects import Effect
 
-from .plots import over_quantity, remembered
-from .presenter import Found, Presenter, Workshop
+from .evidence import over_quantity, remembered
+from .presenter import FoundCause, Presenter, Workshop
 
 
 class EncoderJump(Presenter):
@@ -16,10 +16,10 @@ class EncoderJump(Presenter):
     effect = "encoder_jump"
     noun = "a jump of joint {joint}'s zero"
 
-    def finding(self, found: Found) -> str:
+    def finding(self, found: FoundCause) -> str:
         return f"the zero of {found.at} jumped by {found.signed('jump')}{found.when}"
 
-    def remedy(self, workshop: Workshop, found: Found) -> str:
+    def remedy(self, workshop: Workshop, found: FoundCause) -> str:
         return (
             f"Look for what slipped at {found.where} (the horn's screw, a coupling, lost counts), tighten it, and home "
             f"the joint again. Readings from the jump on need {workshop.amount(found, 'jump')} more."

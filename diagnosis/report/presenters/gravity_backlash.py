@@ -7,8 +7,8 @@ from bodyschema.diagnosis.report.residuals import Residuals
 from bodyschema.effects import Effect
 from bodyschema.effects.motion import flanks
 
-from .plots import load, over_quantity
-from .presenter import Found, Presenter, Workshop
+from .evidence import load, over_quantity
+from .presenter import FoundCause, Presenter, Workshop
 
 
 class GravityBacklash(Presenter):
@@ -17,10 +17,10 @@ class GravityBacklash(Presenter):
     effect = "gravity_backlash"
     noun = "play of joint {joint}, which hangs on one flank"
 
-    def finding(self, found: Found) -> str:
+    def finding(self, found: FoundCause) -> str:
         return f"{found.at} has {found.size('width')} of play and hangs on the flank to which the weight pulls it"
 
-    def remedy(self, workshop: Workshop, found: Found) -> str:
+    def remedy(self, workshop: Workshop, found: FoundCause) -> str:
         play = workshop.amount(found, "width").replace("+", "")
         return (
             f"Tighten or preload the gear of {found.where}, or load it by a spring so that it stays on one flank. "

@@ -6,8 +6,8 @@ from bodyschema.diagnosis.report.panels import Panel
 from bodyschema.diagnosis.report.residuals import Residuals
 from bodyschema.effects import Effect
 
-from .plots import over_quantity, remembered
-from .presenter import Found, Presenter, Workshop
+from .evidence import over_quantity, remembered
+from .presenter import FoundCause, Presenter, Workshop
 
 
 class Hysteresis(Presenter):
@@ -16,11 +16,11 @@ class Hysteresis(Presenter):
     effect = "hysteresis"
     noun = "hysteresis of joint {joint}"
 
-    def finding(self, found: Found) -> str:
+    def finding(self, found: FoundCause) -> str:
         lag, length = found.size("lag"), found.size("length")
         return f"{found.at} lags by {lag} behind its reading, against the way it went, and turns round over {length}"
 
-    def remedy(self, workshop: Workshop, found: Found) -> str:
+    def remedy(self, workshop: Workshop, found: FoundCause) -> str:
         way = workshop.amount(found, "length").replace("+", "")
         return (
             f"Look for friction behind the drive of {found.where}: bearing, seal, cable, brake. Until then come to "

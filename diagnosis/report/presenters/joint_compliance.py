@@ -6,8 +6,8 @@ from bodyschema.diagnosis.report.panels import Panel
 from bodyschema.diagnosis.report.residuals import Residuals
 from bodyschema.effects import Effect
 
-from .plots import load, over_quantity
-from .presenter import DEG, Found, Presenter, Workshop
+from .evidence import load, over_quantity
+from .presenter import DEG, FoundCause, Presenter, Workshop
 
 
 class JointCompliance(Presenter):
@@ -16,7 +16,7 @@ class JointCompliance(Presenter):
     effect = "joint_compliance"
     noun = "joint {joint} giving under the weight"
 
-    def finding(self, found: Found) -> str:
+    def finding(self, found: FoundCause) -> str:
         numbers = found.numbers
         if not found.weighed:
             return f"{found.at} gives under the arm's weight"
@@ -24,7 +24,7 @@ class JointCompliance(Presenter):
             return f"{found.at} gives by {numbers['compliance_rad_per_Nm'] * DEG:.2g}°/N·m under the arm's weight"
         return f"{found.at} gives by {1e3 * numbers['compliance_m_per_N']:.2g} mm/N under the arm's weight"
 
-    def remedy(self, workshop: Workshop, found: Found) -> str:
+    def remedy(self, workshop: Workshop, found: FoundCause) -> str:
         compliance = next(v for name, v in found.numbers.items() if name.startswith("compliance"))
         most = workshop.torques[workshop.joint(found)] * compliance
         sag = f"{1e3 * most:.2g} mm" if workshop.slides(found) else f"{most * DEG:.2g}°"

@@ -6,8 +6,8 @@ from bodyschema.diagnosis.report.panels import Panel
 from bodyschema.diagnosis.report.residuals import Residuals
 from bodyschema.effects import Effect
 
-from .plots import over_reading
-from .presenter import Found, Presenter, Workshop
+from .evidence import over_reading
+from .presenter import FoundCause, Presenter, Workshop
 
 
 class JointCoupling(Presenter):
@@ -16,10 +16,10 @@ class JointCoupling(Presenter):
     effect = "joint_coupling"
     noun = "joint {joint} moving with joint {source}"
 
-    def finding(self, found: Found) -> str:
+    def finding(self, found: FoundCause) -> str:
         return f"{found.at} moves by {100 * found.numbers['ratio']:+.3g} % of joint {found.source}'s angle"
 
-    def remedy(self, workshop: Workshop, found: Found) -> str:
+    def remedy(self, workshop: Workshop, found: FoundCause) -> str:
         ratio = f"{found.numbers['ratio']:+.5f}"
         return (
             f"In the driver, add {ratio} times the reading of {found.source} to that of {found.where}: "

@@ -6,8 +6,8 @@ from bodyschema.diagnosis.report.panels import Panel
 from bodyschema.diagnosis.report.residuals import Residuals
 from bodyschema.effects import Effect
 
-from .plots import over_reading
-from .presenter import DEG, Found, Presenter, Workshop, with_sign
+from .evidence import over_reading
+from .presenter import DEG, FoundCause, Presenter, Workshop, with_sign
 
 
 class JointEccentricity(Presenter):
@@ -16,10 +16,10 @@ class JointEccentricity(Presenter):
     effect = "joint_eccentricity"
     noun = "an eccentric encoder of joint {joint}"
 
-    def finding(self, found: Found) -> str:
+    def finding(self, found: FoundCause) -> str:
         return f"the encoder of {found.at} sits off its axis: ±{found.numbers['amplitude_rad'] * DEG:.2g}° once a turn"
 
-    def remedy(self, workshop: Workshop, found: Found) -> str:
+    def remedy(self, workshop: Workshop, found: FoundCause) -> str:
         amplitude, phase = (found.numbers[name] * DEG for name in ("amplitude_rad", "phase_rad"))
         return (
             f"Centre the encoder's magnet of {found.where} on the axis. Until then add "

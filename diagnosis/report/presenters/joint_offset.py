@@ -6,8 +6,8 @@ from bodyschema.diagnosis.report.panels import Panel
 from bodyschema.diagnosis.report.residuals import Residuals
 from bodyschema.effects import Effect
 
-from .plots import over_reading
-from .presenter import Found, Presenter, Workshop
+from .evidence import over_reading
+from .presenter import FoundCause, Presenter, Workshop
 
 _TURN_ORIGIN = "turn the origin of joint {} by as much about"
 
@@ -18,10 +18,10 @@ class JointOffset(Presenter):
     effect = "joint_offset"
     noun = "a wrong zero of joint {joint}"
 
-    def finding(self, found: Found) -> str:
+    def finding(self, found: FoundCause) -> str:
         return f"the zero of {found.at} is off by {found.signed('offset')}"
 
-    def remedy(self, workshop: Workshop, found: Found) -> str:
+    def remedy(self, workshop: Workshop, found: FoundCause) -> str:
         move = "move the origin of joint {} by as much along" if workshop.slides(found) else _TURN_ORIGIN
         return (
             f"Add {workshop.amount(found, 'offset')} to what the encoder of {found.where} reads, in its homing "

@@ -6,8 +6,8 @@ from bodyschema.diagnosis.report.panels import Panel
 from bodyschema.diagnosis.report.residuals import Residuals
 from bodyschema.effects import Effect
 
-from .plots import over_reading
-from .presenter import DEG, Found, Presenter, Workshop, with_sign
+from .evidence import over_reading
+from .presenter import DEG, FoundCause, Presenter, Workshop, with_sign
 
 
 class JointRipple(Presenter):
@@ -16,7 +16,7 @@ class JointRipple(Presenter):
     effect = "joint_ripple"
     noun = "a ripple of joint {joint}"
 
-    def finding(self, found: Found) -> str:
+    def finding(self, found: FoundCause) -> str:
         numbers = found.numbers
         if "cycles_per_turn" in numbers:
             wave = f"±{numbers['amplitude_rad'] * DEG:.2g}°, {numbers['cycles_per_turn']:.3g} times a turn"
@@ -24,7 +24,7 @@ class JointRipple(Presenter):
             wave = f"±{1e3 * numbers['amplitude_m']:.2g} mm, {numbers['cycles_per_m']:.3g} times a metre"
         return f"{found.at} has a ripple of {wave}"
 
-    def remedy(self, workshop: Workshop, found: Found) -> str:
+    def remedy(self, workshop: Workshop, found: FoundCause) -> str:
         numbers, phase = found.numbers, f"{with_sign(found.numbers['phase_rad'] * DEG)}°"
         if workshop.slides(found):
             cycles = numbers["cycles_per_m"]

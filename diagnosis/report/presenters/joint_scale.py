@@ -6,8 +6,8 @@ from bodyschema.diagnosis.report.panels import Panel
 from bodyschema.diagnosis.report.residuals import Residuals
 from bodyschema.effects import Effect
 
-from .plots import over_reading
-from .presenter import Found, Presenter, Workshop
+from .evidence import over_reading
+from .presenter import FoundCause, Presenter, Workshop
 
 # A scale error below this reverses the joint's direction.
 _BACKWARDS = -1.0
@@ -19,13 +19,13 @@ class JointScale(Presenter):
     effect = "joint_scale"
     noun = "a wrong ratio of joint {joint}"
 
-    def finding(self, found: Found) -> str:
+    def finding(self, found: FoundCause) -> str:
         error = found.numbers["scale_error"]
         if error < _BACKWARDS:
             return f"{found.at} counts the other way than its encoder says"
         return f"{found.at} turns {100 * abs(error):.3g} % {'more' if error > 0.0 else 'less'} than its encoder says"
 
-    def remedy(self, workshop: Workshop, found: Found) -> str:
+    def remedy(self, workshop: Workshop, found: FoundCause) -> str:
         error = found.numbers["scale_error"]
         if error < _BACKWARDS:
             return f"Give the readings of {found.where} the other sign, in driver and recordings, and diagnose again."

@@ -8,8 +8,8 @@ from bodyschema.diagnosis.report.panels import Panel
 from bodyschema.diagnosis.report.residuals import Residuals, binned
 from bodyschema.effects import Effect
 
-from .plots import attributed, scatter_plot
-from .presenter import Found, Presenter, Workshop
+from .evidence import attributed, scatter_plot
+from .presenter import FoundCause, Presenter, Workshop
 
 
 class LensDistortion(Presenter):
@@ -18,10 +18,10 @@ class LensDistortion(Presenter):
     effect = "lens_distortion"
     noun = "lens distortion"
 
-    def finding(self, found: Found) -> str:
+    def finding(self, found: FoundCause) -> str:
         return f"the lenses still distort: k1 = {found.numbers['k1']:+.3g}"
 
-    def remedy(self, workshop: Workshop, found: Found) -> str:
+    def remedy(self, workshop: Workshop, found: FoundCause) -> str:
         left = f"k1 = {found.numbers['k1']:+.3g} left"
         return f"Calibrate the lenses again: the images that are called rectified have {left}."
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.rpy import rpy_of
 
-from .presenter import Found, Presenter, Workshop, pose, short
+from .presenter import FoundCause, Presenter, Workshop, pose, short
 
 # Share of the largest amount below which one is left out: it changes the size of all by less than 2 %.
 _SMALL_PART = 0.2
@@ -19,7 +19,7 @@ class LinkGeometry(Presenter):
     effect = "link_geometry"
     noun = "a wrong link before joint {joint}"
 
-    def finding(self, found: Found) -> str:
+    def finding(self, found: FoundCause) -> str:
         shifts = {axis: found.numbers[f"{axis}_m"] for axis in found.shifts}
         turns = {axis: found.numbers[f"r{axis}_rad"] for axis in found.turns}
         parts = ((found.shift, "in", shifts), (found.turn, "about", turns))
@@ -27,7 +27,7 @@ class LinkGeometry(Presenter):
         between = ", and " if "," in said[0] else " and "
         return f"the link before {found.at} is off by {between.join(said)}"
 
-    def remedy(self, workshop: Workshop, found: Found) -> str:
+    def remedy(self, workshop: Workshop, found: FoundCause) -> str:
         origin = workshop.robot.tree.joint(found.where or "").T_parent_joint @ pose(found.numbers)
         return f"In the URDF, give joint {found.where} the {_origin(origin)}{workshop.in_urdf}."
 

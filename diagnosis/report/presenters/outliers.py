@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from bodyschema.diagnosis.report.panels import Panel
-from bodyschema.diagnosis.report.plot import Plot, span
 from bodyschema.diagnosis.report.residuals import POINTS, Residuals
+from bodyschema.diagnosis.report.svg_plot import Plot, span
 
-from .presenter import Found, Presenter, Workshop
+from .presenter import FoundCause, Presenter, Workshop
 
 
 class Outliers(Presenter):
@@ -17,10 +17,10 @@ class Outliers(Presenter):
     effect = "outliers"
     noun = "fixes that are not the marker"
 
-    def finding(self, found: Found) -> str:
+    def finding(self, found: FoundCause) -> str:
         return f"{100 * found.numbers['share']:.2g} % of the fixes are not the marker"
 
-    def remedy(self, workshop: Workshop, found: Found) -> str:
+    def remedy(self, workshop: Workshop, found: FoundCause) -> str:
         share = f"{100 * found.numbers['share']:.2g} %"
         if workshop.robot.calibration is None:
             return (

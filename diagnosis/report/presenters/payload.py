@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .presenter import Found, Presenter, Workshop, listed
+from .presenter import FoundCause, Presenter, Workshop, listed
 
 
 class Payload(Presenter):
@@ -13,10 +13,10 @@ class Payload(Presenter):
     effect = "payload"
     noun = "an unknown mass on the hand"
 
-    def finding(self, found: Found) -> str:
+    def finding(self, found: FoundCause) -> str:
         return f"the hand carries {found.numbers['mass_kg']:.2g} kg that the URDF does not have"
 
-    def remedy(self, workshop: Workshop, found: Found) -> str:
+    def remedy(self, workshop: Workshop, found: FoundCause) -> str:
         mass = found.numbers["mass_kg"]
         centre = [found.numbers[f"{axis}_kgm"] / max(mass, 1e-9) for axis in "xyz"]
         return (

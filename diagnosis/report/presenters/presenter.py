@@ -20,7 +20,7 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.rpy import rpy_of
 
-from .plots import measured_against_predicted
+from .evidence import measured_against_predicted
 
 DEG = math.degrees(1.0)
 # Ticks that divide a turn to within this share are counted per turn.
@@ -30,7 +30,7 @@ _DECIMAL = 1e-3
 
 
 @dataclass(frozen=True)
-class Found:
+class FoundCause:
     """A cause with its numbers.
 
     Attributes:
@@ -49,7 +49,7 @@ class Found:
     weighed: bool = True
 
     @classmethod
-    def of(cls, cause: Cause) -> Found:
+    def of(cls, cause: Cause) -> FoundCause:
         """Return a cause with all of its numbers."""
         return cls(cause.where, cause.source, {name: interval.value for name, interval in cause.parameters.items()})
 
@@ -125,20 +125,20 @@ class Workshop:
         """Hint at the corrected URDF."""
         return f" (--out writes {corrected_file(self.robot)}, which has it)"
 
-    def joint(self, found: Found) -> int:
+    def joint(self, found: FoundCause) -> int:
         """Return the index in q of the joint at which a cause is."""
         return self.robot.joints.index(found.where or "")
 
-    def slides(self, found: Found) -> bool:
+    def slides(self, found: FoundCause) -> bool:
         """Return True for a cause at a prismatic joint."""
         return bool(self.robot.chain.prismatic[self.joint(found)])
 
-    def amount(self, found: Found, base: str) -> str:
+    def amount(self, found: FoundCause, base: str) -> str:
         """Return a number of a cause that is an angle or a length, with its ticks where they are known."""
         name = f"{base}_m" if self.slides(found) else f"{base}_rad"
         return f"{found.signed(base)}{self._ticks(found, found.numbers[name])}"
 
-    def _ticks(self, found: Found, amount: float) -> str:
+    def _ticks(self, found: FoundCause, amount: float) -> str:
         step = float(self.steps[self.joint(found)])
         if step <= 0.0:
             return ""
@@ -155,7 +155,7 @@ class Workshop:
     def pose_of(self, effect: str) -> FloatArray:
         """Return the pose (4, 4) of another cause, the identity where it was not found."""
         cause = self.causes.get(effect)
-        return np.eye(4) if cause is None else pose(Found.of(cause).numbers)
+        return np.eye(4) if cause is None else pose(FoundCause.of(cause).numbers)
 
 
 class Presenter(ABC):
@@ -170,11 +170,11 @@ class Presenter(ABC):
     noun: str
 
     @abstractmethod
-    def finding(self, found: Found) -> str:
+    def finding(self, found: FoundCause) -> str:
         """Return a cause as a clause: what is wrong, where, by how much."""
 
     @abstractmethod
-    def remedy(self, workshop: Workshop, found: Found) -> str:
+    def remedy(self, workshop: Workshop, found: FoundCause) -> str:
         """Return what to do about a cause."""
 
     def panel(self, residuals: Residuals, effect: Effect) -> Panel:
@@ -189,10 +189,10 @@ class PlainPresenter(Presenter):
         self._kind = kind
         self.noun = kind.name.replace("_", " ") + (" at joint {joint}" if kind.at_joint else "")
 
-    def finding(self, found: Found) -> str:
+    def finding(self, found: FoundCause) -> str:
         return self._kind.finding("" if found.where is None else found.at, found.numbers)
 
-    def remedy(self, workshop: Workshop, found: Found) -> str:
+    def remedy(self, workshop: Workshop, found: FoundCause) -> str:
         return self._kind.remedy("" if found.where is None else found.at)
 
 

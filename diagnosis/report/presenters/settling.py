@@ -8,8 +8,8 @@ from bodyschema.diagnosis.report.panels import Panel
 from bodyschema.diagnosis.report.residuals import Residuals
 from bodyschema.effects import Effect
 
-from .plots import over_quantity, remembered
-from .presenter import Found, Presenter, Workshop
+from .evidence import over_quantity, remembered
+from .presenter import FoundCause, Presenter, Workshop
 
 # Remaining share at which a move has ended.
 _ENDED = 0.001
@@ -21,11 +21,11 @@ class Settling(Presenter):
     effect = "settling"
     noun = "joint {joint} read before it rests"
 
-    def finding(self, found: Found) -> str:
+    def finding(self, found: FoundCause) -> str:
         missing = f"{100 * found.numbers['fraction']:.2g} %"
         return f"{found.at} was read before it came to rest: {missing} of each move was missing"
 
-    def remedy(self, workshop: Workshop, found: Found) -> str:
+    def remedy(self, workshop: Workshop, found: FoundCause) -> str:
         fraction = found.numbers["fraction"]
         longer = math.log(_ENDED) / math.log(fraction) if 0.0 < fraction < 1.0 else 2.0
         wait = f"{longer:.2g} times as long" if longer > 1.0 else "longer"

@@ -10,8 +10,8 @@ from bodyschema.diagnosis.report.panels import Panel
 from bodyschema.diagnosis.report.residuals import Residuals
 from bodyschema.effects import Effect
 
-from .plots import attributed, scatter_plot
-from .presenter import Found, Presenter, Workshop
+from .evidence import attributed, scatter_plot
+from .presenter import FoundCause, Presenter, Workshop
 
 # Remaining share at which a drift is over.
 _OVER = 0.05
@@ -23,11 +23,11 @@ class ThermalDrift(Presenter):
     effect = "thermal_drift"
     noun = "a drift that settles"
 
-    def finding(self, found: Found) -> str:
+    def finding(self, found: FoundCause) -> str:
         constant = f"{found.numbers['time_constant_s']:.0f} s"
         return f"what is measured drifts by {found.shift} with a time constant of {constant}"
 
-    def remedy(self, workshop: Workshop, found: Found) -> str:
+    def remedy(self, workshop: Workshop, found: FoundCause) -> str:
         wait = -math.log(_OVER) * found.numbers["time_constant_s"]
         return (
             f"Let camera and arm warm up for {_duration(wait)} before recording: {100 * _OVER:.0f} % of the drift is "

@@ -8,8 +8,8 @@ from bodyschema.diagnosis.report.panels import Panel
 from bodyschema.diagnosis.report.residuals import Residuals
 from bodyschema.effects import Effect
 
-from .plots import over_time_since
-from .presenter import Found, Presenter, Workshop, listed, pose
+from .evidence import over_time_since
+from .presenter import FoundCause, Presenter, Workshop, listed, pose
 
 
 class ToolSlip(Presenter):
@@ -18,10 +18,10 @@ class ToolSlip(Presenter):
     effect = "tool_slip"
     noun = "a marker that slipped"
 
-    def finding(self, found: Found) -> str:
+    def finding(self, found: FoundCause) -> str:
         return f"the marker slipped by {found.shift}{found.when}"
 
-    def remedy(self, workshop: Workshop, found: Found) -> str:
+    def remedy(self, workshop: Workshop, found: FoundCause) -> str:
         robot = workshop.robot.robot
         if not robot.marker_known:
             return "Fasten the marker: it slipped on the hand."

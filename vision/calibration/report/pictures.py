@@ -11,7 +11,7 @@ from bodyschema.interfaces.records import FloatArray, ImageArray
 from bodyschema.vision.board import Corners
 from bodyschema.vision.calibration.guidance import GRID
 from bodyschema.vision.calibration.view import Eye
-from bodyschema.vision.images import jpeg, shrunk
+from bodyschema.vision.image_file import jpeg, shrunk
 
 _WIDTH_PX = 400
 _GREEN = (60, 210, 60)

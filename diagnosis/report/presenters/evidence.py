@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyschema.diagnosis.report.panels import Panel
-from bodyschema.diagnosis.report.plot import Layout, Plot, span
 from bodyschema.diagnosis.report.residuals import POINTS, Residuals, binned
+from bodyschema.diagnosis.report.svg_plot import Layout, Plot, span
 from bodyschema.effects import Effect, Motion
 from bodyschema.effects.encoder import EncoderEffect
 from bodyschema.effects.moments import after

@@ -1,4 +1,4 @@
-"""Choice between the compiled and the NumPy path of the innermost loops. Both agree up to rounding.
+"""Choice between the compiled path of the innermost loops (`csrc/`) and that of NumPy. Both agree up to rounding.
 
 The compiled path exists if a C compiler was present when kbmaps was built. BODYSCHEMA_PURE=1 in the environment of a
 process disables it.

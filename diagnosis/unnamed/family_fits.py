@@ -166,8 +166,8 @@ class Apart:
         return sum(way.choice for way in self.chosen)
 
 
-class Unknowns:
-    """All families, prepared for fits of the same observations.
+class UnnamedFamilies:
+    """All unnamed families, prepared for fits of the same observations.
 
     Their columns are those of the aligned simulation, since unnamed errors and changes by the causes are small.
     """

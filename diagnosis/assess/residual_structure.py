@@ -9,10 +9,10 @@ from scipy.special import fdtrc
 
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.search.held_out import Blocks
+from bodyschema.diagnosis.unnamed.family_fits import Apart, UnnamedFamilies, basis_of
 from bodyschema.diagnosis.unnamed.rattle import Rattle
 from bodyschema.diagnosis.unnamed.sensitivity import joints_of
 from bodyschema.diagnosis.unnamed.smooth import SmoothModel, smooth_model
-from bodyschema.diagnosis.unnamed.unknown import Apart, Unknowns, basis_of
 
 from .explanation import Explanation
 
@@ -20,7 +20,7 @@ _WANDERS = "an error that neighbouring rows share and nothing that was tested pr
 
 
 @dataclass(frozen=True, eq=False)
-class Leftover:
+class ResidualStructure:
     """Residual structure after all causes have been named.
 
     Attributes:
@@ -49,14 +49,16 @@ class Leftover:
         return bool(self.what)
 
     @property
-    def nameless(self) -> tuple[str, ...]:
+    def unnamed(self) -> tuple[str, ...]:
         """The descriptions but for a loose marker."""
         return self.what if self.rattle is None else self.what[:-1]
 
 
-def leftover(explanation: Explanation, unknowns: Unknowns, blocks: Blocks, loose: Rattle | None) -> Leftover:
+def residual_structure(
+    explanation: Explanation, unnamed: UnnamedFamilies, blocks: Blocks, loose: Rattle | None
+) -> ResidualStructure:
     """Return the residual structure that the families of an explanation describe, and the play of a loose marker."""
-    left = _of_families(explanation, unknowns, blocks, is_loose=loose is not None)
+    left = _of_families(explanation, unnamed, blocks, is_loose=loose is not None)
     if loose is None:
         return left
     # Look at the joint that carries the marker.
@@ -65,13 +67,15 @@ def leftover(explanation: Explanation, unknowns: Unknowns, blocks: Blocks, loose
     return replace(left, what=(*left.what, loose.what), joints=joints, rattle=loose)
 
 
-def _of_families(explanation: Explanation, unknowns: Unknowns, blocks: Blocks, *, is_loose: bool) -> Leftover:
+def _of_families(
+    explanation: Explanation, unnamed: UnnamedFamilies, blocks: Blocks, *, is_loose: bool
+) -> ResidualStructure:
     fit, apart = explanation.fit, explanation.apart
     if fit.is_exact:
-        return Leftover((), (), False, 1.0)
+        return ResidualStructure((), (), False, 1.0)
     if apart is None:
-        beside = unknowns.apart(fit, (unknowns.nearest(fit)[0][0],))
-        left = Leftover((), (), False, min(1.0, _chance(fit, beside, unknowns) * unknowns.count))
+        beside = unnamed.apart(fit, (unnamed.nearest(fit)[0][0],))
+        left = ResidualStructure((), (), False, min(1.0, _chance(fit, beside, unnamed) * unnamed.count))
         # On which side of its play a marker lies is alike in neighbouring rows.
         if is_loose or not explanation.wanders:
             return left
@@ -80,19 +84,19 @@ def _of_families(explanation: Explanation, unknowns: Unknowns, blocks: Blocks, *
         return replace(left, what=(_WANDERS,), with_time=True, untold=(_WANDERS,), unpredicted_m=shared)
     families = [way.family for way in apart.chosen]
     joints = [joints_of(family, own, fit.run) for family, own in zip(families, apart.numbers, strict=True)]
-    return Leftover(
+    return ResidualStructure(
         what=tuple(family.what for family in families),
         joints=tuple(sorted(frozenset[int]().union(*joints))),
         with_time=any(family.over_time for family in families),
-        p_value=_chance(fit, apart, unknowns),
+        p_value=_chance(fit, apart, unnamed),
         model=smooth_model(fit, apart, families, blocks),
         untold=tuple(family.what for family in families if family.over_time),
     )
 
 
-def _chance(fit: Fit, apart: Apart, unknowns: Unknowns) -> float:
+def _chance(fit: Fit, apart: Apart, unnamed: UnnamedFamilies) -> float:
     """Return the p-value of this structure arising by chance: an F-test, since few rows do not tell the noise."""
-    count = max(unknowns.told(apart).shape[2] + apart.choice, 1)
+    count = max(unnamed.told(apart).shape[2] + apart.choice, 1)
     coordinates = 3.0 * float(fit.noise.weights.sum())
     free = coordinates - basis_of(fit).shape[1] - count
     if free <= 0.0:

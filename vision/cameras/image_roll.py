@@ -1,4 +1,4 @@
-"""Image files instead of cameras."""
+"""Play image files in place of cameras."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from bodyschema.diagnosis.fit.fit import Fit, amount_columns
 from bodyschema.diagnosis.search.search import Search
-from bodyschema.diagnosis.unnamed.unknown import SPECIFIC, Apart, Unknowns
+from bodyschema.diagnosis.unnamed.family_fits import SPECIFIC, Apart, UnnamedFamilies
 from bodyschema.effects import Effect, Motion
 from bodyschema.interfaces.records import FloatArray
 
@@ -21,8 +21,8 @@ _LESS_USUAL = 1.5
 
 
 @dataclass(frozen=True, eq=False)
-class Nameless:
-    """Causes beside an unnamed cause that is as specific as a named one.
+class UnnamedAlternative:
+    """Alternative to a cause: the other causes beside an unnamed one that is as specific.
 
     Attributes:
         apart: the other causes, with the unnamed one removed from the data.
@@ -34,8 +34,8 @@ class Nameless:
 
     @classmethod
     def in_place_of(
-        cls, cause: Effect, fit: Fit, tried: Iterable[Apart], unknowns: Unknowns, search: Search
-    ) -> Nameless | None:
+        cls, cause: Effect, fit: Fit, tried: Iterable[Apart], unnamed: UnnamedFamilies, search: Search
+    ) -> UnnamedAlternative | None:
         """Return the most probable one; None where none is tried.
 
         Args:
@@ -44,7 +44,7 @@ class Nameless:
         """
         allowance = cost_of_names([cause], search) + SPECIFIC - _LESS_USUAL
         found = [
-            cls(apart, apart.fit.log_likelihood - fit.log_likelihood + allowance - unknowns.cost(apart))
+            cls(apart, apart.fit.log_likelihood - fit.log_likelihood + allowance - unnamed.cost(apart))
             for apart in tried
         ]
         return max(found, key=lambda one: one.behind, default=None)

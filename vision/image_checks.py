@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import cv2
 import numpy as np
 
 from bodyschema.interfaces.camera import StereoCalibration
@@ -14,7 +13,6 @@ from bodyschema.interfaces.records import ImageArray, StereoFrame
 # Grey level of an over-exposed pixel, and the largest share of them in a usable image.
 WHITE, _MOST_WHITE = 250, 0.4
 _BLACK = 20  # grey level that hardly a pixel of a black image exceeds
-_QUALITY = 80  # of JPEG for a page: about 100 kB
 
 
 def check_images(frame: StereoFrame, calibration: StereoCalibration) -> None:
@@ -64,14 +62,3 @@ def too_white(levels: ImageArray) -> float | None:
     """Return the share of white among grey levels, if it is too large."""
     white = float(np.mean(levels >= WHITE))
     return white if white > _MOST_WHITE else None
-
-
-def shrunk(image: ImageArray, widest_px: int) -> ImageArray:
-    """Return an image no wider than this."""
-    scale = min(1.0, widest_px / image.shape[1])
-    return np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
-
-
-def jpeg(image: ImageArray) -> bytes:
-    """Return an image as JPEG, for a page."""
-    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()

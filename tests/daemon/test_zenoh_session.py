@@ -11,8 +11,8 @@ from queue import Queue
 import pytest
 
 from bodyschema.cli.hardware.doctor import zenoh_check
-from bodyschema.daemon.transport.bus import Request, ZenohSession, client, unreached
 from bodyschema.daemon.transport.identity import Route
+from bodyschema.daemon.transport.session import Request, ZenohSession, client, unreached
 from bodyschema.daemon.transport.wire import JSON, MSGPACK, ErrorReply, decode
 from bodyschema.interfaces.errors import BusError, RequestError
 
@@ -102,7 +102,7 @@ def test_a_subscriber_with_a_bug_goes_on_receiving(server, asking, quick: bool) 
 
 STOPPED = """
 import os, signal, sys, time
-from bodyschema.daemon.transport.bus import ZenohSession
+from bodyschema.daemon.transport.session import ZenohSession
 with ZenohSession(connect=sys.argv[1]) as bus:
     bus.subscribe(sys.argv[2], lambda payload: (print("heard", flush=True), os.kill(os.getpid(), signal.SIGSTOP)))
     time.sleep(3600)
@@ -228,7 +228,7 @@ def test_a_closed_session_says_so(endpoint) -> None:
 
 def test_a_process_ends_although_its_handlers_are_still_declared(endpoint) -> None:
     code = (
-        "import sys; from bodyschema.daemon.transport.bus import ZenohSession\n"
+        "import sys; from bodyschema.daemon.transport.session import ZenohSession\n"
         "with ZenohSession(listen=sys.argv[1]) as bus:\n"
         "    bus.answer('a/b', lambda r: b''); bus.subscribe('a/c', print); bus.watch('a/d', print)\n"
         "    raise SystemExit(7)"

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from bodyschema.diagnosis.diagnosis import diagnose
 from bodyschema.diagnosis.report.conclusion import conclusion
 from bodyschema.diagnosis.report.result import DiagnosisFile
-from bodyschema.diagnosis.unnamed.eyes import by_turn, reported, undone
+from bodyschema.diagnosis.unnamed.vergence import by_turn, reported, undone
 from bodyschema.effects import Effect, Simulation
 from bodyschema.interfaces.records import FloatArray
 

@@ -1,4 +1,4 @@
-"""Tracker of a coloured ball in stereo frames: a marker fix, or the reason for a miss."""
+"""Tracker of a coloured ball in the images of two eyes: a marker fix, or the reason for a miss."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from bodyschema.interfaces.records import (
     StereoFrame,
     frozen_array,
 )
-from bodyschema.vision.ball.blob import Disc, Patch, Region, find_patches, measure, patch_at, roughly
-from bodyschema.vision.ball.colour import gate_of
-from bodyschema.vision.ball.match import StereoMatcher, is_reflection_of
-from bodyschema.vision.ball.settings import LimbSettings
-from bodyschema.vision.ball.settings import TrackSettings as _Settings
-from bodyschema.vision.ball.size import BallSize
-from bodyschema.vision.ball.sphere import Pinhole
+from bodyschema.vision.config import LONGEST_PAUSE_S, VisionConfig
+from bodyschema.vision.image_checks import check_calibration, check_images
+from bodyschema.vision.triangulate import Location
 
-from .config import LONGEST_PAUSE_S, VisionConfig
-from .images import check_calibration, check_images
-from .triangulate import Location
+from .blob import Disc, Patch, Region, find_patches, measure, patch_at, roughly
+from .colour import gate_of
+from .match import StereoMatcher, is_reflection_of
+from .settings import LimbSettings
+from .settings import TrackSettings as _Settings
+from .size import BallSize
+from .sphere import Pinhole
 
 _log = logging.getLogger(__name__)
 
