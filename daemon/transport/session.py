@@ -201,7 +201,7 @@ class ZenohSession:
     @property
     def _open(self) -> zenoh.Session:
         if self._session is None:
-            raise BusError("the zenoh session is not open; use the bus in a with statement")
+            raise BusError("the zenoh session is not open; use it in a with statement")
         return self._session
 
     def _config(self) -> zenoh.Config:
