@@ -17,8 +17,7 @@ from bodyschema.vision.cameras.config import CamerasConfig, ImagesConfig, TwoCon
 from bodyschema.vision.cameras.image_roll import ImageRoll
 from bodyschema.vision.cameras.look import of_image
 from bodyschema.vision.cameras.opened import eyes_of
-from bodyschema.vision.cameras.pairing import Pairing
-from bodyschema.vision.cameras.shot import Shot
+from bodyschema.vision.cameras.pairing import Pairing, Shot
 from bodyschema.vision.cameras.stamps import TRIALS, Stamps
 from bodyschema.vision.cameras.v4l2.serials import connected, serial_of
 

@@ -23,6 +23,7 @@ from bodyschema.vision.tags.config import ClusterConfig, PlacedTag, TagConfig
 from bodyschema.vision.tags.dictionary import tag_modules
 from bodyschema.vision.tags.edge import PIXEL_CUMULANT, blurred_step
 from bodyschema.vision.tags.image import TagImage, measure_tag
+from bodyschema.vision.tags.settings import EdgeSettings
 from bodyschema.vision.tags.tracker import TagTracker
 from bodyschema.vision.trackers import tracker_of
 from kbmaps import rotation_vectors
@@ -341,14 +342,14 @@ def test_a_cluster_of_which_the_eyes_see_different_tags_is_no_marker() -> None:
     assert reason(TagTracker(SMALL, CUBE, CONFIG).track(frame)) is Reason.NO_MARKER
 
 
-def test_a_tag_that_only_one_eye_measures_names_its_fault_in_the_other() -> None:
+def test_a_tag_that_only_one_eye_measures_names_its_fault_in_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
     one, other = cube_at(tilted([0.2, 1.0, 0.3], 40.0), MIDDLE)
     right = seen(one, other).images[1].astype(np.float64)
     faded = slice(None, int(SMALL.project(np.array([one.x, other.x]))[:, 2].mean()))  # up to the other tag
     right[:, faded] = 128.0 + 0.2 * (right[:, faded] - 128.0)
     frame = StereoFrame(0.0, seen(one).left, right.astype(np.uint8))
-    config = TagConfig(side_m=SIDE_M, min_contrast=60.0)
-    assert reason(TagTracker(SMALL, CUBE, config).track(frame)) is Reason.LOW_CONTRAST
+    monkeypatch.setattr(EdgeSettings, "least_contrast", 60.0)  # less, and OpenCV does not find the tag
+    assert reason(TagTracker(SMALL, CUBE, CONFIG).track(frame)) is Reason.LOW_CONTRAST
 
 
 def test_more_tags_of_the_same_noise_give_a_surer_orientation() -> None:

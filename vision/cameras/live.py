@@ -18,8 +18,7 @@ from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import StereoFrame
 
 from .config import CamerasConfig, OneConfig, SideBySideConfig, TwoConfig
-from .pairing import Pairing
-from .shot import Shot
+from .pairing import Pairing, Shot
 from .v4l2.capture import Capture
 from .v4l2.device import CameraDevice, OpenCapture, open_v4l2
 from .v4l2.serials import serial_of

@@ -4,10 +4,20 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from dataclasses import dataclass
 
-from .shot import Shot
+from bodyschema.interfaces.records import ImageArray
 
 KEPT = 4  # images of each camera; older ones are never paired
+
+
+@dataclass(frozen=True, slots=True)
+class Shot:
+    """An image of one camera and when it was taken."""
+
+    t: float  # time stamp [s], the latency not yet taken off
+    t_sigma: float  # 1-sigma of it [s]
+    image: ImageArray  # (height, width, 3), uint8, BGR
 
 
 class Pairing:

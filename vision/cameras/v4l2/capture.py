@@ -11,7 +11,7 @@ from typing import Self
 
 from bodyschema.interfaces.errors import SourceError
 from bodyschema.vision.cameras.look import Look
-from bodyschema.vision.cameras.shot import Shot
+from bodyschema.vision.cameras.pairing import Shot
 
 from .device import CameraDevice
 

@@ -14,7 +14,7 @@ from bodyschema.interfaces.errors import SourceError, SourceLost
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import ImageArray
 from bodyschema.vision.cameras.config import UvcSettings
-from bodyschema.vision.cameras.shot import Shot
+from bodyschema.vision.cameras.pairing import Shot
 from bodyschema.vision.cameras.stamps import Stamps
 
 from .controls import FocusWatch, VideoCapture, apply, raw_size_px, sends_jpeg
