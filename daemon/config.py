@@ -58,9 +58,6 @@ class DaemonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     any_step: bool = False
     max_reading_gap_s: Positive = 0.1  # encoder readings around a frame may be this far apart
     max_marker_speed_m_s: Positive = 3.0  # a marker that moved faster since its last fix is not believed
-    # joints that move farther than this while the time of a frame is uncertain (1-sigma, and what lies between the two
-    # eyes' images) are too fast for a pair
-    max_time_error_deg: Positive = 0.2
     # pairs older than this are deleted, but never the newest 20,000; without it, age does not matter
     keep_days: Positive | None = None
     # maximum size of the store in 10^6 bytes; the oldest pairs beyond it are deleted, but never the newest 20,000.
@@ -70,7 +67,7 @@ class DaemonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 # Keys of earlier versions by their tables, whose values are fixed now. The next release knows them no more.
 RETIRED = {
-    ("daemon",): ("segment_gap_s", "keep_newest"),
+    ("daemon",): ("max_time_error_deg", "segment_gap_s", "keep_newest"),
     ("drivers", "dynamixel"): ("max_speed_deg_s", "max_move_deg"),
     ("drivers", "dynamixel", "zero_force"): ("doubtful_cycles", "ramp_s", "overcurrent_s"),
     ("drivers", "dynamixel", "gaze"): ("doubtful_cycles", "stale_s", "blocked_s", "blocked_deg"),

@@ -94,13 +94,13 @@ def _structs(annotation: object) -> Iterator[type[msgspec.Struct]]:
 
 
 def _table(heading: str, kind: type[msgspec.Struct], first: dict[type[msgspec.Struct], str]) -> str:
-    """Return the section of one table; keys that are tables themselves have their own.
+    """Return the section of one table; keys that can only be tables have their own.
 
     Args:
         first: the table that describes the keys of a class, of those before this one.
     """
     told = _documented(kind)
-    fields = [field for field in msgspec.structs.fields(kind) if not list(_structs(field.type))]
+    fields = [field for field in msgspec.structs.fields(kind) if not list(_structs(field.type)) or _is_word(field.type)]
     by_text: dict[str, list[msgspec.structs.FieldInfo]] = {}
     described: dict[str, list[str]] = {}
     for field in fields:
@@ -118,6 +118,11 @@ def _table(heading: str, kind: type[msgspec.Struct], first: dict[type[msgspec.St
         return f"\n## {heading}\n{shared}" if shared else ""
     table = "| key | default | meaning |\n| --- | --- | --- |\n" + "\n".join(rows) + "\n"
     return f"\n## {heading}\n{shared}\n{table}"
+
+
+def _is_word(annotation: object) -> bool:
+    """Return True for a key that is a table or one of some words."""
+    return any(typing.get_origin(part) is typing.Literal for part in typing.get_args(annotation))
 
 
 def _definer(kind: type[msgspec.Struct], name: str) -> type[msgspec.Struct]:

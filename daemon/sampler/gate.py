@@ -15,6 +15,9 @@ from .align import joint_difference
 # This many consecutive fixes that agree with each other, but not with the previous position, are accepted.
 CONFIRMATIONS = 3
 SEGMENT_GAP_S = 1.0  # a longer pause between pairs starts a new segment
+# Joints that move farther while the time of a frame is uncertain (1-sigma, and what lies between the two eyes' images)
+# are too fast for a pair.
+MOST_TIME_ERROR_DEG = 0.2
 
 
 class _Fix(NamedTuple):
@@ -81,7 +84,7 @@ class Gate:
 
     def is_too_fast(self, moved: FloatArray) -> bool:
         """Return True if joints that moved by `moved` [rad or m], (d,), within the time uncertainty make no pair."""
-        return float(np.linalg.norm(moved * self._degrees_per_unit)) > self._rules.max_time_error_deg
+        return float(np.linalg.norm(moved * self._degrees_per_unit)) > MOST_TIME_ERROR_DEG
 
     def _believe(self, fix: _Fix) -> bool:
         jumped = self._reachable(self._suspect, fix)
