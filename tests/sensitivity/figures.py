@@ -81,8 +81,11 @@ def diagnosis() -> Figures:
     """Return the held-out error [mm] of the extended simulation of a hidden case, and the causes that are named."""
     recording, simulation = _hidden()
     found = conclusion(diagnose(recording, simulation, seed=1))
+    error, noise = found.rms_mm.extended, found.rms_mm.noise_floor
+    assert error is not None
+    assert noise is not None
     named = " ".join(sorted(f"{cause.effect}@{cause.where}" for cause in found.causes))
-    return {"error": found.rms_mm.extended, "noise": found.rms_mm.noise_floor, "causes": f"{found.verdict}: {named}"}
+    return {"error": error, "noise": noise, "causes": f"{found.verdict}: {named}"}
 
 
 @cache
