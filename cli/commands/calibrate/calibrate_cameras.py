@@ -136,18 +136,25 @@ def _calibrate(
     *,
     as_json: bool,
 ) -> None:
-    from bodyschema.cli.cameras.calibration import cameras_view, figures, write_calibrated_cameras
+    from bodyschema.cli.cameras.calibration import (
+        calibrated,
+        cameras_view,
+        figures,
+        from_images,
+        write_calibrated_cameras,
+    )
     from bodyschema.daemon.config import Config
-    from bodyschema.daemon.wiring.cameras import calibration_file, names_calibration
+    from bodyschema.daemon.wiring.cameras import calibration_file, require_cameras
 
     board, named, autofocus = printed.board(), True, ()
     if images is not None:
-        found, result = _of_images(images, files, board, known)
-        out = out or CAMERAS
+        tell = partial(say, stderr=True)
+        found = from_images(files.of(images), board, tell)
+        result, out = calibrated(found, known, tell), out or CAMERAS
     else:
         config = Config.load(robot)
         found, result, autofocus = _live(config, board, known, save)
-        out, named = out or calibration_file(config), names_calibration(config)
+        out, named = out or calibration_file(config), require_cameras(config).calibration is not None
     report = write_calibrated_cameras(result, found, out)
     measured = printed.ruler_mm is not None or known.baseline_mm is not None
     told = figures(result, found, size_was_measured=measured, autofocus=autofocus)
@@ -182,34 +189,28 @@ def _check(
 
 
 def _print_board(made: Board, paper: str, out: Path) -> None:
-    from bodyschema.cli.cameras.calibration import write_board
+    from bodyschema.cli.cameras.board_pages import write_page
+    from bodyschema.vision.board.page import page as board_page
 
-    across, upright = write_board(made, paper, out)
+    across, upright = write_page(board_page(made, paper), out)
     say(
         f"{out} written: {made.name}. Print it at 100 %, then measure both rulers: {across:g} mm below, {upright:g} mm "
         "beside the board."
     )
 
 
-def _of_images(images: Path, files: EyeFiles, board: Board, known: KnownCameras) -> tuple[Gathered, Calibrated]:
-    from bodyschema.cli.cameras.calibration import calibrated, from_images
-
-    tell = partial(say, stderr=True)
-    found = from_images(files.of(images), board, tell)
-    return found, calibrated(found, known, tell)
-
-
 def _live(
     config: Config, board: Board, known: KnownCameras, save: Path | None
 ) -> tuple[Gathered, Calibrated, tuple[str, ...]]:
     """Return the views, their calibration, and what the cameras reported of their focus."""
-    from bodyschema.cli.cameras.calibration import calibrated, kept_in, live_views
-    from bodyschema.cli.cameras.live_calibration import LiveCalibration, guidance_on
+    from bodyschema.cli.cameras.calibration import calibrated, kept_in
+    from bodyschema.cli.cameras.live_calibration import LiveCalibration, LiveViews, guidance_on
     from bodyschema.daemon.wiring.cameras import focus_complaints, open_eyes, require_cameras
+    from bodyschema.vision.calibration.view import EYES, ONE_EYE
 
     clock = SystemClock()
     eyes = open_eyes(config, clock)
-    views = live_views(board, require_cameras(config).eyes)
+    views = LiveViews(board, eyes=EYES if require_cameras(config).eyes > 1 else ONE_EYE)
     with guidance_on(Console(stderr=True, highlight=False), board.name, clock) as show:
         calibration = LiveCalibration(
             eyes,
