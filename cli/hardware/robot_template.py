@@ -198,7 +198,7 @@ def quoted(text: str) -> str:
     return f'"{escaped}"'
 
 
-def guess_from(urdf: Path, robot: Path, *, marker_link: str | None = None, camera_link: str | None = None) -> Guess:
+def guess_from(urdf: Path, robot: Path, marker_link: str | None, camera_link: str | None) -> Guess:
     """Guess the chain with the most moving joints in `urdf`, without fingers and joints that mimic others.
 
     Args:
@@ -212,7 +212,8 @@ def guess_from(urdf: Path, robot: Path, *, marker_link: str | None = None, camer
     """
     tree = UrdfTree.load(urdf)
     for link in (marker_link, camera_link):
-        _require_link(tree, link, urdf)
+        if link is not None and link not in tree.links:
+            raise ConfigError(f"has no link {link!r}", file=urdf, remedy=did_you_mean(link, tree.links))
     if marker_link is None:
         root = camera_link or tree.root
         paths = {link: [joint for joint, _ in tree.path(root, link)] for link in tree.links}
@@ -239,11 +240,6 @@ def _moving(path: Sequence[UrdfJoint]) -> list[str]:
 def _is_finger(joint: UrdfJoint) -> bool:
     """Return True for a joint that mimics another one, and for one of a gripper by its name."""
     return joint.mimics or (joint.kind in MOVING and bool(_FINGER.search(joint.name)))
-
-
-def _require_link(tree: UrdfTree, link: str | None, urdf: Path) -> None:
-    if link is not None and link not in tree.links:
-        raise ConfigError(f"has no link {link!r}", file=urdf, remedy=did_you_mean(link, tree.links))
 
 
 def key_name(text: str) -> str:

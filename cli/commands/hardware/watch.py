@@ -136,8 +136,8 @@ def _cameras(robot: Path, out: Path | None, port: int, every: float, count: int 
         while watching.step(READ_S):
             if time.monotonic() >= tell_at:
                 tell_at = time.monotonic() + LINE_EVERY_S
-                say(watching.said, *watched.eyes.health)
-    say(watching.said, *watched.eyes.health)
+                say(watched.camera.said, *watched.eyes.health)
+    say(watched.camera.said, *watched.eyes.health)
 
 
 def _marker(robot: Path, seconds: float | None) -> None:
