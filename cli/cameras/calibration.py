@@ -15,7 +15,7 @@ from rich.padding import Padding
 from rich.text import Text
 from scipy.spatial.transform import Rotation
 
-from bodyschema.cli.cameras.board_pages import printed_scale
+from bodyschema.cli.cameras.board_pages import printed_scale, write_page
 from bodyschema.cli.terminal.screen import ruled_table
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError
@@ -24,13 +24,16 @@ from bodyschema.interfaces.whole_files import write_whole
 from bodyschema.robot.hand_eye import HandEye, pose_covariance
 from bodyschema.vision.board import Board
 from bodyschema.vision.board.board import Pattern
+from bodyschema.vision.board.page import page as board_page
 from bodyschema.vision.calibration.calibrate import Asked, Calibrated, calibrate
 from bodyschema.vision.calibration.check import Check, check
 from bodyschema.vision.calibration.gather import Gathered, gathered, require_both
 from bodyschema.vision.calibration.images import ImagePair, Images, read_pairs, write_pair
+from bodyschema.vision.calibration.live import LiveViews
 from bodyschema.vision.calibration.refocus import refocused
 from bodyschema.vision.calibration.report import page as report_page
 from bodyschema.vision.calibration.report.page import to_its_interval
+from bodyschema.vision.calibration.view import EYES, ONE_EYE
 from bodyschema.vision.printing.sheet import rulers_mm
 from bodyschema.vision.rig.common_error import AHEAD_M, CommonError
 from bodyschema.vision.rig.rectified import Rectification
@@ -155,6 +158,15 @@ def as_printed(drawn: Board, ruler_mm: float | None) -> Board:
     return replace(drawn, square_m=scale * drawn.square_m, marker_m=scale * drawn.marker_side_m)
 
 
+def write_board(board: Board, paper: str, out: Path) -> tuple[float, float]:
+    """Write the board's page as PDF or SVG; the lengths of its rulers, across and upright [mm].
+
+    Raises:
+        ConfigError: it does not fit, the ending is neither, or the file cannot be written.
+    """
+    return write_page(board_page(board, paper), out)
+
+
 def from_images(images: Images, board: Board, tell: Tell) -> Gathered:
     """All views in a folder's images.
 
@@ -187,6 +199,11 @@ def calibrated(found: Gathered, known: KnownCameras, tell: Tell, serials: Sequen
         baseline_m=_metres(known.baseline_mm),
     )
     return calibrate(found.views, found.board, asked, tell)
+
+
+def live_views(board: Board, eyes: int) -> LiveViews:
+    """Return an empty collection of views of the board, for one eye or two."""
+    return LiveViews(board, eyes=EYES if eyes > 1 else ONE_EYE)
 
 
 def kept_in(folder: Path | None) -> Callable[[ImagePair, int], None]:

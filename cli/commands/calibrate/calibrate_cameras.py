@@ -189,10 +189,9 @@ def _check(
 
 
 def _print_board(made: Board, paper: str, out: Path) -> None:
-    from bodyschema.cli.cameras.board_pages import write_page
-    from bodyschema.vision.board.page import page as board_page
+    from bodyschema.cli.cameras.calibration import write_board
 
-    across, upright = write_page(board_page(made, paper), out)
+    across, upright = write_board(made, paper, out)
     say(
         f"{out} written: {made.name}. Print it at 100 %, then measure both rulers: {across:g} mm below, {upright:g} mm "
         "beside the board."
@@ -203,14 +202,13 @@ def _live(
     config: Config, board: Board, known: KnownCameras, save: Path | None
 ) -> tuple[Gathered, Calibrated, tuple[str, ...]]:
     """Return the views, their calibration, and what the cameras reported of their focus."""
-    from bodyschema.cli.cameras.calibration import calibrated, kept_in
-    from bodyschema.cli.cameras.live_calibration import LiveCalibration, LiveViews, guidance_on
+    from bodyschema.cli.cameras.calibration import calibrated, kept_in, live_views
+    from bodyschema.cli.cameras.live_calibration import LiveCalibration, guidance_on
     from bodyschema.daemon.wiring.cameras import focus_complaints, open_eyes, require_cameras
-    from bodyschema.vision.calibration.view import EYES, ONE_EYE
 
     clock = SystemClock()
     eyes = open_eyes(config, clock)
-    views = LiveViews(board, eyes=EYES if require_cameras(config).eyes > 1 else ONE_EYE)
+    views = live_views(board, require_cameras(config).eyes)
     with guidance_on(Console(stderr=True, highlight=False), board.name, clock) as show:
         calibration = LiveCalibration(
             eyes,
