@@ -31,9 +31,8 @@ from .counters import SamplerCounters
 from .gate import Gate
 from .gaze_loop import gaze_of
 from .history import LARGEST_REPLY, answer_pairs
-from .powered import asked
 from .reconnect import ReconnectingSource, ResilientWriter
-from .sources import Sources, TellsHealth, answer_simulation
+from .sources import Sources, TellsHealth, answer_simulation, asked
 
 log = logging.getLogger(__name__)
 

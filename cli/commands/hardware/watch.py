@@ -89,7 +89,7 @@ def watch(
 def _joints(robot: Path, *, once: bool, json: bool, zero_force: bool) -> None:
     from bodyschema.cli.hardware.joints_watch import JointsWatch, as_json, screen
     from bodyschema.daemon.config import Config
-    from bodyschema.daemon.sampler.powered import find_powered
+    from bodyschema.daemon.sampler.sources import find_powered
     from bodyschema.daemon.wiring.wiring import open_joints
     from bodyschema.interfaces.servos import ServoJoints
 
