@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.suggest import did_you_mean
+from bodyschema.robot.toml_text import toml_value
 from bodyschema.robot.urdf import MOVING, UrdfJoint, UrdfTree
 
 
@@ -163,13 +164,12 @@ _EXAMPLES = "/dev/v4l/by-id/usb-LEFT-video-index0", "/dev/v4l/by-id/usb-RIGHT-vi
 
 def robot_toml(guess: Guess, seen: Seen = _NOTHING_SEEN) -> str:
     """Return the text of a commented robot.toml."""
-    joints = "[" + ", ".join(quoted(joint) for joint in guess.joints) + "]"
     return _TEMPLATE.format(
-        name=quoted(guess.name),
-        urdf=quoted(guess.urdf),
-        joints=joints,
-        marker_link=quoted(guess.marker_link),
-        camera_link=quoted(guess.camera_link),
+        name=toml_value(guess.name),
+        urdf=toml_value(guess.urdf),
+        joints=toml_value(guess.joints),
+        marker_link=toml_value(guess.marker_link),
+        camera_link=toml_value(guess.camera_link),
         frame="left optical frame" if seen.webcam is None else "camera's optical frame",
         eyes=_TWO_EYES if seen.webcam is None else _ONE_EYE,
         marker=seen.marker(),
@@ -184,18 +184,12 @@ def _metres(length_mm: float) -> str:
 def _camera_tables(seen: Seen) -> str:
     """Return the cameras' tables; with fewer than two cameras, an example that is commented out."""
     if seen.webcam is not None:
-        return _CAMERAS.format(hidden="", devices=_ONE.format(device=quoted(seen.webcam)))
-    left, right = map(quoted, seen.cameras[:2] if len(seen.cameras) >= 2 else _EXAMPLES)
+        return _CAMERAS.format(hidden="", devices=_ONE.format(device=toml_value(seen.webcam)))
+    left, right = map(toml_value, seen.cameras[:2] if len(seen.cameras) >= 2 else _EXAMPLES)
     text = _CAMERAS.format(hidden="# ", devices=_TWO.format(left=left, right=right))
     if len(seen.cameras) >= 2:
         return text
     return "".join(line if line.startswith("#") else f"# {line}" for line in text.splitlines(keepends=True))
-
-
-def quoted(text: str) -> str:
-    """Return `text` as a TOML string."""
-    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
-    return f'"{escaped}"'
 
 
 def guess_from(urdf: Path, robot: Path, marker_link: str | None, camera_link: str | None) -> Guess:
