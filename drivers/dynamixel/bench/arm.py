@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from random import Random
 
-from bodyschema.drivers.bench.asked_faults import ON_THE_WIRE, FaultKinds
 from bodyschema.drivers.bench.device import Angle, Faults, Reply
+from bodyschema.drivers.bench.faults import ON_THE_WIRE, FaultKinds
 from bodyschema.drivers.bench.servo_arm import AT_THE_START, ServoArm
 from bodyschema.drivers.dynamixel.bench.chain import Chain
 from bodyschema.drivers.dynamixel.bench.frames import HEADER2
