@@ -18,17 +18,16 @@ from functools import partial
 from random import Random
 from typing import Any
 
-from bodyschema.drivers.bench.device import Device
-from bodyschema.drivers.bench.faults import Storm, mute
-from bodyschema.drivers.bench.faults import storm as storm_of_lines
-from bodyschema.drivers.dynamixel.bench.arm import storm as storm_of_dynamixel
+from bodyschema.drivers.bench.device import Device, Fault
+from bodyschema.drivers.bench.faults import mute
+from bodyschema.drivers.dynamixel.bench.arm import swapped
 from bodyschema.drivers.dynamixel.bench.chain import Chain
 from bodyschema.drivers.dynamixel.bench.servo import Servo
 from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
 from bodyschema.drivers.dynamixel.joints import DynamixelJoints
 from bodyschema.drivers.dynamixel.models import BY_NAME
 from bodyschema.drivers.feetech.bench.arm import Chain as FeetechChain
-from bodyschema.drivers.feetech.bench.arm import storm as storm_of_feetech
+from bodyschema.drivers.feetech.bench.arm import swapped as swapped_feetech
 from bodyschema.drivers.feetech.bench.servo import Servo as FeetechServo
 from bodyschema.drivers.feetech.config import BusConfig as FeetechBus
 from bodyschema.drivers.feetech.config import FeetechConfig
@@ -39,6 +38,7 @@ from bodyschema.drivers.serial_lines.config import EncoderConfig, SerialLinesCon
 from bodyschema.drivers.serial_lines.joints import SerialLineJoints
 from bodyschema.interfaces.errors import SourceLost
 from tests.daemon.virtual_port import VirtualClock, VirtualPort
+from tests.drivers.wire_faults import Storm, storm
 
 JOINTS = 3  # in a storm
 JOINTS_OF_AN_ARM = 6
@@ -79,6 +79,10 @@ def _port(device: Device, clock: VirtualClock, rng: Random, baud: int = 1_000_00
     return VirtualPort(device, clock, baud, outwards=lambda: rng.uniform(0, 1e-4), inwards=lambda: rng.uniform(0, 3e-4))
 
 
+def _storm(swapped: Fault, intensity: float, rng: Random) -> Storm:
+    return storm(intensity, rng, swapped)
+
+
 def names(count: int) -> list[str]:
     """Return the names of the joints."""
     return [f"joint{k}" for k in range(1, count + 1)]
@@ -94,7 +98,7 @@ def dynamixel(clock: VirtualClock, rng: Random, count: int, model: str, *, is_fa
     limits = [LIMITS] * count
     joints = DynamixelJoints(config, names(count), clock, limits=limits, open_port=lambda *_: (port, LATENCY_S))
     step, parts = BY_NAME[model].rad_per_tick, 1 if is_fast else count
-    return Rig(chain, joints, lambda: chain.instructions, storm_of_dynamixel, step, parts)
+    return Rig(chain, joints, lambda: chain.instructions, partial(_storm, swapped), step, parts)
 
 
 def feetech(clock: VirtualClock, rng: Random, count: int, model: str) -> Rig:
@@ -107,7 +111,7 @@ def feetech(clock: VirtualClock, rng: Random, count: int, model: str) -> Rig:
     limits = [LIMITS] * count
     joints = FeetechJoints(config, names(count), clock, limits=limits, open_port=lambda *_: (port, LATENCY_S))
     step = FEETECH_MODELS[model].rad_per_tick
-    return Rig(chain, joints, lambda: chain.instructions, storm_of_feetech, step, count)
+    return Rig(chain, joints, lambda: chain.instructions, partial(_storm, swapped_feetech), step, count)
 
 
 def lines(clock: VirtualClock, rng: Random, count: int) -> Rig:
@@ -117,7 +121,7 @@ def lines(clock: VirtualClock, rng: Random, count: int) -> Rig:
     port = _port(board, clock, rng, LINE_BAUD)
     config = SerialLinesConfig("bench", tuple(EncoderConfig(name) for name in names(count)), LINE_BAUD)
     joints = SerialLineJoints(config, names(count), clock, limits=[LIMITS] * count, open_port=lambda *_: port)
-    return Rig(board, joints, lambda: board.lines, storm_of_lines, 2 * math.pi / 4096, 1)
+    return Rig(board, joints, lambda: board.lines, storm, 2 * math.pi / 4096, 1)
 
 
 Make = Callable[[VirtualClock, Random, int], Rig]

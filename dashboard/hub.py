@@ -15,9 +15,6 @@ MOST_FOLLOWERS = 32
 class HubFullError(BodyschemaError):
     """Too many browsers follow already."""
 
-    def __init__(self) -> None:
-        super().__init__(f"{MOST_FOLLOWERS} pages are open already. Close one")
-
 
 class Follower:
     """One browser: its pending documents, each in its newest version. A slow browser misses the versions between."""
@@ -83,7 +80,7 @@ class Hub:
         """
         with self._lock:
             if len(self._followers) >= MOST_FOLLOWERS:
-                raise HubFullError
+                raise HubFullError(f"{MOST_FOLLOWERS} pages are open already. Close one")
             follower = Follower(self._documents)
             self._followers.add(follower)
         return follower

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 
 def this_interpreter() -> str:
@@ -16,6 +18,16 @@ def this_interpreter() -> str:
 def module_command(module: str, *arguments: str) -> list[str]:
     """Return the command that runs `module` with this interpreter."""
     return [this_interpreter(), "-P", "-m", module, *arguments]
+
+
+def end(process: subprocess.Popen[Any], limit_s: float) -> int:
+    """Terminate a process, kill it after a time limit [s], and return its exit code."""
+    process.terminate()
+    try:
+        return process.wait(limit_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()
 
 
 @contextmanager

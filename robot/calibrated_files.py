@@ -19,10 +19,10 @@ from bodyschema.interfaces.whole_files import write_whole, writing
 
 from .calibrated import CalibratedGeometry
 from .description import RobotDescription
-from .limited import read_at_most
 from .rpy import rpy_of
 from .toml_file import read_toml
 from .toml_text import toml_text
+from .urdf import parse_urdf
 
 CAMERA_LINK = "calibrated_camera"
 MARKER_LINK = "calibrated_marker"
@@ -75,8 +75,7 @@ def calibrated_urdf(robot: RobotDescription, geometry: CalibratedGeometry, folde
     """Return the URDF of `robot` with `geometry`, for a file in `folder`."""
     from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
-    parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, huge_tree=False)
-    root = etree.fromstring(read_at_most(robot.tree.file), parser)
+    root = parse_urdf(robot.tree.file)
     comment = etree.Comment(f" {heading.replace('--', '- -')} ")
     comment.tail = "\n  "
     root.insert(0, comment)

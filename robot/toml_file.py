@@ -86,15 +86,12 @@ def read_toml(
 
 def line_of_endless_key(text: str) -> int | None:
     """Return the first line (from 1) with a key of more than `MOST_PARTS` parts, which parse slowly; else None."""
-    for number, line in enumerate(without_quoted(text).split("\n"), 1):
+    # With `q` in the place of each string and comment; there are as many lines.
+    plain = _QUOTED.sub(lambda found: "q" + "\n" * found[0].count("\n"), text)
+    for number, line in enumerate(plain.split("\n"), 1):
         if line.count(".") > MOST_PARTS and any(piece.count(".") > MOST_PARTS for piece in _BETWEEN.split(line)):
             return number
     return None
-
-
-def without_quoted(text: str) -> str:
-    """Return TOML text with `q` in the place of each string and comment; it has as many lines."""
-    return _QUOTED.sub(lambda found: "q" + "\n" * found[0].count("\n"), text)
 
 
 def _unusable(value: object, keys: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], str]]:

@@ -16,7 +16,7 @@ import numpy as np
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.extras import missing
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.sim_backend.geometry import cross_matrix
+from kbmaps.rotations import cross_matrix
 
 
 class PhysicsUrdf(msgspec.Struct, frozen=True):

@@ -29,12 +29,6 @@ def turn_of_z(direction: FloatArray) -> FloatArray:
     return np.stack([x, np.cross(direction, x), direction], axis=1)
 
 
-def cross_matrix(vector: FloatArray) -> FloatArray:
-    """Return the skew-symmetric matrix (3, 3) of `vector` (3,): its product with x is the cross product vector × x."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-
-
 def turn_between(R_from: FloatArray, R_to: FloatArray) -> FloatArray:
     """Return the rotation axis (3,) from one orientation (3, 3) to another, times the sine of the angle."""
     R = R_to @ R_from.T

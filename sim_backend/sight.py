@@ -9,8 +9,8 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.pointing import Pointing
 from bodyschema.robot.rpy import rotation_of
-from bodyschema.sim_backend.geometry import cross_matrix
 from kbmaps import RigidChain
+from kbmaps.rotations import cross_matrix
 
 from .bullet import Body
 from .config import CameraConfig

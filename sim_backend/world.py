@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import subprocess
 import threading
 import time
 from collections import deque
@@ -102,10 +101,6 @@ class SimWorld:
     def now(self) -> float:
         """Return the simulated time of the last step [s]; a frame may be up to two frame intervals older."""
         return self._physics.steps / self._physics.rate_hz
-
-    @property
-    def renderer_process(self) -> subprocess.Popen[bytes]:
-        return self._renderer.process
 
     def change_tool(self, marker_xyz: tuple[float, float, float] | FloatArray) -> float:
         """Put another tool into the hand, its marker described to be at `marker_xyz` [m] in the marker link.

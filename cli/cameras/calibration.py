@@ -10,14 +10,13 @@ from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
-from rich import box
 from rich.console import Group
 from rich.padding import Padding
-from rich.table import Table
 from rich.text import Text
 from scipy.spatial.transform import Rotation
 
 from bodyschema.cli.cameras.board_pages import printed_scale, write_page
+from bodyschema.cli.terminal.screen import ruled_table
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
@@ -326,19 +325,20 @@ def cameras_view(found: CamerasFile) -> Group:
     width, height = found.image_size_px
     eyes = ("left", "right") if found.baseline_mm is not None else ("left",)
     titles = ("left", "95 %", "right", "95 %") if len(eyes) > 1 else ("value", "95 %")
-    table = _table(f"{found.model} {'lenses' if len(eyes) > 1 else 'lens'}, {width}x{height}", *titles)
+    table = ruled_table(f"{found.model} {'lenses' if len(eyes) > 1 else 'lens'}, {width}x{height}", *titles)
     values = {each.name: each for each in found.parameters}
     own = [name.removeprefix("left.") for name in values if name.startswith("left.")]
     for name in own:
         own_of = (values[f"{eye}.{name}"] for eye in eyes)
         pairs = (to_its_interval(each.value, each.half_width) for each in own_of)
-        table.add_row(Text(_with_unit(name)), *(text for pair in pairs for text in pair))
+        unit = " [px]" if name.endswith("_px") else ""
+        table.add_row(Text(f"{name.removesuffix('_px')}{unit}"), *(text for pair in pairs for text in pair))
     return Group(table, *(Padding(Text(text), (1, 0, 0, 0), expand=False) for text in _sentences(found)))
 
 
 def check_view(found: CheckFile, name: str) -> Group:
     """Return a table of measured and expected figures, followed by the verdict."""
-    table = _table(f"{name}: {found.corners} corners", "measured", "95 %", "should be")
+    table = ruled_table(f"{name}: {found.corners} corners", "measured", "95 %", "should be")
     table.add_row(
         Text("rows of both eyes apart [px]"), f"{found.rows_px:+.3f}", f"± {found.rows_half_width_px:.3f}", "0"
     )
@@ -393,15 +393,3 @@ def _rivals(found: CamerasFile) -> str:
         return ""
     errors = ", ".join(f"{model} {px:.3f} px" for model, px in found.held_out_by_model_px.items())
     return f"Lens models by that error: {errors}."
-
-
-def _with_unit(name: str) -> str:
-    return f"{name.removesuffix('_px')} [px]" if name.endswith("_px") else name
-
-
-def _table(first: str, *others: str) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
-    table.add_column(Text(first), overflow="fold")
-    for name in others:
-        table.add_column(name, justify="right", no_wrap=True)
-    return table

@@ -6,8 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Protocol, Self
+from typing import Protocol
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -18,7 +17,6 @@ from bodyschema.cli.cameras.calibration import Tell, pair_in
 from bodyschema.daemon.sampler.reconnect import ReconnectingSource
 from bodyschema.interfaces.errors import SourceEnded, SourceError
 from bodyschema.interfaces.protocols import Clock, StereoEyes
-from bodyschema.interfaces.records import StereoFrame
 from bodyschema.interfaces.waits import LINE_EVERY_S, READ_S
 from bodyschema.vision.calibration.calibrate import Calibrated
 from bodyschema.vision.calibration.check import Check, check
@@ -63,53 +61,6 @@ class HealthyEyes(StereoEyes, Protocol):
     def health(self) -> tuple[str, ...]: ...
 
 
-Require = Callable[[tuple[int, int], tuple[str, ...]], None]
-
-
-class RequiredEyes:
-    """Cameras that must satisfy a requirement each time they are opened."""
-
-    def __init__(self, eyes: StereoEyes, require: Require) -> None:
-        """Store the arguments; open nothing yet.
-
-        Args:
-            require: called with image size and serials; raises SourceError if others are required.
-        """
-        self._eyes, self._require = eyes, require
-
-    def __enter__(self) -> Self:
-        self._eyes.__enter__()
-        try:
-            self._require(self._eyes.image_size_px, self._eyes.serials)
-        except BaseException:
-            self._eyes.__exit__(None, None, None)
-            raise
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._eyes.__exit__(kind, error, trace)
-
-    def read(self, timeout_s: float) -> StereoFrame | None:
-        """Return the next frame; see `StereoEyes.read`."""
-        return self._eyes.read(timeout_s)
-
-
-class SameAsFirst:
-    """Requirement that cameras and image size stay the same for all views of a calibration."""
-
-    def __init__(self) -> None:
-        self._first: tuple[tuple[int, int], tuple[str, ...]] | None = None
-
-    def __call__(self, image_size_px: tuple[int, int], serials: tuple[str, ...]) -> None:
-        """Raise SourceError if image size or serials differ from the first call."""
-        self._first = self._first or (image_size_px, serials)
-        if (image_size_px, serials) != self._first:
-            these, first = _named(image_size_px, serials), _named(*self._first)
-            raise SourceError(f"these are {these}, the views are of {first}. Plug those in")
-
-
 def _named(image_size_px: tuple[int, int], serials: tuple[str, ...]) -> str:
     return f"{' and '.join(serials)} with {'x'.join(map(str, image_size_px))} pixels"
 
@@ -129,7 +80,8 @@ class LiveCalibration:
         keep: Callable[[ImagePair, int], None] = lambda _pair, _number: None,
     ) -> None:
         self._eyes, self._calibrated, self._show, self._keep = eyes, calibrated, show, keep
-        self._source = ReconnectingSource(RequiredEyes(eyes, SameAsFirst()), "the cameras", clock)
+        self._source = ReconnectingSource(eyes, "the cameras", clock, require=self._require_same)
+        self._first: tuple[tuple[int, int], tuple[str, ...]] | None = None
         self._views = views
         self._refusal = ""
         self._next_try = 0
@@ -157,6 +109,13 @@ class LiveCalibration:
                         return self._views.found, result
         require_both(self._views.found)
         return self._views.found, self._calibration()
+
+    def _require_same(self) -> None:
+        """Raise SourceError if cameras or image size are not those of the first time."""
+        these = self._eyes.image_size_px, self._eyes.serials
+        self._first = self._first or these
+        if these != self._first:
+            raise SourceError(f"these are {_named(*these)}, the views are of {_named(*self._first)}. Plug those in")
 
     def _look(self) -> Look | None:
         frame = self._source.read(READ_S)
@@ -201,7 +160,11 @@ def checked_live(
     """
     rig, last = pair_in(calibration), ""
     until = clock.now() + longest_s
-    with ReconnectingSource(RequiredEyes(eyes, rig.require), "the cameras", clock) as source, suppress(SourceEnded):
+
+    def require() -> None:
+        rig.require(eyes.image_size_px, eyes.serials)
+
+    with ReconnectingSource(eyes, "the cameras", clock, require=require) as source, suppress(SourceEnded):
         while clock.now() < until:
             frame = source.read(READ_S)
             look = None if frame is None else views.look(frame)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Literal
 
 from bodyschema.interfaces.errors import ConfigError
@@ -17,7 +16,7 @@ from bodyschema.vision.cluster.tables import chessboard_tables, cluster_tables, 
 from bodyschema.vision.printing import Page
 from bodyschema.vision.tags.config import Dictionary
 
-from .board_pages import printed_scale, write_page
+from .board_pages import printed_scale
 
 ShapeName = Literal["tags", "plate", "cube", "board", "chessboard"]
 _RUN = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?")
@@ -69,15 +68,6 @@ def numbers_of(ids: str) -> list[int]:
     if len(set(found)) < len(found) or not found:
         raise ConfigError(f"--ids {ids} has a tag twice, or none", remedy="No number may be there twice")
     return found
-
-
-def write_tags(tags: Tags, paper: str, out: Path) -> tuple[float, float]:
-    """Write the page as PDF or SVG; return the lengths of its horizontal and vertical rulers [mm].
-
-    Raises:
-        ConfigError: there are no such tags, they do not fit, or the file cannot be written.
-    """
-    return write_page(sheet(tags, paper), out)
 
 
 def sheet(tags: Tags, paper: str) -> Page:

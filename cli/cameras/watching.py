@@ -6,15 +6,15 @@ import itertools
 import logging
 import math
 import threading
+import time
 from collections.abc import Callable
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any, Protocol, Self
 
 from bodyschema.daemon.service.local_web import HEADERS, LOOPBACK, host_refusal
-from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError, SourceEnded
-from bodyschema.interfaces.protocols import Clock, Source
+from bodyschema.interfaces.protocols import Source
 from bodyschema.interfaces.records import ImageArray
 from bodyschema.interfaces.whole_files import writing
 from bodyschema.vision.image_file import jpeg
@@ -23,8 +23,6 @@ from bodyschema.vision.image_file import jpeg
 class Pictures(Source, Protocol):
     """Pictures of cameras; see `bodyschema.vision.cameras.watched.WatchedCamera`."""
 
-    @property
-    def said(self) -> str: ...
     def read(self, timeout_s: float) -> ImageArray | None: ...
 
 
@@ -32,17 +30,10 @@ class Watching:
     """Reads pictures until a stop is requested, there are no more, or enough were shown."""
 
     def __init__(
-        self,
-        pictures: Pictures,
-        show: Callable[[bytes], None],
-        *,
-        every_s: float = 0.0,
-        count: int | None = None,
-        clock: Clock | None = None,
+        self, pictures: Pictures, show: Callable[[bytes], None], *, every_s: float = 0.0, count: int | None = None
     ) -> None:
         """Store the settings; the caller of `step` opens `pictures`."""
         self._pictures, self._show, self._every_s = pictures, show, every_s
-        self._clock = SystemClock() if clock is None else clock
         self._left = math.inf if count is None else count
         self._next_s = -math.inf
         self._stopping = False
@@ -69,17 +60,12 @@ class Watching:
             picture = self._pictures.read(timeout_s)
         except SourceEnded:
             return False
-        now = self._clock.now()
+        now = time.monotonic()
         if picture is not None and now >= self._next_s:
             self._next_s = now + self._every_s
             self._left -= 1
             self._show(jpeg(picture))
         return True
-
-    @property
-    def said(self) -> str:
-        """Share of frames in which the marker was found, and the reasons in the others."""
-        return self._pictures.said
 
 
 def _write(file: Path, data: bytes) -> None:

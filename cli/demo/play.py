@@ -18,7 +18,7 @@ from typing import IO, Literal
 import numpy as np
 
 from bodyschema.cli.demo.scene import Scene
-from bodyschema.cli.replay.processes import Process, end, started
+from bodyschema.cli.replay.processes import END_LIMIT_S, Process, started
 from bodyschema.cli.terminal.screen import rejected
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.transport.keys import Keys
@@ -27,7 +27,7 @@ from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import CommandRequest, JointsRequest, PairsReply, PredictReply, decode, encode
 from bodyschema.diagnosis.report.svg_plot import Layout, Plot
 from bodyschema.interfaces.errors import BusError
-from bodyschema.interfaces.interpreter import module_command
+from bodyschema.interfaces.interpreter import end, module_command
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.online_learner import REGION_RAD
 from bodyschema.learning.status import Outlook
@@ -235,7 +235,7 @@ def started_asker(scene: Scene, seed: int) -> Iterator[Asker]:
     try:
         yield Asker(lines)
     finally:
-        end(process)
+        end(process, END_LIMIT_S)
         reader.join()
         process.stdout.close()
 

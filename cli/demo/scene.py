@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import re
 import shutil
-import socket
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from bodyschema.cli.replay.processes import free_endpoint
 from bodyschema.daemon.wiring.wiring import demonstration_model
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.records import FloatArray
@@ -106,46 +105,16 @@ DYNAMIXEL = {
 FEETECH = {joint: "STS3250" if joint.startswith("shoulder") else "STS3215" for joint in DYNAMIXEL}
 
 
-@dataclass(frozen=True, slots=True)
 class Scene:
     """Paths of the files of one demo."""
 
-    folder: Path
-
-    @property
-    def robot_file(self) -> Path:
-        """The robot's description with the demo's ports and seed."""
-        return self.folder / "robot.toml"
-
-    @property
-    def log_file(self) -> Path:
-        """Log of the two processes."""
-        return self.folder / "daemon.log"
-
-    @property
-    def store_file(self) -> Path:
-        """The sampler's pairs."""
-        return self.folder / STATE / "pairs.sqlite"
-
-    @property
-    def recording_file(self) -> Path:
-        """All accepted pairs."""
-        return self.folder / "recording.csv"
-
-    @property
-    def first_tool_file(self) -> Path:
-        """The pairs with the first tool alone, which one model can explain."""
-        return self.folder / "first_tool.csv"
-
-    @property
-    def curve_file(self) -> Path:
-        """The learning curve as numbers."""
-        return self.folder / "learning_curve.csv"
-
-    @property
-    def plot_file(self) -> Path:
-        """The learning curve as a picture."""
-        return self.folder / "learning_curve.svg"
+    def __init__(self, folder: Path) -> None:
+        self.robot_file = folder / "robot.toml"  # the robot's description with the demo's ports and seed
+        self.log_file = folder / "daemon.log"  # of the two processes
+        self.store_file = folder / STATE / "pairs.sqlite"
+        self.recording_file = folder / "recording.csv"  # all accepted pairs
+        self.first_tool_file = folder / "first_tool.csv"  # the pairs of the first tool, which one model can explain
+        self.curve_file, self.plot_file = folder / "learning_curve.csv", folder / "learning_curve.svg"
 
 
 def prepare(
@@ -173,25 +142,19 @@ def prepare(
             if path.suffix in {".urdf", ".toml"}:
                 shutil.copyfile(path, folder / path.name)
         scene = Scene(folder.resolve())
-        scene.robot_file.write_text(
-            _described(model, camera) + _own_tables(seed, bus) + _marker(marker, model), encoding="utf-8"
-        )
+        described = model.read_text(encoding="utf-8")
+        if camera == "mono":
+            described = re.sub(r"(?m)^baseline_m = .*$", "eyes = 1", described)
+        scene.robot_file.write_text(described + _own_tables(seed, bus) + _marker(marker, model), encoding="utf-8")
     return scene
 
 
-def _described(model: Path, camera: Camera) -> str:
-    """Return the robot.toml shipped with the model, reduced to one eye if there is only one camera."""
-    text = model.read_text(encoding="utf-8")
-    return text if camera == "stereo" else re.sub(r"(?m)^baseline_m = .*$", "eyes = 1", text)
-
-
 def _own_tables(seed: int, bus: Bus | None) -> str:
-    sampler, learner = _free_ports(2)
     bench = "" if bus is None else f"servo_bench = true\n{_joints(bus)}"
     return f"""
 [zenoh]
-sampler = "tcp/127.0.0.1:{sampler}"
-learner = "tcp/127.0.0.1:{learner}"
+sampler = "{free_endpoint()}"
+learner = "{free_endpoint()}"
 
 [daemon]
 state_dir = "{STATE}"
@@ -232,11 +195,3 @@ def _servos(make: str, models: Mapping[str, str]) -> str:
     for id, (joint, model) in enumerate(models.items(), 1):
         lines += ["", f"[[drivers.{make}.servos]]", f'joint = "{joint}"', f"id = {id}", f'model = "{model}"']
     return "\n".join(lines) + "\n"
-
-
-def _free_ports(count: int) -> list[int]:
-    sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
-    ports = [server.getsockname()[1] for server in sockets]
-    for server in sockets:
-        server.close()
-    return ports

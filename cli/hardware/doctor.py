@@ -6,7 +6,6 @@ import ctypes
 import os
 import re
 import shutil
-import socket
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +20,7 @@ from bodyschema.daemon.config import Config
 from bodyschema.daemon.service.remedies import as_typed
 from bodyschema.daemon.transport.identity import Route
 from bodyschema.daemon.transport.keys import Keys
-from bodyschema.daemon.transport.session import ZenohSession, is_alive
+from bodyschema.daemon.transport.session import ZenohSession, accepts, is_alive
 from bodyschema.daemon.transport.status import SamplerStatus
 from bodyschema.daemon.transport.wire import decode
 from bodyschema.daemon.transport.zenoh_config import PROCESSES
@@ -32,7 +31,6 @@ from bodyschema.daemon.wiring.servos import (
     joint_state_checks,
     other_holders,
     port_checks,
-    ports_are_there,
     servo_checks,
     servos_of,
 )
@@ -139,7 +137,7 @@ def _marker_sources(config: Config) -> Iterator[Check]:
 
 def _on_the_ports(config: Config, look: Callable[[Config], Iterator[Check]]) -> Iterator[Check]:
     """Yield the checks of `look`; if a running sampler holds the ports, those of its status instead."""
-    if not ports_are_there(config):
+    if not all(os.path.exists(port) for port in configured_ports(config).values()):
         return
     if other_holders(config):
         yield from _of_the_sampler(config)
@@ -254,7 +252,7 @@ def router_check(route: Route) -> Check:
 def zenoh_check(process: str, route: Route, token: str) -> Check:
     """Check that the process answers or, if it does not run, that its endpoint is free."""
     endpoint = str(route)
-    if not _is_listening(endpoint):
+    if endpoint.startswith(("tcp/", "tls/")) and not accepts(endpoint, CONNECT_S):
         return Check("zenoh", "ok", f"the {process} does not run; {endpoint} is free for it")
     if is_alive(route, token, open_timeout_s=OPEN_S):
         return Check("zenoh", "ok", f"the {process} answers on {endpoint}")
@@ -263,31 +261,13 @@ def zenoh_check(process: str, route: Route, token: str) -> Check:
     return Check("zenoh", "wrong", said, f"ss -ltnp 'sport = :{port}'    # who it is; or another port in [zenoh]")
 
 
-def _is_listening(endpoint: str) -> bool:
-    """Return True if the endpoint accepts connections, or if that cannot be tried."""
-    protocol, _, address = endpoint.partition("/")
-    host, _, port = address.rpartition(":")
-    if protocol not in ("tcp", "tls"):
-        return True
-    try:
-        with socket.create_connection((host.strip("[]"), int(port)), CONNECT_S):
-            return True
-    except (OSError, OverflowError, UnicodeError):  # as in `unreached`
-        return False
-
-
-def _named(check: Check, file: Path) -> Check:
-    """Return the check with the actual name of robot.toml in its command."""
-    return replace(check, fix=check.fix.replace("robot.toml", str(file)))
-
-
 def run(config: Config, tell: Callable[[str], None]) -> list[Check]:
     """Run all checks; an error on the way counts as a failed check."""
     checks: list[Check] = []
     for name, look in steps(config):
         tell(name)
         try:
-            checks += [_named(check, config.file) for check in look()]
+            checks += [replace(check, fix=check.fix.replace("robot.toml", str(config.file))) for check in look()]
         except BodyschemaError as error:
             checks.append(Check(name, "wrong", str(error)))
     return checks

@@ -9,10 +9,9 @@ from typing import Self
 import msgspec
 import numpy as np
 from rich.console import Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 
-from bodyschema.cli.terminal.screen import bar
+from bodyschema.cli.terminal.screen import bar, plain_table
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.sampler.reconnect import ReconnectingSource
 from bodyschema.daemon.service.remedies import as_typed
@@ -220,11 +219,9 @@ HINT = "Move one joint at a time. It went the other way? Correct "
 
 def screen(seen: Seen) -> RenderableType:
     """Return a row for each joint, then the joint moved last and any problems."""
-    table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
-    table.add_column("joint", no_wrap=True, max_width=18)
-    for heading in ("ID", "angle", "°/s", "mA", "°C"):
-        table.add_column(heading, justify="right", no_wrap=True)
-    table.add_column("covered of the URDF's range", no_wrap=True)
+    numbers = ("ID", "angle", "°/s", "mA", "°C")
+    table = plain_table("joint", *numbers, "covered of the URDF's range", right=numbers)
+    table.columns[0].max_width = 18
     for joint in seen.joints:
         table.add_row(*_row(joint))
     lines = [Text(seen.moved, "cyan")] if seen.moved else []

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bodyschema.cli.hardware.robot_template import Seen, guess_of, key_name, quoted, robot_toml
+from bodyschema.cli.hardware.robot_template import Seen, guess_of, key_name, robot_toml
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.wiring.servos import KnownModel, Servos, known_models, require_servos
 from bodyschema.interfaces.errors import ConfigError
@@ -31,6 +31,7 @@ from bodyschema.robot.lerobot import (
     read_calibration,
 )
 from bodyschema.robot.suggest import did_you_mean
+from bodyschema.robot.toml_text import toml_value
 from bodyschema.robot.urdf import MOVING, UrdfTree
 
 BAUD = 1_000_000
@@ -163,7 +164,7 @@ def _servo_tables(arm: LeRobotArm, servos: Sequence[LeRobotServo], calibration: 
         f"# The servos, with IDs and zeros from LeRobot's {calibration.name}: 0 is the middle of the recorded range.",
         "# CHECK directions with `bodyschema watch joints`: move a joint, and look where its angle goes.",
         f"[{table}.buses.arm]",
-        f"port = {quoted(port)}",
+        f"port = {toml_value(port)}",
         f"baud = {BAUD:_}",
         "",
     ]
@@ -173,9 +174,9 @@ def _servo_tables(arm: LeRobotArm, servos: Sequence[LeRobotServo], calibration: 
             check = f"  # CHECK: taken from the middle of the URDF's limits, {math.degrees(servo.middle_rad):.0f}°"
         lines += [
             f"[[{table}.servos]]",
-            f"joint = {quoted(servo.joint)}",
+            f"joint = {toml_value(servo.joint)}",
             f"id = {servo.id}",
-            f"model = {quoted(servo.model)}",
+            f"model = {toml_value(servo.model)}",
             f"direction = {servo.direction}",
             f"zero_ticks = {servo.zero_ticks:.5g}{check}",
             "",

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.suggest import did_you_mean
+from bodyschema.robot.toml_text import toml_value
 from bodyschema.robot.urdf import MOVING, UrdfJoint, UrdfTree
 
 
@@ -163,13 +164,12 @@ _EXAMPLES = "/dev/v4l/by-id/usb-LEFT-video-index0", "/dev/v4l/by-id/usb-RIGHT-vi
 
 def robot_toml(guess: Guess, seen: Seen = _NOTHING_SEEN) -> str:
     """Return the text of a commented robot.toml."""
-    joints = "[" + ", ".join(quoted(joint) for joint in guess.joints) + "]"
     return _TEMPLATE.format(
-        name=quoted(guess.name),
-        urdf=quoted(guess.urdf),
-        joints=joints,
-        marker_link=quoted(guess.marker_link),
-        camera_link=quoted(guess.camera_link),
+        name=toml_value(guess.name),
+        urdf=toml_value(guess.urdf),
+        joints=toml_value(guess.joints),
+        marker_link=toml_value(guess.marker_link),
+        camera_link=toml_value(guess.camera_link),
         frame="left optical frame" if seen.webcam is None else "camera's optical frame",
         eyes=_TWO_EYES if seen.webcam is None else _ONE_EYE,
         marker=seen.marker(),
@@ -184,21 +184,15 @@ def _metres(length_mm: float) -> str:
 def _camera_tables(seen: Seen) -> str:
     """Return the cameras' tables; with fewer than two cameras, an example that is commented out."""
     if seen.webcam is not None:
-        return _CAMERAS.format(hidden="", devices=_ONE.format(device=quoted(seen.webcam)))
-    left, right = map(quoted, seen.cameras[:2] if len(seen.cameras) >= 2 else _EXAMPLES)
+        return _CAMERAS.format(hidden="", devices=_ONE.format(device=toml_value(seen.webcam)))
+    left, right = map(toml_value, seen.cameras[:2] if len(seen.cameras) >= 2 else _EXAMPLES)
     text = _CAMERAS.format(hidden="# ", devices=_TWO.format(left=left, right=right))
     if len(seen.cameras) >= 2:
         return text
     return "".join(line if line.startswith("#") else f"# {line}" for line in text.splitlines(keepends=True))
 
 
-def quoted(text: str) -> str:
-    """Return `text` as a TOML string."""
-    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
-    return f'"{escaped}"'
-
-
-def guess_from(urdf: Path, robot: Path, *, marker_link: str | None = None, camera_link: str | None = None) -> Guess:
+def guess_from(urdf: Path, robot: Path, marker_link: str | None, camera_link: str | None) -> Guess:
     """Guess the chain with the most moving joints in `urdf`, without fingers and joints that mimic others.
 
     Args:
@@ -212,7 +206,8 @@ def guess_from(urdf: Path, robot: Path, *, marker_link: str | None = None, camer
     """
     tree = UrdfTree.load(urdf)
     for link in (marker_link, camera_link):
-        _require_link(tree, link, urdf)
+        if link is not None and link not in tree.links:
+            raise ConfigError(f"has no link {link!r}", file=urdf, remedy=did_you_mean(link, tree.links))
     if marker_link is None:
         root = camera_link or tree.root
         paths = {link: [joint for joint, _ in tree.path(root, link)] for link in tree.links}
@@ -239,11 +234,6 @@ def _moving(path: Sequence[UrdfJoint]) -> list[str]:
 def _is_finger(joint: UrdfJoint) -> bool:
     """Return True for a joint that mimics another one, and for one of a gripper by its name."""
     return joint.mimics or (joint.kind in MOVING and bool(_FINGER.search(joint.name)))
-
-
-def _require_link(tree: UrdfTree, link: str | None, urdf: Path) -> None:
-    if link is not None and link not in tree.links:
-        raise ConfigError(f"has no link {link!r}", file=urdf, remedy=did_you_mean(link, tree.links))
 
 
 def key_name(text: str) -> str:

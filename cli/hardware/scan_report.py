@@ -91,19 +91,16 @@ def _place(
         return "another rate", f"give the servo {baud:,} bit/s, or set baud = {here[0].baud} in robot.toml", here[0]
     if here and here[0].model is None:
         return "not known", "it does not report its model: correct its entry", here[0]
+    if here and here[0].model in known_models():
+        fix = f'set model = "{here[0].model}" in robot.toml, or give the servo another ID'
+        return "wrong model", fix, here[0]
     if here:
-        return "wrong model", _for_model(here[0].model, model), here[0]
+        fix = f"it is a {here[0].model}, which no driver reads: put a {model} in its place, or give it another ID"
+        return "wrong model", fix, here[0]
     elsewhere = [servo for servo in found if servo.id == id and servo.model == model]
     if elsewhere:
         return "another port", f'set port = "{elsewhere[0].port}" in robot.toml', elsewhere[0]
     return "missing", "look at its supply and cable, and those of the one before it", None
-
-
-def _for_model(found: str | None, wanted: str) -> str:
-    """Return the remedy for a servo of another model."""
-    if found in known_models():
-        return f'set model = "{found}" in robot.toml, or give the servo another ID'
-    return f"it is a {found}, which no driver reads: put a {wanted} in its place, or give it another ID"
 
 
 def as_json(report: ScanReport) -> str:

@@ -83,7 +83,10 @@ def write_backup(config: Config, file: Path, *, utc: str, version: str, replace:
     """
     if file.exists() and not replace:
         raise BackupError(f"{file} is there already. Give another name, or --force")
-    with tempfile.TemporaryDirectory(dir=_folder_of(file), prefix=".backup-") as scratch, _explained(file):
+    folder = file.absolute().parent
+    if not folder.is_dir():
+        raise BackupError(f"there is no folder {folder}. Make it, or give another name")
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".backup-") as scratch, _explained(file):
         contents = _description(config)
         if config.checkpoint_file.exists():
             held = Path(scratch) / "learner.ckpt"
@@ -311,13 +314,6 @@ def _entry(file: Path, origin: Path) -> Entry:
     with file.open("rb") as stream:
         digest = hashlib.file_digest(stream, lambda: hashlib.blake2b(digest_size=CHECKSUM_BYTES))
         return Entry(stream.tell(), digest.hexdigest(), str(origin.absolute()))
-
-
-def _folder_of(file: Path) -> Path:
-    folder = file.absolute().parent
-    if not folder.is_dir():
-        raise BackupError(f"there is no folder {folder}. Make it, or give another name")
-    return folder
 
 
 @contextmanager

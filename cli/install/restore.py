@@ -68,7 +68,8 @@ def restore(backup: Backup, robot_file: Path, state_dir: Path | None = None, *, 
         lock_held = _locked(folder / Path(STORE).name, undo)
         with ExitStack() as scratch:
             staged = _staged(backup, targets, scratch)
-            identity, unreadable = _give_identity(backup, tables, *map(staged.get, _state_files(folder)))
+            store, checkpoint = (staged.get(folder / Path(name).name) for name in (STORE, CHECKPOINT))
+            identity, unreadable = _give_identity(backup, tables, store, checkpoint)
             for target in targets:
                 aside += _move_aside(target, undo)
                 os.replace(staged[target], target)
@@ -125,10 +126,6 @@ def _state_dir(backup: Backup, tables: Mapping[str, Any], robot_file: Path) -> P
             f"Give --state-dir {str(folder)!r} to put them there, or another folder"
         )
     return folder
-
-
-def _state_files(folder: Path) -> tuple[Path, Path]:
-    return folder / Path(STORE).name, folder / Path(CHECKPOINT).name
 
 
 def _require_room(backup: Backup, targets: Iterable[Path], *, force: bool) -> None:

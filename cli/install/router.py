@@ -18,7 +18,7 @@ import msgspec
 
 from bodyschema.daemon.service.notify import Notifier
 from bodyschema.daemon.service.service import Service
-from bodyschema.daemon.transport.access import EVERY_ROBOT, ROLES, Names, Subjects, access_control
+from bodyschema.daemon.transport.access import EVERY_ROBOT, ROLES, Names, access_control
 from bodyschema.daemon.transport.identity import SECURE, Identity, TlsConfig
 from bodyschema.daemon.transport.session import LARGEST_REPLY_BYTES, LEASE_MS, ZenohSession
 from bodyschema.daemon.transport.zenoh_config import ENDPOINT, HOW_TO
@@ -90,7 +90,7 @@ class RouterConfig:
             "timestamping/enabled": True,
             "transport/link/tx/lease": LEASE_MS,
             "transport/link/rx/max_message_size": LARGEST_REPLY_BYTES,
-            "access_control": access_control(self.tables.access, Subjects(self.identity.by_user)),
+            "access_control": access_control(self.tables.access, by_user=self.identity.by_user),
             **self.identity.settings(),
         }
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from bodyschema.daemon.service.signals import with_parent
 from bodyschema.daemon.transport.session import is_alive
 from bodyschema.interfaces.errors import BusError
-from bodyschema.interfaces.interpreter import module_command
+from bodyschema.interfaces.interpreter import end, module_command
 
 START_LIMIT_S = 300.0  # a full machine takes minutes to import; a process that ends is reported at once
 END_LIMIT_S = 15.0
@@ -50,16 +50,6 @@ class Process:
             time.sleep(0.1)
 
 
-def end(process: subprocess.Popen[bytes]) -> None:
-    """Terminate a process; kill it after a time limit."""
-    process.terminate()
-    try:
-        process.wait(END_LIMIT_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
-
-
 @contextmanager
 def started(name: str, arguments: list[str], environment: Mapping[str, str], log: Path) -> Iterator[Process]:
     """Run `bodyschema run ARGUMENTS` for the duration of the with statement."""
@@ -76,7 +66,7 @@ def started(name: str, arguments: list[str], environment: Mapping[str, str], log
         try:
             yield Process(name, log, popen)
         finally:
-            end(popen)
+            end(popen, END_LIMIT_S)
 
 
 def override(table: str, key: str, value: object) -> dict[str, str]:

@@ -81,6 +81,7 @@ def as_text(report: ReplayReport, width: int = 80) -> str:
     """Return the report for a terminal of `width` columns; figures in columns are not wrapped."""
     rejected = ", ".join(f"{count} {reason}" for reason, count in sorted(report.rejected.items())) or "none"
     fitted = f"the nominal model with {' and '.join(report.fitted)} fitted" if report.fitted else "the nominal model"
+    by_model = ", ".join(f"{name} {value:.3f} mm" for name, value in report.prequential_mm.items())
     lines = [
         f"{report.rows} rows of {report.recording}; {report.held_out} held out "
         f"({report.held_out_blocks} of {BLOCKS} contiguous blocks)",
@@ -97,7 +98,7 @@ def as_text(report: ReplayReport, width: int = 80) -> str:
         *([] if report.angle is None else [_angles(report.angle)]),
         f"before is {fitted} to the rows that were learnt; after is what the learner answers (model: "
         f"{report.answering}). {_verdict(report)}",
-        f"error on new pairs before they were learnt: {_by_model(report.prequential_mm)}",
+        f"error on new pairs before they were learnt: {by_model or 'none'}",
         f"the errors above count the noise of the measurements; on new pairs where data is the learner expects "
         f"{mm(_metres(report.expected_mm))}; its 1-sigma and that noise together cover "
         f"{report.within_sigma_share:.0%} of the held-out coordinates (68 % is right); "
@@ -133,10 +134,6 @@ def _verdict(report: ReplayReport) -> str:
     if abs(ratio - 1.0) < 0.01:
         return "Learning left the mean error as it was."
     return f"Learning {'lowered' if ratio < 1 else 'raised'} the mean error to {ratio:.0%}."
-
-
-def _by_model(errors: dict[str, float]) -> str:
-    return ", ".join(f"{name} {value:.3f} mm" for name, value in errors.items()) or "none"
 
 
 def _metres(value_mm: float | None) -> float | None:

@@ -47,11 +47,6 @@ class Steps:
         too_far = int(np.count_nonzero(steps_deg > rules.max_step_deg))
         return cls(len(steps_deg), too_far, float(np.median(steps_deg)), rules.max_step_deg)
 
-    @property
-    def is_path(self) -> bool:
-        """True if most rows follow from their predecessors."""
-        return self.too_far <= MOST * self.count
-
     def __str__(self) -> str:
         return (
             f"{self.too_far} of {self.count} steps are larger than max_step_deg = {self.max_step_deg:g} "
@@ -61,7 +56,7 @@ class Steps:
 
 def require_path(steps: Steps, recording: Recording) -> None:
     """Raise RecordingError if the rows are single poses far apart."""
-    if not steps.is_path:
+    if steps.too_far > MOST * steps.count:
         raise RecordingError(
             f"{steps}: these are single poses, not a guided path, and the sampler's step and speed rules do not "
             "apply to them",
@@ -119,16 +114,10 @@ class Job:
         return self.recording.rows(self.split.held_out)
 
 
-@dataclass(frozen=True, slots=True)
-class Learnt:
-    """Status of both processes when all was learnt."""
-
-    sampler: SamplerStatus
-    learner: LearnerStatus
-    seconds: float
+Report = Callable[[SamplerStatus, LearnerStatus], None]
 
 
-def replay(job: Job, report: Callable[[SamplerStatus, LearnerStatus], None]) -> ReplayReport:
+def replay(job: Job, report: Report) -> ReplayReport:
     """Replay a recording and measure the errors of the learnt model.
 
     Args:
@@ -143,14 +132,9 @@ def replay(job: Job, report: Callable[[SamplerStatus, LearnerStatus], None]) -> 
     held_out = job.held_out_rows
     before = aligned_chain(job.config.robot, job.learnt_rows).positions(held_out.q)
     with _running(job) as live:
-        learnt = live.until_learnt(report)
+        sampler, learner, learning_s = live.until_learnt(report)
         prediction = live.predictions(held_out.q)
-    return _report(job, before, learnt, prediction)
-
-
-def _report(job: Job, before: FloatArray, learnt: Learnt, prediction: PredictReply) -> ReplayReport:
-    robot, held_out = job.config.robot, job.held_out_rows
-    sampler, learner = learnt.sampler, learnt.learner
+    robot = job.config.robot
     x, sigma = np.array(prediction.x), np.array(prediction.sigma)
     claimed = learner.claimed_error_m
     expected = learner.expected_error_m(claimed)
@@ -178,7 +162,7 @@ def _report(job: Job, before: FloatArray, learnt: Learnt, prediction: PredictRep
         replayed=learner.replayed,
         outlook=learner.outlook,
         doubt=" ".join(job.warnings) or None,
-        learning_s=learnt.seconds,
+        learning_s=learning_s,
         angle=_angles(held_out, prediction, learner),
     )
 
@@ -202,8 +186,12 @@ class _Live:
         pauses_s = np.diff(job.learnt_rows.play_times) / speed if speed else np.zeros(1)
         self._stall_limit_s = STALL_LIMIT_S + float(pauses_s.max(initial=0.0))
 
-    def until_learnt(self, report: Callable[[SamplerStatus, LearnerStatus], None]) -> Learnt:
-        """Wait until the recording has ended, every pair is learnt, and the learner is at rest."""
+    def until_learnt(self, report: Report) -> tuple[SamplerStatus, LearnerStatus, float]:
+        """Wait until the recording has ended, every pair is learnt, and the learner is at rest.
+
+        Returns:
+            Both states then, and the time that learning took [s].
+        """
         begin = changed = time.monotonic()
         last: tuple[object, ...] = ()
         while True:
@@ -221,7 +209,7 @@ class _Live:
                     remedy="--any-step relaxes its step and speed rules",
                 )
             if through and learner.pairs + learner.refused >= sampler.pairs and learner.at_rest:
-                return Learnt(sampler, learner, changed - begin)
+                return sampler, learner, changed - begin
             if now - changed > self._stall_limit_s:
                 raise BusError(f"no progress for {self._stall_limit_s:.0f} s; --keep DIR keeps the logs that say why")
             time.sleep(GLANCE_S)

@@ -10,10 +10,10 @@ from itertools import groupby
 
 import msgspec
 from rich.console import Group, RenderableType
-from rich.table import Table
 from rich.text import Text
 
 from bodyschema.cli.servos.log import LoggedWrite, ServoLog
+from bodyschema.cli.terminal.screen import plain_table
 from bodyschema.daemon.wiring.eeprom import (
     BAUD,
     HOMING_OFFSET,
@@ -146,14 +146,14 @@ def carry_out(
     needed = [each for each in planned if each.is_needed]
     for each in needed:
         workbench.torque_off(workbench.bus(each.wanted.port, each.wanted.baud), [each.change.servo])
-    batch = log.next_batch()
+    batch = max(log.batches(), default=0) + 1
     entries = {id(each.change): _entry(each, batch, clock.utc(), undoes) for each in needed}
     done: list[Done] = []
     for _, together in groupby(needed, key=lambda each: (each.wanted.port, each.change.setting.name)):
         group = list(together)
         log.append([entries[id(each.change)] for each in group])
         came = _written(workbench, group)
-        log.append([_closed(entries[id(one.change)], one) for one in came])
+        log.append([msgspec.structs.replace(entries[id(one.change)], state=one.outcome.value) for one in came])
         done += came
     return done
 
@@ -227,20 +227,17 @@ def _entry(planned: Planned, batch: int, utc: str, undoes: int | None) -> Logged
     )
 
 
-def _closed(entry: LoggedWrite, done: Done) -> LoggedWrite:
-    return msgspec.structs.replace(entry, state=done.outcome.value)
-
-
 SCHEMA = 1  # of `settings_json`
 
 
 def planned_table(planned: Sequence[Planned]) -> RenderableType:
     """Return a table of the writes: servo, register, present and new value; below it the consequences."""
-    table = _table("joint", "ID", "register", "now", "", "then")
+    table = plain_table("joint", "ID", "register", "now", "", "then", right=("ID",))
     for each in planned:
         change = each.change
         arrow, style = ("→", "bold") if each.is_needed else ("=", "dim")
-        table.add_row(*_who(change), change.setting.shown(change.now), arrow, Text(_then(change), style=style))
+        then = Text(change.setting.shown(change.then), style=style)
+        table.add_row(*_who(change), change.setting.shown(change.now), arrow, then)
     follows = {each.change.setting.name: each.change.setting.follows for each in planned if each.is_needed}
     lines = [Text(f"{name}: {what}", style="yellow") for name, what in follows.items() if what]
     return Group(table, *lines)
@@ -248,7 +245,7 @@ def planned_table(planned: Sequence[Planned]) -> RenderableType:
 
 def done_table(done: Sequence[Done]) -> RenderableType:
     """Return a table of the result of each write."""
-    table = _table("joint", "ID", "register", "before", "", "now")
+    table = plain_table("joint", "ID", "register", "before", "", "now", right=("ID",))
     said: list[Text] = []
     for one in done:
         change, found = one.change, one.found
@@ -263,9 +260,7 @@ def done_table(done: Sequence[Done]) -> RenderableType:
 
 def settings_table(servo: IdentifiedServo, values: Sequence[tuple[Setting, int]]) -> RenderableType:
     """Return a table of a servo's writable settings: names, present values, permitted values."""
-    table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
-    for heading in ("register", "", "now", "may be"):
-        table.add_column(heading, no_wrap=heading != "may be")
+    table = plain_table("register", "", "now", "may be", folded=("may be",))
     for setting, value in values:
         bounds = ", ".join(setting.words) or f"{setting.lowest} … {setting.highest}"
         table.add_row(setting.name, str(setting.register.address), setting.shown(value), bounds)
@@ -304,17 +299,6 @@ def _moves(servo: IdentifiedServo, ticks: int) -> str:
     return f"now {servo.zero_ticks}: its angles become {abs(degrees):.1f}° {'less' if degrees > 0 else 'more'}"
 
 
-def _table(*headings: str) -> Table:
-    table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
-    for heading in headings:
-        table.add_column(heading, justify="right" if heading == "ID" else "left", no_wrap=True)
-    return table
-
-
 def _who(change: Change) -> tuple[str, str, str]:
     setting = change.setting
     return change.servo.joint, str(change.servo.id), f"{setting.name} ({setting.register.address})"
-
-
-def _then(change: Change) -> str:
-    return change.setting.shown(change.then)

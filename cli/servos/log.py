@@ -83,10 +83,6 @@ class ServoLog:
         ordered = sorted(last.values(), key=lambda entry: entry.batch)
         return {batch: list(entries) for batch, entries in groupby(ordered, key=lambda entry: entry.batch)}
 
-    def next_batch(self) -> int:
-        """Return an unused batch number."""
-        return max(self.batches(), default=0) + 1
-
     def to_undo(self) -> list[LoggedWrite]:
         """Return the newest batch that changed something and was not undone; empty if there is none."""
         batches = self.batches()

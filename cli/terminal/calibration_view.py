@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from rich import box
 from rich.console import Group
 from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
 from bodyschema.calibration.report import CalibrationReport, Figure, Zero
-from bodyschema.cli.terminal.screen import such_zeros
+from bodyschema.cli.terminal.screen import ruled_table, such_zeros
 
 # Told noise that explains the residuals leaves less than this.
 MISFIT = 1.5
@@ -20,10 +19,7 @@ WRONG_URDF = 1.25
 
 def view(report: CalibrationReport) -> Group:
     """Return tables of the figures, followed by sentences on their meaning."""
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
-    table.add_column(Text(f"{report.robot}, {report.pairs} pairs of {report.source}"), overflow="fold")
-    for name in ("nominal", "learnt", "95 %"):
-        table.add_column(name, justify="right", no_wrap=True)
+    table = ruled_table(f"{report.robot}, {report.pairs} pairs of {report.source}", "nominal", "learnt", "95 %")
     _section(table, f"camera on {report.camera_link}")
     _figures(table, ("x [mm]", "y [mm]", "z [mm]"), report.camera_xyz_mm, 2)
     _figures(table, ("roll [°]", "pitch [°]", "yaw [°]"), report.camera_rpy_deg, 3)

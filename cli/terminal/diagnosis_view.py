@@ -13,7 +13,7 @@ from rich.text import Text
 from bodyschema.cli.terminal.screen import BAR_WIDTH
 from bodyschema.diagnosis.report.numbers import chance, mm, numbers_of, percent, place, share, telling
 from bodyschema.diagnosis.report.presenters.registry import named, rival_named
-from bodyschema.diagnosis.report.result import SMALL, DiagnosisFile, Errors, Indistinguishable, Verdict
+from bodyschema.diagnosis.report.result import SMALL, DiagnosisFile, Indistinguishable, Verdict
 from bodyschema.diagnosis.report.text import in_order, made_to, modelled, other_shares, to_do
 
 # Number of rejected hypotheses shown.
@@ -50,7 +50,8 @@ def view(diagnosis: DiagnosisFile, remedies: Sequence[str], *, timed: bool) -> G
         timed: True if the recording has times.
     """
     head, style = _HEADS[diagnosis.verdict]
-    parts: list[RenderableType] = [Text.assemble((f" {head} ", style), "  ", (_sentence(diagnosis), "bold"))]
+    sentence = diagnosis.sentence.rstrip(".") + "."
+    parts: list[RenderableType] = [Text.assemble((f" {head} ", style), "  ", (sentence, "bold"))]
     if meaning := _MEANING[diagnosis.verdict]:
         parts.append(Text(meaning))
     if diagnosis.unexplained.depends_on:
@@ -101,10 +102,6 @@ def _rival(itself: str, rival: Indistinguishable, seen_by: str) -> str:
     return f"{instead}; another motion can tell."
 
 
-def _sentence(diagnosis: DiagnosisFile) -> str:
-    return diagnosis.sentence.rstrip(".") + "."
-
-
 def _table(title: str) -> Table:
     table = Table(
         box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, title=Text(title, style="bold"), title_justify="left"
@@ -123,18 +120,14 @@ def _errors(diagnosis: DiagnosisFile) -> Table:
     # The nominal error may be so large that its bar would leave no room for the others.
     longest = max(rms.aligned, rms.extended, rms.noise_floor or 0.0, 1e-12)
     for name, label in _ERRORS:
-        value = _of(rms, name)
-        if value is not None and not (name in _SAME_AS and value == _of(rms, _SAME_AS[name])):
-            table.add_row(label, mm(value), mm(_of(mean, name)), _bar(value / longest))
+        value: float | None = getattr(rms, name)
+        if value is not None and not (name in _SAME_AS and value == getattr(rms, _SAME_AS[name])):
+            table.add_row(label, mm(value), mm(getattr(mean, name)), _bar(value / longest))
     return table
 
 
 def _bar(part: float) -> str:
     return "█" * max(round(BAR_WIDTH * min(part, 1.0)), 1) + ("…" if part > 1.001 else "")
-
-
-def _of(errors: Errors, name: str) -> float | None:
-    return getattr(errors, name)
 
 
 def _causes(diagnosis: DiagnosisFile, timed: bool) -> Table:

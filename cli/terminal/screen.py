@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TypeVar
 
+from rich import box
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -59,6 +60,23 @@ def titled_table(title: str, *, numbers: bool = True) -> Table:
     return table
 
 
+def ruled_table(first: str, *others: str) -> Table:
+    """Return an empty table with a rule below its headings: texts on the left, numbers under the others."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
+    table.add_column(Text(first), overflow="fold")
+    for name in others:
+        table.add_column(Text(name), justify="right", no_wrap=True)
+    return table
+
+
+def plain_table(*headings: str, right: Collection[str] = (), folded: Collection[str] = ()) -> Table:
+    """Return an empty table without lines: `right` are the headings of numbers, `folded` those of long texts."""
+    table = Table(box=None, padding=(0, 2, 0, 0), header_style="dim")
+    for name in headings:
+        table.add_column(name, justify="right" if name in right else "left", no_wrap=name not in folded)
+    return table
+
+
 def rejected(status: SamplerStatus) -> list[tuple[str, int]]:
     """Return a text of the rejected frames by reason, the most frequent first."""
     from bodyschema.interfaces.rejections import words_of
@@ -76,16 +94,11 @@ def coverage_table(status: SamplerStatus, slides: Collection[str] = ()) -> Table
     table.add_column(no_wrap=True)
     table.add_column(justify="right", no_wrap=True)
     for name, joint in status.coverage.items():
-        table.add_row(name, bar(joint), _metres(joint) if name in slides else _degrees(joint))
+        covered = f"{math.degrees(joint.low):+.0f}° … {math.degrees(joint.high):+.0f}°"
+        if name in slides:
+            covered = f"{joint.low:+.3f} m … {joint.high:+.3f} m"
+        table.add_row(name, bar(joint), covered)
     return table
-
-
-def _degrees(joint: JointRange) -> str:
-    return f"{math.degrees(joint.low):+.0f}° … {math.degrees(joint.high):+.0f}°"
-
-
-def _metres(joint: JointRange) -> str:
-    return f"{joint.low:+.3f} m … {joint.high:+.3f} m"
 
 
 def bar(joint: JointRange) -> Text:

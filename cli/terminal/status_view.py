@@ -228,11 +228,7 @@ def servos_table(servos: Mapping[str, ServoStatus]) -> Table:
             or_dash(servo.temperature_c, "{:.0f} °C"),
             or_dash(servo.current_a, "{:.2f} A"),
         )
-        state = Text(_short(servo), style="red") if servo.troubles else Text("well", style="green")
+        short = ", ".join(trouble.split(":")[0] for trouble in servo.troubles)  # the remedies are above the table
+        state = Text(short, style="red") if short else Text("well", style="green")
         table.add_row(joint, str(servo.id), servo.model, str(servo.firmware), *figures, state)
     return table
-
-
-def _short(servo: ServoStatus) -> str:
-    """Return the problem without its remedy, which is printed above the table."""
-    return ", ".join(trouble.split(":")[0] for trouble in servo.troubles)

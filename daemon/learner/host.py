@@ -25,7 +25,7 @@ from bodyschema.daemon.learner.solver_process import SolverLostError, SolverProc
 from bodyschema.daemon.service.notify import Notifier
 from bodyschema.daemon.service.service import Service
 from bodyschema.daemon.service.signals import SignalFlags, tell_parent_serving
-from bodyschema.daemon.transport.access import Names, Subjects, access_control
+from bodyschema.daemon.transport.access import Names, access_control
 from bodyschema.daemon.transport.identity import SECURE
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.session import ZenohSession
@@ -176,7 +176,7 @@ def session_settings(configs: Sequence[Config]) -> dict[str, Any]:
     identity = _way(first)[1]
     if identity is not None and any(end.startswith(SECURE) for end in settings["listen/endpoints"]):
         who = {config.robot.name: config.tables.zenoh.access or Names() for config in configs}
-        settings["access_control"] = access_control(who, Subjects(identity.by_user))
+        settings["access_control"] = access_control(who, by_user=identity.by_user)
     return settings
 
 

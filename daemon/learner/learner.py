@@ -100,7 +100,7 @@ class Learner:
     @contextlib.contextmanager
     def serving(self) -> Iterator[None]:
         """Answer and learn until the end of the with statement; then write a last checkpoint."""
-        listening = threading.Thread(target=self._guarded, args=(self._learn_pairs,), name="learn_pairs")
+        listening = threading.Thread(target=self._learn_pairs, name="learn_pairs")
         listening.start()
         try:
             self._declare()
@@ -307,20 +307,17 @@ class Learner:
         self._config, self._settings = found.config, found.config.tables.learner
         return found.message("learner")
 
-    def _guarded(self, loop: Callable[[], None]) -> None:
+    def _learn_pairs(self) -> None:
         show_name()
         try:
-            loop()
+            while not self._stop.is_set():
+                self._service.beat(self._loop)
+                self._feed.step(READ_S)
+                self._learning.judge_due(self._clock.now())
+                with self._feed.lock:
+                    self._changes.note(self._learning.change)
         except Exception as error:
             self._failure = error
-
-    def _learn_pairs(self) -> None:
-        while not self._stop.is_set():
-            self._service.beat(self._loop)
-            self._feed.step(READ_S)
-            self._learning.judge_due(self._clock.now())
-            with self._feed.lock:
-                self._changes.note(self._learning.change)
 
     def work(self) -> bool:
         """Do a piece of background work; return False if there is none. SolverLostError: the solver lost its pairs."""

@@ -24,7 +24,7 @@ import msgspec
 import numpy as np
 
 from bodyschema.interfaces.errors import BodyschemaError
-from bodyschema.interfaces.interpreter import module_command
+from bodyschema.interfaces.interpreter import end, module_command
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.interfaces.waits import END_LIMIT_S
 from bodyschema.learning.solvers.orientation import OrientationSolution
@@ -220,12 +220,8 @@ class SolverProcess:
         if child is None or child.stdin is None or child.stdout is None:
             return None
         child.stdin.close()
-        child.terminate()
         try:
-            return child.wait(END_LIMIT_S)
-        except subprocess.TimeoutExpired:
-            child.kill()
-            return child.wait()
+            return end(child, END_LIMIT_S)
         finally:
             child.stdout.close()
 

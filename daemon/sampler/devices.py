@@ -200,20 +200,6 @@ class AsksForTurns(Protocol):
         """Assume the turns nearest to the joints' last positions."""
 
 
-def complaints_of(joints: JointSource) -> list[str]:
-    """Return the problems that the encoders report."""
-    return list(joints.health) if isinstance(joints, TellsHealth) else []
-
-
-def servos_of(joints: JointSource) -> dict[str, ServoStatus]:
-    return dict(joints.servo_health) if isinstance(joints, Servos) else {}
-
-
-def buses_of(joints: JointSource) -> dict[str, BusStatus]:
-    """Return each bus's statistics since the start."""
-    return dict(joints.bus_health) if isinstance(joints, Servos) else {}
-
-
 def accept_turns(encoders: object) -> str:
     """Set lost turn counts to the turns nearest to the last positions; return a message.
 

@@ -44,8 +44,10 @@ class ReconnectingSource(Generic[R_co]):
         sleep: Callable[[float], None] = time.sleep,
         # returns a device that this process will never be allowed to open, or None
         forbidden: Callable[[], str | None] = lambda: None,
+        # called after each opening; raises SourceError for another device than is wanted
+        require: Callable[[], None] = lambda: None,
     ) -> None:
-        self._forbidden = forbidden
+        self._forbidden, self._require = forbidden, require
         self._source, self._name, self._wall, self._sleep = source, name, wall, sleep
         self._opened = ExitStack()
         self._wait_s = FIRST_WAIT_S
@@ -56,12 +58,18 @@ class ReconnectingSource(Generic[R_co]):
         self.losses = 0
 
     def __enter__(self) -> Self:
-        self._opened.enter_context(self._source)
-        self._is_open = True
+        self._open()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._opened.close()
+
+    def _open(self) -> None:
+        with ExitStack() as stack:
+            stack.enter_context(self._source)
+            self._require()
+            self._opened = stack.pop_all()
+        self._is_open = True
 
     @property
     def health(self) -> tuple[str, ...]:
@@ -92,7 +100,7 @@ class ReconnectingSource(Generic[R_co]):
             self._sleep(min(left, timeout_s))
             return False
         try:
-            self._opened.enter_context(self._source)
+            self._open()
         except SourceError as error:
             self._lost(error)
             device = self._forbidden()
@@ -101,7 +109,6 @@ class ReconnectingSource(Generic[R_co]):
             raise SourceError(
                 f"{device} came back as another device, which only a new start of this process may open ({error})"
             ) from error
-        self._is_open = True
         return True
 
     def _lost(self, error: SourceError) -> None:

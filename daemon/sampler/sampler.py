@@ -12,14 +12,7 @@ from importlib.metadata import version
 import numpy as np
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.sampler.devices import (
-    DeviceWatch,
-    SamplerRules,
-    accept_turns,
-    buses_of,
-    complaints_of,
-    servos_of,
-)
+from bodyschema.daemon.sampler.devices import DeviceWatch, SamplerRules, Servos, accept_turns
 from bodyschema.daemon.service.service import Service, with_health
 from bodyschema.daemon.service.signals import tell_parent_serving
 from bodyschema.daemon.transport.keys import Keys
@@ -38,9 +31,8 @@ from .counters import SamplerCounters
 from .gate import Gate
 from .gaze_loop import gaze_of
 from .history import LARGEST_REPLY, answer_pairs
-from .powered import asked
 from .reconnect import ReconnectingSource, ResilientWriter
-from .sources import Sources, answer_simulation
+from .sources import Sources, TellsHealth, answer_simulation, asked
 
 log = logging.getLogger(__name__)
 
@@ -162,6 +154,7 @@ class Sampler:
     def status(self) -> SamplerStatus:
         """Return the sampler's state; from any thread."""
         tally = self._tally
+        servos = self._encoders if isinstance(self._encoders, Servos) else None
         return SamplerStatus(
             robot=self._config.robot.name,
             store=self._store.identity,
@@ -177,8 +170,8 @@ class Sampler:
             coverage=tally.coverage,
             disk_free_bytes=disk_free(self._store.file),
             health=self._health(),
-            servos=servos_of(self._encoders),
-            buses=buses_of(self._encoders),
+            servos={} if servos is None else dict(servos.servo_health),
+            buses={} if servos is None else dict(servos.bus_health),
             version=self._version,
             unreadable=self._store.reader.present_damage().count,
         )
@@ -381,7 +374,8 @@ class Sampler:
 
     def _health(self) -> list[str]:
         said: list[str] = [trouble for trouble in (self._joints.trouble, self._marker.trouble) if trouble]
-        said += complaints_of(self._encoders) + self._devices.changes + self._storing.complaints
+        said += self._encoders.health if isinstance(self._encoders, TellsHealth) else ()
+        said += self._devices.changes + self._storing.complaints
         if self._failure is not None:
             said.append(str(self._failure))
         elif not self._ended:

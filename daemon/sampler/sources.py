@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import msgspec
@@ -13,13 +14,14 @@ import msgspec
 from bodyschema.daemon.transport.session import Request
 from bodyschema.daemon.transport.wire import SCHEMA, CommandReply, decode, encode
 from bodyschema.interfaces.camera import StereoCalibration
-from bodyschema.interfaces.errors import RequestError
+from bodyschema.interfaces.errors import ConfigError, RequestError
 from bodyschema.interfaces.protocols import Clock, JointSource, MarkerSource, Source
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import LONGEST_TOOL_M
 from kbmaps import RigidChain
 
 Picture = Callable[[], bytes | None]
+ANSWER_S = 1.5  # less than the 2 s that a query waits
 
 
 class GroundTruth(Protocol):
@@ -130,6 +132,30 @@ class Sources:
     # returns the newest camera picture as JPEG, or None before the first; None without cameras
     picture: Picture | None = None
     live: bool = False  # neither encoders nor cameras wait for the other; otherwise unread data is kept
+
+
+def find_powered(drives: Iterable[object], name: str, file: Path) -> Powered:
+    """Return the arm's drive of this name. ConfigError if robot.toml, `file`, does not configure it."""
+    for drive in drives:
+        if isinstance(drive, Powered) and drive.name == name:
+            return drive
+    remedy = f"Add the table [drivers.dynamixel.{name}]: docs/zero_force.md"
+    raise ConfigError(f"{name} is not configured", file=file, remedy=remedy)
+
+
+def asked(drive: Powered, *, on: bool) -> str:
+    """Send a request to the reading thread and wait for its answer; cancel it on a timeout.
+
+    Raises:
+        RequestError: it is refused, or the servos are not being read.
+    """
+    answer = drive.ask(on)
+    try:
+        return answer.result(ANSWER_S)
+    except TimeoutError as error:
+        if not answer.cancel() and not answer.cancelled():
+            raise RequestError(f"{drive.name}: being {'begun' if on else 'ended'}; see `bodyschema status`") from error
+        raise RequestError(f"{drive.name}: the servos are not read at present; see `bodyschema status`") from error
 
 
 class StampedJoints(JointSource, Protocol):

@@ -26,7 +26,8 @@ class Notifier:
 
     def __init__(self, address: str | None = None, watchdog_s: float | None = None) -> None:
         """Notify the socket at `address`, a path or with a leading `@` an abstract name; None: nothing."""
-        self._address = None if address is None else _as_address(address)
+        is_abstract = address is not None and address.startswith("@")
+        self._address = f"\0{address[1:]}" if address and is_abstract else address
         self._failed = False
         self._next_extension = 0.0
         self.watchdog_s = None if address is None else watchdog_s
@@ -85,7 +86,3 @@ class Notifier:
             self._failed = True
         else:
             self._failed = False
-
-
-def _as_address(name: str) -> str:
-    return f"\0{name[1:]}" if name.startswith("@") else name

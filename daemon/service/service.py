@@ -59,7 +59,11 @@ class Service:
             return
         with self._lock:
             self._round.add(loop)
-            self._feed_when_due(self._every_s)
+            now = self._clock.now()
+            if self._loops <= self._round and now >= self._next_feed:
+                self._round.clear()
+                self._next_feed = now + self._every_s
+                self._notifier.feed_watchdog()
 
     def leave(self, loop: str) -> None:
         """Note that the loop of this name has ended as it should: the watchdog no longer waits for it."""
@@ -102,13 +106,6 @@ class Service:
     def stopping(self) -> None:
         """Report that the process is stopping."""
         self._notifier.stopping()
-
-    def _feed_when_due(self, every_s: float) -> None:
-        now = self._clock.now()
-        if self._loops <= self._round and now >= self._next_feed:
-            self._round.clear()
-            self._next_feed = now + every_s
-            self._notifier.feed_watchdog()
 
 
 def with_health(line: str, health: Sequence[str]) -> str:

@@ -7,7 +7,6 @@ that no rule allows is dropped there, before it reaches a process.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import msgspec
@@ -43,17 +42,6 @@ class Names(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 ROLES = tuple(field.name for field in msgspec.structs.fields(Names))
 
 
-@dataclass(frozen=True, slots=True)
-class Subjects:
-    """Identification of connecting clients."""
-
-    by_user: bool  # by the user name that the password belongs to; otherwise by the common name of the certificate
-
-    def of(self, names: tuple[str, ...]) -> dict[str, list[str]]:
-        """Return the subjects of these names in the form of zenoh's configuration."""
-        return {"usernames" if self.by_user else "cert_common_names": list(names)}
-
-
 def deeds(role: str, keys: Keys) -> dict[Deed, tuple[str, ...]]:
     """Return the keys under which the role may perform each action."""
     pair, cache = keys.pair, f"{keys.pair}/{CACHE}"
@@ -87,12 +75,14 @@ def deeds(role: str, keys: Keys) -> dict[Deed, tuple[str, ...]]:
     }
 
 
-def access_control(names_of_robot: Mapping[str, Names], subjects: Subjects) -> dict[str, Any]:
+def access_control(names_of_robot: Mapping[str, Names], *, by_user: bool) -> dict[str, Any]:
     """Return zenoh's table `access_control`: each role may use the keys of its robots; all else is denied.
 
     Args:
         names_of_robot: names per role, by the robot's name, or `*` for every robot.
+        by_user: names are those of users, to whom the passwords belong; otherwise the certificates' common names.
     """
+    kind = "usernames" if by_user else "cert_common_names"
     rules: list[dict[str, Any]] = []
     owners: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
@@ -104,7 +94,7 @@ def access_control(names_of_robot: Mapping[str, Names], subjects: Subjects) -> d
             identity = f"{role} of {robot}"
             of_role = list(_rules(identity, deeds(role, Keys(robot))))
             rules += of_role
-            owners.append({"id": identity, **subjects.of(who)})
+            owners.append({"id": identity, kind: list(who)})
             policies.append({"rules": [rule["id"] for rule in of_role], "subjects": [identity]})
     return {"enabled": True, "default_permission": "deny", "rules": rules, "subjects": owners, "policies": policies}
 

@@ -346,7 +346,7 @@ ACCEPT_LIMIT_S = 1.0
 def unreached(route: Route) -> str:
     """Return the reason why none of a route's endpoints could be reached."""
     last = route.endpoints[-1]
-    if not _accepts(last):
+    if not accepts(last):
         return (
             f"nothing listens on {route}. Start the daemon with `bodyschema run`, "
             "or fix the table [zenoh] of robot.toml"
@@ -362,14 +362,14 @@ def unreached(route: Route) -> str:
     )
 
 
-def _accepts(endpoint: str) -> bool:
+def accepts(endpoint: str, within_s: float = ACCEPT_LIMIT_S) -> bool:
     """Return True if a TCP endpoint accepts connections, even from a process that never answers."""
     protocol, _, address = endpoint.partition("/")
     host, _, port = address.rpartition(":")
     if protocol not in ("tcp", "tls") or not port.isdigit():
         return False
     try:
-        with socket.create_connection((host.strip("[]"), int(port)), ACCEPT_LIMIT_S):
+        with socket.create_connection((host.strip("[]"), int(port)), within_s):
             return True
     except (OSError, OverflowError, UnicodeError):  # a port above 65535, a name with a part above 63 characters
         return False

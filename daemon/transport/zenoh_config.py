@@ -10,7 +10,7 @@ import msgspec
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.robot.toml_file import ENDPOINT, line_of
 
-from .access import Names, Subjects, access_control
+from .access import Names, access_control
 from .identity import SECURE, Identity, LoginConfig, Route, TlsConfig, is_local
 
 PROCESSES = ("sampler", "learner")
@@ -119,7 +119,7 @@ class ZenohConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             settings |= identity.settings()
             if self.endpoint(process).startswith(SECURE):
                 names = self.access or Names()
-                settings["access_control"] = access_control({robot: names}, Subjects(identity.by_user))
+                settings["access_control"] = access_control({robot: names}, by_user=identity.by_user)
         return settings
 
 

@@ -17,9 +17,9 @@ from typing import Any
 import msgspec
 
 from bodyschema.daemon.config import Config
-from bodyschema.drivers.bench.asked_faults import AskedFault
 from bodyschema.drivers.bench.device import Angle
 from bodyschema.drivers.bench.dry_run import BenchArm, DryRun
+from bodyschema.drivers.bench.faults import AskedFault
 from bodyschema.drivers.bench.servo_arm import played, swinging
 from bodyschema.drivers.bench.through_driver import LATENCY_MS, READ_S, Behind, ThroughDriver
 from bodyschema.drivers.dynamixel.config import DynamixelConfig

@@ -41,14 +41,9 @@ PAGE = "docs/cameras.md"
 Eyes = LiveEyes | RealsenseCamera | Film
 
 
-def cameras_of(config: Config) -> CamerasConfig | None:
-    """Return the cameras configured in robot.toml; None if it has none."""
-    return config.tables.vision.cameras
-
-
 def require_cameras(config: Config) -> CamerasConfig:
     """Return the cameras configured in robot.toml; raise ConfigError if it has none."""
-    cameras = cameras_of(config)
+    cameras = config.tables.vision.cameras
     if cameras is None:
         raise ConfigError(
             "no cameras are configured", file=config.file, remedy=f"Add the table [vision.cameras]: {PAGE}"
@@ -74,11 +69,6 @@ def calibration_file(config: Config) -> Path:
     """Return the calibration file named in robot.toml; by default cameras.toml beside it."""
     cameras = require_cameras(config)
     return config.file.parent / (cameras.calibration or "cameras.toml")
-
-
-def names_calibration(config: Config) -> bool:
-    """Return True if robot.toml names a calibration."""
-    return require_cameras(config).calibration is not None
 
 
 def common_error(config: Config) -> CommonError | None:
@@ -151,7 +141,7 @@ def tracked_images(config: Config, folder: Path) -> TrackedCamera:
 
 
 def _tracked(config: Config, **layout: VideosConfig | ImagesConfig) -> TrackedCamera:
-    given = cameras_of(config)
+    given = config.tables.vision.cameras
     calibration, readout_s = (None, None) if given is None else (given.calibration, given.readout_s)
     cameras = CamerasConfig(calibration=calibration, readout_s=readout_s, **layout)  # pyright: ignore[reportArgumentType]
     seen = seen_through(config, cameras)

@@ -113,11 +113,6 @@ def port_checks(config: Config, ours: Collection[int] = ()) -> Iterator[Check]:
         yield from checks.port_checks(name, port, ours=ours)
 
 
-def ports_are_there(config: Config) -> bool:
-    """Return True if all ports of robot.toml exist."""
-    return all(os.path.exists(port) for port in configured_ports(config).values())
-
-
 def other_holders(config: Config) -> list[Holder]:
     """Return the other processes that have one of the ports open."""
     return [holder for port in configured_ports(config).values() for holder in checks.holders(port)]

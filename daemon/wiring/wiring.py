@@ -85,7 +85,7 @@ def check_sources(config: Config, *, sim: bool) -> None:
     """ConfigError when `open_sources` would find nothing to open; opens nothing."""
     _require_source(config, sim=sim)
     if sim:
-        require_simulation()
+        require_extra("sim", "the simulation")
         simulation_settings(config)
 
 
@@ -194,11 +194,6 @@ def connected_cameras() -> list[str]:
     from bodyschema.vision.cameras.v4l2.serials import connected
 
     return connected()
-
-
-def require_simulation() -> None:
-    """Raise ConfigError with the command to type when the simulation's packages are not installed."""
-    require_extra("sim", "the simulation")
 
 
 def demonstration_model() -> Path:
@@ -332,7 +327,7 @@ def marker_source_lines(config: Config) -> Iterator[str]:
 
 @contextmanager
 def _simulated(config: Config) -> Iterator[Sources]:
-    require_simulation()
+    require_extra("sim", "the simulation")
     from bodyschema.sim_backend import SimWorld
     from bodyschema.sim_backend.world import exact_encoders
 
@@ -356,7 +351,7 @@ def open_postures(config: Config, count: int) -> Iterator[Sources]:
     Raises:
         ConfigError: the simulation cannot be made of this description.
     """
-    require_simulation()
+    require_extra("sim", "the simulation")
     from bodyschema.sim_backend.posed import PosedWorld, visible_postures
 
     settings = simulation_settings(config)

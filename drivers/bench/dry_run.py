@@ -9,8 +9,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
-from .asked_faults import NOW_AND_THEN, AskedFault
 from .device import Device
+from .faults import NOW_AND_THEN, AskedFault
 from .pty_shell import PtyShell
 
 EVERY_S = 10.0  # period of recurring faults

@@ -1,10 +1,16 @@
-"""Faults of an answer in transit. (Faults of a servo are set on the servo.)"""
+"""Faults of an answer in transit, and those that the command line asks for: `late=0.1`, `mute@elbow`, `unplug`.
+
+Faults of a servo are set on the servo.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from random import Random
+
+from bodyschema.interfaces.errors import ConfigError
+from bodyschema.robot.suggest import did_you_mean
 
 from .device import Fault, Reply
 
@@ -48,66 +54,90 @@ def garbage(reply: Reply, rng: Random) -> Reply:
     return replace(reply, data=noise + reply.data if rng.random() < 0.5 else reply.data + noise)
 
 
-class Planned:
-    """Faults of chosen servos, each for a given number of answers."""
-
-    def __init__(self, rng: Random | None = None) -> None:
-        self._rng = Random(0) if rng is None else rng
-        self._plan: dict[int, tuple[Fault, int | None]] = {}
-
-    def add(self, id: int, fault: Fault, times: int | None = None) -> None:
-        """Apply `fault` to the servo's next `times` answers; None: to all of them, until `clear`."""
-        self._plan[id] = (fault, times)
-
-    def clear(self) -> None:
-        self._plan.clear()
-
-    def __call__(self, reply: Reply) -> Reply:
-        if reply.id not in self._plan:
-            return reply
-        fault, times = self._plan[reply.id]
-        if times is not None:
-            if times <= 1:
-                del self._plan[reply.id]
-            else:
-                self._plan[reply.id] = (fault, times - 1)
-        return fault(reply, self._rng)
+ON_THE_WIRE: Mapping[str, Fault] = {
+    "mute": mute,
+    "late": late(0.05),
+    "checksum": wrong_checksum,
+    "corrupt": corrupt(),
+    "half": half,
+    "garbage": garbage,
+}
+OF_ALL = ("power-cycle", "unplug")
+NOW_AND_THEN = ("glitch", *OF_ALL)
+SHARE = 0.02
+OPTION = "--fault"
 
 
-class Storm:
-    """Random faults."""
+@dataclass(frozen=True, slots=True)
+class FaultKinds:
+    """Faults available for a vendor's servos or encoders."""
 
-    def __init__(self, shares: Mapping[str, tuple[float, Fault]], rng: Random) -> None:
-        """Start with all counts at zero.
+    on_the_wire: Mapping[str, Fault]  # faults of transmitted packets, by name
+    # faults of one servo or encoder; `glitch` recurs, the others are present from the start
+    of_one_joint: tuple[str, ...]
 
-        Args:
-            shares: by name, the probability that an answer is affected, and the fault.
+    @property
+    def names(self) -> tuple[str, ...]:
+        return (*self.on_the_wire, *self.of_one_joint, *OF_ALL)
+
+
+@dataclass(frozen=True, slots=True)
+class AskedFault:
+    kind: str  # its name
+    joint: str | None  # joint whose servo or encoder is affected; None: all
+    share: float  # the probability that an answer is affected, for faults on the wire
+
+    @classmethod
+    def parsed(cls, text: str, joints: Collection[str], kinds: FaultKinds) -> AskedFault:
+        """Parse `KIND[@JOINT][=SHARE]`.
+
+        A wire fault with a joint affects every answer of its servo; without a joint it affects 2 % of all answers.
+
+        Raises:
+            ConfigError: an unknown kind or joint, or a share.
         """
-        self._shares, self._rng = dict(shares), rng
-        self._total = sum(share for share, _ in self._shares.values())
-        self.struck = dict.fromkeys(self._shares, 0)
+        named, _, share = text.partition("=")
+        kind, _, joint = named.partition("@")
+        if kind not in kinds.names:
+            raise ConfigError(f"{OPTION} {text}: unknown fault {kind!r}", remedy=did_you_mean(kind, kinds.names))
+        if joint and joint not in joints:
+            raise ConfigError(f"{OPTION} {text}: unknown joint {joint!r}", remedy=did_you_mean(joint, joints))
+        if not joint and kind in kinds.of_one_joint:
+            first = next(iter(joints))
+            raise ConfigError(f"{OPTION} {text}: it is of one joint", remedy=f"Name it, as in {kind}@{first}")
+        if joint and kind in OF_ALL:
+            raise ConfigError(f"{OPTION} {text}: it strikes all servos", remedy=f"Give {kind} alone")
+        if share and kind not in kinds.on_the_wire:
+            raise ConfigError(f"{OPTION} {text}: it has no share", remedy=f"Give {named} alone")
+        return cls(kind, joint or None, _probability(text, share) if share else 1.0 if joint else SHARE)
+
+
+def _probability(text: str, share: str) -> float:
+    try:
+        value = float(share)
+    except ValueError:
+        value = -1.0
+    if not 0.0 < value <= 1.0:
+        raise ConfigError(f"{OPTION} {text}: {share!r} is no share", remedy="Give one between 0 and 1, as in late=0.05")
+    return value
+
+
+class WireFaults:
+    """Faults of the packets on one bus."""
+
+    def __init__(self, faults: Sequence[tuple[int | None, float, Fault]], rng: Random) -> None:
+        """Store triples of servo ID (None: all), probability and fault."""
+        self._faults, self._rng = tuple(faults), rng
+
+    @classmethod
+    def asked(cls, faults: Sequence[AskedFault], kinds: FaultKinds, ids: Mapping[str, int], rng: Random) -> WireFaults:
+        """Select those of `faults` that affect a bus; `ids` maps the joints on it to servo IDs."""
+        here = [f for f in faults if f.kind in kinds.on_the_wire and (f.joint is None or f.joint in ids)]
+        strike = [(None if f.joint is None else ids[f.joint], f.share, kinds.on_the_wire[f.kind]) for f in here]
+        return cls(strike, Random(rng.random()))
 
     def __call__(self, reply: Reply) -> Reply:
-        drawn = self._rng.random()
-        if drawn >= self._total:
-            return reply
-        for name, (share, fault) in self._shares.items():
-            if drawn < share:
-                self.struck[name] += 1
-                return fault(reply, self._rng)
-            drawn -= share
+        for id, share, fault in self._faults:
+            if reply.data and id in (None, reply.id) and self._rng.random() < share:
+                reply = fault(reply, self._rng)
         return reply
-
-
-def storm(intensity: float, rng: Random, *others: Fault, longest_late_s: float = 0.05) -> Storm:
-    """Mix all faults and `others` in equal shares; `intensity` is the probability that an answer is affected."""
-    faults = {
-        "mute": mute,
-        "late": late(longest_late_s),
-        "wrong checksum": wrong_checksum,
-        "corrupt": corrupt(),
-        "half": half,
-        "garbage": garbage,
-        **{f"other {k}": fault for k, fault in enumerate(others, 1)},
-    }
-    return Storm({name: (intensity / len(faults), fault) for name, fault in faults.items()}, rng)

@@ -15,10 +15,10 @@ import numpy as np
 from bodyschema.drivers.servos.config import ServoConfig, ServosConfig
 from bodyschema.interfaces.records import FloatArray, frozen_array
 
-from .asked_faults import AskedFault, FaultKinds, WireFaults
 from .chain import ServoChain, ServoT
 from .device import Angle, Faults
 from .dry_run import GLITCH_TICKS, BenchArm
+from .faults import AskedFault, FaultKinds, WireFaults
 
 
 class _Settings:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 from bodyschema.drivers.servos.bus import Bus, Exchange, Request
 from bodyschema.drivers.servos.scan import VOLT_PER_UNIT
@@ -12,7 +12,6 @@ from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.servos import ServoStatus
 
 from .channel import Drive, Sample
-from .handshake import Finding
 from .model import Register
 from .servo import IdentifiedServo
 
@@ -51,10 +50,6 @@ class Health:
         else:
             del self._alerts[joint]
             log.info("joint %r is well again", joint)
-
-    def note_found(self, findings: Iterable[Finding]) -> None:
-        """Note which servos were found at an opening, and which were not."""
-        self.absent = {finding.config.joint: finding.found for finding in findings if finding.servo is None}
 
     def of(self, servo: IdentifiedServo, sample: Sample | None, lost: str | None) -> ServoStatus:
         """Return the state of a servo; `lost` is the joint that lost its turn count."""

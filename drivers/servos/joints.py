@@ -152,7 +152,7 @@ class ServoJoints:
                 identify(self._buses[config.bus_of(servo)], servo, config.model_of(servo), self.vendor.models)
                 for servo in self._wanted
             ]
-            self._health.note_found(findings)
+            self._health.absent = {each.config.joint: each.found for each in findings if each.servo is None}
             servos = require_all(findings, ", ".join(bus.port for bus in config.buses.values()))
             self.servos = [switch_torque_off(self._buses[servo.bus], servo) for servo in servos]
             self._prepare()

@@ -215,10 +215,6 @@ def heard(port: Port, clock: Clock, end: float, enough: int | None = None) -> by
     return received
 
 
-def open_line(port: str, baud: int, clock: Clock) -> Port:
-    return SerialLine.open(port, baud, clock.now)
-
-
 Tell = Callable[[str], None]
 
 
@@ -230,7 +226,7 @@ def scan_port(
     *,
     bauds: Sequence[int] = (),
     latency_s: float = DEFAULT_LATENCY_S,
-    open_port: Callable[[str, int, Clock], Port] = open_line,
+    open_port: Callable[[str, int, Clock], Port] = lambda port, baud, clock: SerialLine.open(port, baud, clock.now),
 ) -> ScannedBus:
     """Find the servos on a port at all rates, or at `bauds`.
 

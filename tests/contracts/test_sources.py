@@ -45,9 +45,10 @@ from bodyschema.drivers.markers.fusing import FusedMarkers, Member
 from bodyschema.drivers.markers.report import Packet
 from bodyschema.drivers.markers.stream import MarkerStream
 from bodyschema.drivers.replay import Replay
-from bodyschema.drivers.ros2.bench.node import Node, Send, intact
+from bodyschema.drivers.ros2.bench.node import Node, Send
 from bodyschema.drivers.ros2.config import Ros2Config
 from bodyschema.drivers.ros2.joints import Ros2Joints
+from bodyschema.drivers.ros2.messages import encode_joint_state
 from bodyschema.drivers.serial_lines.bench.board import EncoderBoard
 from bodyschema.drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
 from bodyschema.drivers.serial_lines.joints import SerialLineJoints
@@ -372,7 +373,7 @@ def servos_that_fall_silent() -> AbstractContextManager[Rig]:
 
 
 @contextmanager
-def ros_2_robot(send: Send = intact) -> Iterator[Rig]:
+def ros_2_robot(send: Send = encode_joint_state) -> Iterator[Rig]:
     clock = VirtualClock()
     nodes = [Node({name: swinging(place)}, 50.0, name=name, send=send) for place, name in enumerate("ab")]
     yield Rig(Ros2Joints(Ros2Config(), ("a", "b"), clock, open_link=lambda *_: VirtualLink(nodes, clock)))
@@ -380,7 +381,7 @@ def ros_2_robot(send: Send = intact) -> Iterator[Rig]:
 
 def ros_2_robot_that_falls_silent() -> AbstractContextManager[Rig]:
     said = count()
-    return ros_2_robot(lambda message: intact(message) if next(said) < 30 else None)
+    return ros_2_robot(lambda message: encode_joint_state(message) if next(said) < 30 else None)
 
 
 def feetech_servos_that_fall_silent() -> AbstractContextManager[Rig]:

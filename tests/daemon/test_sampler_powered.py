@@ -16,7 +16,6 @@ from small_arm import write_small_arm
 from test_sampler import command, running, sample, status_when
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.sampler import powered
 from bodyschema.daemon.sampler.sources import Sources
 from bodyschema.daemon.wiring.wiring import demonstration_model
 from bodyschema.interfaces.clock import SystemClock
@@ -73,7 +72,7 @@ def test_a_refusal_is_the_answer(config) -> None:
 
 
 def test_what_nobody_does_in_time_is_not_done_later(config, monkeypatch) -> None:
-    monkeypatch.setattr(powered, "ANSWER_S", 0.05)
+    monkeypatch.setattr("bodyschema.daemon.sampler.sources.ANSWER_S", 0.05)
     drive = Powered()
     with running(config, sources(config, drive)) as bus, pytest.raises(RequestError, match="not read at present"):
         command(bus, "zero_force_on")

@@ -8,14 +8,7 @@ from small_arm import write_small_arm
 
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.wiring.simulation import simulation_settings
-from bodyschema.daemon.wiring.wiring import (
-    check_sources,
-    demonstration_model,
-    open_joints,
-    open_postures,
-    open_sources,
-    require_simulation,
-)
+from bodyschema.daemon.wiring.wiring import check_sources, demonstration_model, open_joints, open_postures, open_sources
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError, RecordingError, SourceLost
 from bodyschema.interfaces.records import MarkerFix
@@ -139,7 +132,7 @@ def test_small_green_balls_make_fixes_in_the_simulation(tmp_path) -> None:
 def test_without_pybullet_the_simulation_names_the_extra(monkeypatch) -> None:
     monkeypatch.setattr("bodyschema.interfaces.extras.find_spec", lambda _name: None)
     with pytest.raises(ConfigError, match=r"Type: .*pip install 'bodyschema\[sim\]'"):
-        require_simulation()
+        check_sources(Config.load(demonstration_model(), {}), sim=True)
 
 
 def test_the_demonstration_model_is_a_robot_in_order() -> None:

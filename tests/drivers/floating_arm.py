@@ -10,8 +10,8 @@ from operator import truediv
 import numpy as np
 from bench_arm import HeardPort
 from virtual_port import VirtualClock
+from wire_faults import Planned
 
-from bodyschema.drivers.bench.faults import Planned
 from bodyschema.drivers.dynamixel.bench.chain import Chain
 from bodyschema.drivers.dynamixel.bench.servo import CURRENT_MODE, Servo
 from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig

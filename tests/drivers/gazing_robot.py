@@ -7,10 +7,10 @@ import math
 import numpy as np
 from bench_arm import HeardPort
 from virtual_port import VirtualClock
+from wire_faults import Planned
 
 from bodyschema.daemon.sampler.gaze_loop import GazeLoop, HandModel
 from bodyschema.daemon.wiring.wiring import demonstration_model
-from bodyschema.drivers.bench.faults import Planned
 from bodyschema.drivers.dynamixel.bench.arm import DrivenShaft
 from bodyschema.drivers.dynamixel.bench.chain import Chain
 from bodyschema.drivers.dynamixel.bench.servo import Servo

@@ -6,10 +6,11 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from random import Random
 
+from spoilt_messages import Fault, Planned
 from virtual_link import VirtualLink, at_once
 from virtual_port import VirtualClock
 
-from bodyschema.drivers.ros2.bench.node import Fault, Node, Planned
+from bodyschema.drivers.ros2.bench.node import Node
 from bodyschema.drivers.ros2.config import Ros2Config
 from bodyschema.drivers.ros2.joints import Ros2Joints
 from bodyschema.interfaces.records import JointReading

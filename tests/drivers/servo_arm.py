@@ -8,9 +8,9 @@ from random import Random
 from typing import Any
 
 from virtual_port import VirtualClock, VirtualPort, at_once
+from wire_faults import Planned
 
 from bodyschema.drivers.bench.chain import ServoChain
-from bodyschema.drivers.bench.faults import Planned
 from bodyschema.drivers.servos.config import ServosConfig
 from bodyschema.drivers.servos.joints import ServoJoints
 

@@ -14,9 +14,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from bodyschema.drivers.bench.asked_faults import AskedFault, FaultKinds, WireFaults
 from bodyschema.drivers.bench.device import Reply
 from bodyschema.drivers.bench.dry_run import DryRun
+from bodyschema.drivers.bench.faults import AskedFault, FaultKinds, WireFaults
 from bodyschema.drivers.bench.servo_arm import played, swinging
 from bodyschema.drivers.bench.through_driver import Behind, ThroughDriver
 from bodyschema.drivers.dynamixel.bench.arm import KINDS, DynamixelArm

@@ -8,8 +8,9 @@ import termios
 import dynamixel_sdk as sdk
 import pytest
 from virtual_port import VirtualClock, VirtualPort
+from wire_faults import Planned
 
-from bodyschema.drivers.bench.faults import Planned, half, mute, wrong_checksum
+from bodyschema.drivers.bench.faults import half, mute, wrong_checksum
 from bodyschema.drivers.bench.pty_shell import PtyShell
 from bodyschema.drivers.dynamixel.bench.chain import Chain
 from bodyschema.drivers.dynamixel.bench.servo import Servo

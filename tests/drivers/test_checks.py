@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from bodyschema.drivers import checks
-from bodyschema.drivers.bench.asked_faults import AskedFault
 from bodyschema.drivers.bench.dry_run import DryRun
+from bodyschema.drivers.bench.faults import AskedFault
 from bodyschema.drivers.checks import Check, holders, port_checks
 from bodyschema.drivers.dynamixel.bench.arm import DynamixelArm
 from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig

@@ -12,9 +12,10 @@ import pytest
 from bench_arm import Arm
 from servo_arm import TICK, swing
 from virtual_port import VirtualClock, VirtualPort
+from wire_faults import storm
 
 from bodyschema.drivers.bench.faults import corrupt, garbage, half, late, mute, wrong_checksum
-from bodyschema.drivers.dynamixel.bench.arm import storm, swapped
+from bodyschema.drivers.dynamixel.bench.arm import swapped
 from bodyschema.drivers.dynamixel.bench.chain import Chain
 from bodyschema.drivers.dynamixel.bench.servo import Servo
 from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
@@ -417,7 +418,7 @@ def test_six_servos_are_read_two_hundred_times_a_second() -> None:
 def test_in_a_storm_of_faults_no_wrong_reading_is_believed(models, fast) -> None:
     arm = Arm(models, fast=fast, seed=5)
     with arm.joints:
-        arm.chain.faults = storm(0.06, Random(6))
+        arm.chain.faults = storm(0.06, Random(6), swapped)
         readings = read(arm, 300)
     assert sum(arm.chain.faults.struck.values()) > 18
     assert max(arm.error(reading) for reading in readings) < 0.01

@@ -13,9 +13,10 @@ from feetech_arm import FeetechArm
 from hypothesis import given
 from hypothesis import strategies as st
 from servo_arm import TICK, swing
+from wire_faults import storm
 
 from bodyschema.drivers.bench.faults import corrupt, garbage, half, late, mute, wrong_checksum
-from bodyschema.drivers.feetech.bench.arm import storm, swapped
+from bodyschema.drivers.feetech.bench.arm import swapped
 from bodyschema.drivers.feetech.bench.servo import Servo
 from bodyschema.drivers.feetech.models import BY_NAME
 from bodyschema.drivers.servos.channel import Punctuality
@@ -212,7 +213,7 @@ def test_an_encoder_s_glitch_is_not_believed() -> None:
 def test_in_a_storm_of_faults_no_wrong_reading_is_believed(sync) -> None:
     arm = FeetechArm(("STS3215",) * 6, sync=sync, seed=5)
     with arm.joints:
-        arm.chain.faults = struck = storm(0.04, Random(6))
+        arm.chain.faults = struck = storm(0.04, Random(6), swapped)
         readings = read(arm, 300)
     assert arm.chain.instructions > 300
     assert sum(struck.struck.values()) > 18

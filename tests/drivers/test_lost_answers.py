@@ -15,9 +15,10 @@ from feetech_arm import FeetechArm
 from hypothesis import given
 from hypothesis import strategies as st
 from virtual_port import VirtualClock, VirtualPort
+from wire_faults import Planned, Storm
 
 from bodyschema.drivers.bench.device import Reply
-from bodyschema.drivers.bench.faults import Planned, Storm, mute
+from bodyschema.drivers.bench.faults import mute
 from bodyschema.drivers.dynamixel.bench.chain import Chain
 from bodyschema.drivers.dynamixel.bench.servo import Servo
 from bodyschema.drivers.dynamixel.bus import Bus

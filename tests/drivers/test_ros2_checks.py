@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 from ros2_robot import PATHS, Robot
+from spoilt_messages import Fault
 
 from bodyschema.drivers.checks import Check
-from bodyschema.drivers.ros2.bench.node import Fault, Node
+from bodyschema.drivers.ros2.bench.node import Node
 from bodyschema.drivers.ros2.config import Ros2Config
 from bodyschema.drivers.ros2.joints import joint_state_checks
 from bodyschema.interfaces.errors import SourceLost

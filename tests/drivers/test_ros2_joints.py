@@ -8,9 +8,10 @@ from random import Random
 import numpy as np
 import pytest
 from ros2_robot import PATHS, Robot
+from spoilt_messages import Fault
 
 from bodyschema.drivers.ros2 import rmw
-from bodyschema.drivers.ros2.bench.node import Fault, Node
+from bodyschema.drivers.ros2.bench.node import Node
 from bodyschema.drivers.ros2.link import Sample
 from bodyschema.drivers.ros2.messages import JOINT_STATE, POINT_STAMPED, Header, JointState, encode_joint_state
 from bodyschema.drivers.ros2.senders import Refusal

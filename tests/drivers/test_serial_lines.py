@@ -18,9 +18,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from servo_arm import swing
 from virtual_port import VirtualClock, VirtualPort, at_once
+from wire_faults import Planned, storm
 
 from bodyschema.drivers.bench.device import Reply
-from bodyschema.drivers.bench.faults import Planned, corrupt, garbage, half, late, mute, storm, wrong_checksum
+from bodyschema.drivers.bench.faults import corrupt, garbage, half, late, mute, wrong_checksum
 from bodyschema.drivers.serial_lines.bench.board import EncoderBoard
 from bodyschema.drivers.serial_lines.board import Board
 from bodyschema.drivers.serial_lines.config import EncoderConfig, SerialLinesConfig

@@ -26,7 +26,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background
 try:
     with SimWorld(RobotDescription.load(model_file("upper_body")), SimConfig()) as world, world.joints, world.camera:
         world.camera.read(300.0)
-        print(world.renderer_process.pid, flush=True)
+        print(world._renderer.process.pid, flush=True)
         # A signal that comes just before a call blocks does not end it: Python looks for signals in between only.
         while not select.select([sys.stdin], [], [], 0.05)[0]:
             pass

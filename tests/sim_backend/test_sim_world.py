@@ -202,7 +202,7 @@ def test_a_reader_that_waits_is_told_when_the_world_closes(unrendered):
 
 def test_a_dead_renderer_is_a_lost_source_until_the_camera_is_opened_again(running):
     world = running
-    world.renderer_process.kill()
+    world._renderer.process.kill()
     with pytest.raises(SourceLost, match="renderer"):
         frames(world, 10)
     with world.camera:

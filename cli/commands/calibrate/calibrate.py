@@ -206,7 +206,10 @@ def arm(
     from bodyschema.calibration.next_poses import check_target
     from bodyschema.daemon.config import Config
 
-    _require_one_target(servos, out)
+    if servos.write and (servos.lerobot is None or out is not None):
+        raise RequestError(
+            "--write is for --lerobot FILE, and without --out: offsets belong into the servos or into a URDF, not both"
+        )
     fit.trusted()
     if plan.next_poses is not None:
         check_target(plan.next_poses, replace=force)
@@ -303,13 +306,6 @@ def _contained(found: Calibration) -> list[str]:
         "alike; distances and expected errors are without its estimated part. Where another instrument measured the "
         "positions, give a robot.toml without `calibration` in [vision.cameras]."
     ]
-
-
-def _require_one_target(servos: LeRobotOptions, out: Path | None) -> None:
-    if servos.write and (servos.lerobot is None or out is not None):
-        raise RequestError(
-            "--write is for --lerobot FILE, and without --out: offsets belong into the servos or into a URDF, not both"
-        )
 
 
 def _require_writable(report: CalibrationReport, *, force: bool) -> None:

@@ -136,18 +136,25 @@ def _calibrate(
     *,
     as_json: bool,
 ) -> None:
-    from bodyschema.cli.cameras.calibration import cameras_view, figures, write_calibrated_cameras
+    from bodyschema.cli.cameras.calibration import (
+        calibrated,
+        cameras_view,
+        figures,
+        from_images,
+        write_calibrated_cameras,
+    )
     from bodyschema.daemon.config import Config
-    from bodyschema.daemon.wiring.cameras import calibration_file, names_calibration
+    from bodyschema.daemon.wiring.cameras import calibration_file, require_cameras
 
     board, named, autofocus = printed.board(), True, ()
     if images is not None:
-        found, result = _of_images(images, files, board, known)
-        out = out or CAMERAS
+        tell = partial(say, stderr=True)
+        found = from_images(files.of(images), board, tell)
+        result, out = calibrated(found, known, tell), out or CAMERAS
     else:
         config = Config.load(robot)
         found, result, autofocus = _live(config, board, known, save)
-        out, named = out or calibration_file(config), names_calibration(config)
+        out, named = out or calibration_file(config), require_cameras(config).calibration is not None
     report = write_calibrated_cameras(result, found, out)
     measured = printed.ruler_mm is not None or known.baseline_mm is not None
     told = figures(result, found, size_was_measured=measured, autofocus=autofocus)
@@ -189,14 +196,6 @@ def _print_board(made: Board, paper: str, out: Path) -> None:
         f"{out} written: {made.name}. Print it at 100 %, then measure both rulers: {across:g} mm below, {upright:g} mm "
         "beside the board."
     )
-
-
-def _of_images(images: Path, files: EyeFiles, board: Board, known: KnownCameras) -> tuple[Gathered, Calibrated]:
-    from bodyschema.cli.cameras.calibration import calibrated, from_images
-
-    tell = partial(say, stderr=True)
-    found = from_images(files.of(images), board, tell)
-    return found, calibrated(found, known, tell)
 
 
 def _live(

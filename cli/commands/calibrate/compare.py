@@ -7,10 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from cyclopts import Parameter
-from rich import box
 from rich.console import Console, Group
 from rich.padding import Padding
-from rich.table import Table
 from rich.text import Text
 
 from bodyschema.cli.commands.options import flag, print_json
@@ -53,14 +51,16 @@ def compare(
 
 def view(report: ComparisonReport) -> Group:
     """Return a view of what was compared, the figures and the worst rows."""
-    figures = _table("", "mean", "RMS", "median", "max")
+    from bodyschema.cli.terminal.screen import ruled_table
+
+    figures = ruled_table("", "mean", "RMS", "median", "max")
     figures.add_row(Text("distance [mm]"), *_row(report.distances))
     if report.aligned is not None:
         figures.add_row(Text("after best rigid alignment [mm]"), *_row(report.aligned.distances))
-    axes = _table(f"{report.second} minus {report.first}", "x", "y", "z")
+    axes = ruled_table(f"{report.second} minus {report.first}", "x", "y", "z")
     axes.add_row(Text("mean [mm]"), *map(_number, report.axis_mean_mm))
     axes.add_row(Text("RMS [mm]"), *map(_number, report.axis_rms_mm))
-    worst = _table("worst rows", "row", "[mm]", "x", "y", "z")
+    worst = ruled_table("worst rows", "row", "[mm]", "x", "y", "z")
     for row in report.worst:
         number = f"{row.row}" if row.row == row.other_row else f"{row.row}, {row.other_row}"
         worst.add_row("", number, _number(row.distance_mm), *map(_number, row.apart_mm))
@@ -104,14 +104,6 @@ def _not_compared(report: ComparisonReport, left: LeftOut) -> str:
     ]
     why = "" if left.joint is None else f" In row {left.first_row} {left.joint} differs by {left.by:.4g} rad or m."
     return f"Not compared, since the other has no row at their joint angles: {' and '.join(parts)}.{why}"
-
-
-def _table(title: str, *columns: str) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
-    table.add_column(Text(title), overflow="fold")
-    for name in columns:
-        table.add_column(Text(name), justify="right", no_wrap=True)
-    return table
 
 
 def _row(distances: Distances) -> Sequence[str]:

@@ -80,21 +80,17 @@ def diagnose(
             tell("writing the report")
             written(found, out)
     say(*(f"Warning: {warning}" for warning in found.warnings), stderr=True)
-    lines = servos.lines(config, _joint_offsets(found), recording)
+    offsets = {
+        cause.where: cause.parameters["offset_rad"].value
+        for cause in found.file.causes
+        if cause.effect == "joint_offset" and cause.where is not None and "offset_rad" in cause.parameters
+    }
+    lines = servos.lines(config, offsets, recording)
     if as_json:
         sys.stdout.write(found.json + "\n")
         sys.stderr.writelines(f"{line}\n" for line in lines)
         return
     _show(found, lines, out)
-
-
-def _joint_offsets(found: ReportedDiagnosis) -> dict[str, float]:
-    """Return the joint offsets among the causes [rad], by joint."""
-    return {
-        cause.where: cause.parameters["offset_rad"].value
-        for cause in found.file.causes
-        if cause.effect == "joint_offset" and cause.where is not None and "offset_rad" in cause.parameters
-    }
 
 
 def _show(found: ReportedDiagnosis, lines: list[str], out: Path | None) -> None:

@@ -90,11 +90,12 @@ def print_tags(
 
     Next: put the printed tables into robot.toml; `bodyschema marker learn` for tags glued by hand.
     """
-    from bodyschema.cli.cameras.tag_pages import Tags, as_printed, face_mm, tables, write_tags
+    from bodyschema.cli.cameras.board_pages import write_page
+    from bodyschema.cli.cameras.tag_pages import Tags, as_printed, face_mm, sheet, tables
 
     usual_mm, *usual = {"board": (20.0, 8, 5), "chessboard": (30.0, 8, 5)}.get(shape, (40.0, 2, 1))
     drawn = Tags(shape, ids, family, side_mm or usual_mm, columns or usual[0], rows or usual[1], fold_deg)
-    across, upright = write_tags(drawn, paper, out)
+    across, upright = write_page(sheet(drawn, paper), out)
     tags = drawn if ruler_mm is None else as_printed(drawn, across, ruler_mm)
     rulers = (
         f"each is {across:g} mm" if across == upright else f"{across:g} mm below the picture, {upright:g} mm beside it"

@@ -65,7 +65,7 @@ def servos(
 
     Next: the changes to robot.toml that it prints; `bodyschema watch joints` shows the angles.
     """
-    from bodyschema.cli.servos.changes import assignments
+    from bodyschema.cli.servos.changes import assignments, plan
 
     if bool(settings) + zero + undo > 1:
         raise RequestError("give NAME=VALUE, --zero or --undo, one of them")
@@ -82,7 +82,9 @@ def servos(
         raise ConfigError("no servos are named", remedy="Name them with --joint, --bus, or --port and --id")
     wanted = _wanted(robot, joint, bus, port, id, baud)
     if wishes:
-        _set(wanted, wishes, _log(robot, port), dry_run=dry_run, yes=yes)
+        log = _log(robot, port)
+        with _workbench(wanted) as workbench:
+            _carry_out(workbench, plan(workbench, wanted, wishes), log, dry_run=dry_run, yes=yes)
     else:
         _show(wanted, as_json=as_json)
 
@@ -102,15 +104,6 @@ def _show(wanted: Sequence[Wanted], *, as_json: bool) -> None:
                 Console(highlight=False).print(settings_table(*found[-1]))
     if as_json:
         sys.stdout.write(settings_json(found) + "\n")
-
-
-def _set(
-    wanted: Sequence[Wanted], wishes: Sequence[tuple[str, str]], log: ServoLog, *, dry_run: bool, yes: bool
-) -> None:
-    from bodyschema.cli.servos.changes import plan
-
-    with _workbench(wanted) as workbench:
-        _carry_out(workbench, plan(workbench, wanted, wishes), log, dry_run=dry_run, yes=yes)
 
 
 def _zero(robot: Path, joint: tuple[str, ...], *, in_servo: bool, dry_run: bool, yes: bool) -> None:

@@ -89,7 +89,7 @@ def watch(
 def _joints(robot: Path, *, once: bool, json: bool, zero_force: bool) -> None:
     from bodyschema.cli.hardware.joints_watch import JointsWatch, as_json, screen
     from bodyschema.daemon.config import Config
-    from bodyschema.daemon.sampler.powered import find_powered
+    from bodyschema.daemon.sampler.sources import find_powered
     from bodyschema.daemon.wiring.wiring import open_joints
     from bodyschema.interfaces.servos import ServoJoints
 
@@ -136,8 +136,8 @@ def _cameras(robot: Path, out: Path | None, port: int, every: float, count: int 
         while watching.step(READ_S):
             if time.monotonic() >= tell_at:
                 tell_at = time.monotonic() + LINE_EVERY_S
-                say(watching.said, *watched.eyes.health)
-    say(watching.said, *watched.eyes.health)
+                say(watched.camera.said, *watched.eyes.health)
+    say(watched.camera.said, *watched.eyes.health)
 
 
 def _marker(robot: Path, seconds: float | None) -> None:

@@ -16,7 +16,7 @@ from cyclopts.validators import Number
 from bodyschema.cli.commands.options import HERE, RobotFile, flag, say
 from bodyschema.daemon.service.signals import with_parent
 from bodyschema.interfaces.extras import require_extra
-from bodyschema.interfaces.interpreter import module_command
+from bodyschema.interfaces.interpreter import end, module_command
 from bodyschema.interfaces.waits import END_LIMIT_S
 
 log = logging.getLogger(__name__)
@@ -35,12 +35,7 @@ def shown(robot_file: Path, port: int = PORT) -> Iterator[subprocess.Popen[bytes
     try:
         yield process
     finally:
-        process.terminate()
-        try:
-            code = process.wait(END_LIMIT_S)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            code = process.wait()
+        code = end(process, END_LIMIT_S)
         if code > 0:
             log.warning("the page had ended with exit code %d; its message is above", code)
 

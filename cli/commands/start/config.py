@@ -11,7 +11,6 @@ from bodyschema.cli.commands.options import HERE, RobotFile, flag, say
 
 if TYPE_CHECKING:
     from bodyschema.daemon.config import Config
-    from bodyschema.effects import Effect
     from bodyschema.robot.description import RobotDescription
 
 SCHEMA = 1  # of --json: robot.toml's tables, and this number
@@ -36,24 +35,17 @@ def config(
 
     loaded = Config.load(robot)
     if as_json:
-        sys.stdout.write(_settings(loaded) + "\n")
+        import msgspec
+
+        tables = {"schema": SCHEMA, **msgspec.to_builtins(loaded.tables)}
+        tables |= {"robot": msgspec.to_builtins(loaded.robot.robot), "camera": msgspec.to_builtins(loaded.robot.camera)}
+        sys.stdout.write(msgspec.json.format(msgspec.json.encode(tables)).decode() + "\n")
         return
     loaded.require_learnable()
     _say_understood(loaded)
 
 
-def _settings(config: Config) -> str:
-    """Return all settings as they are in force, as JSON."""
-    import msgspec
-
-    tables = {"schema": SCHEMA, **msgspec.to_builtins(config.tables)}
-    tables["robot"] = msgspec.to_builtins(config.robot.robot)
-    tables["camera"] = msgspec.to_builtins(config.robot.camera)
-    return msgspec.json.format(msgspec.json.encode(tables)).decode()
-
-
 def _say_understood(checked: Config) -> None:
-    """Print how the description is understood."""
     from bodyschema.cli.recordings.synthesis import without_consequence
     from bodyschema.daemon.wiring.wiring import marker_source_lines
     from bodyschema.robot.urdf import REVOLUTE
@@ -85,21 +77,16 @@ def _say_understood(checked: Config) -> None:
         stereo = "described" if seen else "not described: no images can be used, recordings can"
         say(f"  {'stereo' if seen is None or seen.is_stereo else 'one camera, its'} calibration {stereo}")
     for effect in checked.simulation.effects:
-        say(f"  effect {_effect_line(effect)}")
+        place = "" if effect.where is None else f" at {effect.where}"
+        source = "" if effect.source is None else f", from {effect.source}"
+        numbers = (f"{p.name} = {value:.4g}" for p, value in zip(effect.parameters, effect.values, strict=True))
+        say(f"  effect {effect.name}{place}{source}: {', '.join(numbers)}")
     for sentence in without_consequence(checked.simulation):
         say(f"  {sentence}")
     if checked.tables.unexplained is not None:
         say(f"  what is unexplained is learnt over {', '.join(checked.tables.unexplained['joints'])}")
     say(f"  sampler on {zenoh.sampler}, learner on {zenoh.learner}")
     say(f"  state in {checked.state_dir}")
-
-
-def _effect_line(effect: Effect) -> str:
-    """Return an effect as one line: name, place, numbers."""
-    place = "" if effect.where is None else f" at {effect.where}"
-    source = "" if effect.source is None else f", from {effect.source}"
-    numbers = (f"{p.name} = {value:.4g}" for p, value in zip(effect.parameters, effect.values, strict=True))
-    return f"{effect.name}{place}{source}: {', '.join(numbers)}"
 
 
 def _numbers(values: Iterable[float]) -> str:

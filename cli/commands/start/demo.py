@@ -63,10 +63,10 @@ def demo(
     from bodyschema.cli.demo.play import play, plot_curve, write_curve
     from bodyschema.cli.demo.scene import prepare
     from bodyschema.cli.demo.view import show_outcome, shown_on
-    from bodyschema.daemon.wiring.wiring import require_simulation
+    from bodyschema.interfaces.extras import require_extra
     from bodyschema.recordings import files as recordings
 
-    require_simulation()
+    require_extra("sim", "the simulation")
     console = Console(highlight=False)
     marker = marker or ("tag" if camera == "mono" else "ball")
     scene = prepare(out, seed, bus=bus, marker=marker, camera=camera)

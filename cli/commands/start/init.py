@@ -73,9 +73,15 @@ def init(
     Next: correct what is marked CHECK, then `bodyschema config`. With servos: `bodyschema watch joints`. With --sim
     nothing is left to correct: `bodyschema run --sim`.
     """
-    _require_one_way(sim=sim, lerobot=lerobot, source=source, urdf=urdf)
+    ways = [name for name, given in (("--sim", sim), ("--lerobot", lerobot), ("--from", source)) if given]
+    if len(ways) > 1:
+        raise ConfigError(f"{' and '.join(ways)} exclude each other", remedy="Give one of them")
+    if source is not None and urdf is None:
+        raise ConfigError("--from needs the robot's URDF", remedy="Give it with --urdf")
     if os.path.lexists(robot):
         raise ConfigError("is there already", file=robot, remedy="Give another --robot, or move it away")
+    from bodyschema.cli.hardware.robot_template import EXAMPLE, guess_from, robot_toml
+
     seen = _seen(webcam, tag_mm, ball_mm, chessboard, plugged_in=bool(lerobot or source))
     with writing(robot, remedy="Give another --robot"):
         if sim:
@@ -83,23 +89,13 @@ def init(
         elif lerobot is not None:
             write_new(robot, _of_lerobot(lerobot, urdf, robot, calibration, port, seen))
         elif source is not None and urdf is not None:
-            guess = _guess(urdf, robot, marker_link, camera_link)
+            guess = guess_from(urdf, robot, marker_link, camera_link)
             _with_servos(guess, robot, _candidates(source, port, baud), seen, yes=yes)
         else:
-            from bodyschema.cli.hardware.robot_template import EXAMPLE, robot_toml
-
-            guess = EXAMPLE if urdf is None else _guess(urdf, robot, marker_link, camera_link)
+            guess = EXAMPLE if urdf is None else guess_from(urdf, robot, marker_link, camera_link)
             write_new(robot, robot_toml(guess, seen))
     following = "run --sim" if sim else "watch joints" if lerobot or source else "config"
     say(f"{robot} written. Next: `bodyschema {following} --robot {robot}`")
-
-
-def _require_one_way(*, sim: bool, lerobot: str | None, source: str | None, urdf: Path | None) -> None:
-    ways = [name for name, given in (("--sim", sim), ("--lerobot", lerobot), ("--from", source)) if given]
-    if len(ways) > 1:
-        raise ConfigError(f"{' and '.join(ways)} exclude each other", remedy="Give one of them")
-    if source is not None and urdf is None:
-        raise ConfigError("--from needs the robot's URDF", remedy="Give it with --urdf")
 
 
 def _seen(
@@ -125,12 +121,6 @@ def _seen(
             raise ConfigError(f"--webcam any: {what}", remedy="Give the name of one, from /dev/v4l/by-id")
         webcam = cameras[0]
     return Seen(cameras, webcam, tag_mm, ball_mm, chessboard)
-
-
-def _guess(urdf: Path, robot: Path, marker_link: str | None, camera_link: str | None) -> Guess:
-    from bodyschema.cli.hardware.robot_template import guess_from
-
-    return guess_from(urdf, robot, marker_link=marker_link, camera_link=camera_link)
 
 
 def _with_servos(guess: Guess, robot: Path, candidates: Sequence[Candidate], seen: Seen, *, yes: bool) -> None:

@@ -9,10 +9,8 @@ from collections.abc import Sequence
 from dataclasses import replace
 from random import Random
 
-from bodyschema.drivers.bench import faults
-from bodyschema.drivers.bench.asked_faults import ON_THE_WIRE, FaultKinds
 from bodyschema.drivers.bench.device import Angle, Faults, Reply
-from bodyschema.drivers.bench.faults import Storm
+from bodyschema.drivers.bench.faults import ON_THE_WIRE, FaultKinds
 from bodyschema.drivers.bench.servo_arm import AT_THE_START, ServoArm
 from bodyschema.drivers.dynamixel.bench.chain import Chain
 from bodyschema.drivers.dynamixel.bench.frames import HEADER2
@@ -82,11 +80,6 @@ def swapped(reply: Reply, rng: Random) -> Reply:
         data[2] = other
         data[-1] = ~sum(data[2:-1]) & 0xFF
     return replace(reply, data=bytes(data))
-
-
-def storm(intensity: float, rng: Random, longest_late_s: float = 0.05) -> Storm:
-    """Mix all faults in equal shares; `intensity` is the probability that an answer is affected."""
-    return faults.storm(intensity, rng, swapped, longest_late_s=longest_late_s)
 
 
 # Bits of Hardware Error Status.

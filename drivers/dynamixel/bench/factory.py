@@ -61,39 +61,14 @@ class Factory2:
 
 
 _P = {"threshold": 20, "voltages": (150, 350), "pwm": 2009, "ports": 4, "supply": 240}
+_FIVE_VOLTS = {"temperature": 70, "voltages": (35, 70), "slope": 140, "supply": 50}
 # The first entry that a model's name starts with applies.
 FACTORY2 = {
     "XM430-W210": Factory2(velocity=330),
     "XM540": Factory2(current=2047, velocity=128, ports=3),
-    "XL330-M077": Factory2(
-        temperature=70,
-        voltages=(35, 70),
-        current=1750,
-        velocity=1620,
-        slope=140,
-        shutdown=53,
-        gains=(400, 40, 0, 400, 400),
-        supply=50,
-    ),
-    "XL330": Factory2(
-        temperature=70,
-        voltages=(35, 70),
-        current=1750,
-        velocity=445,
-        slope=140,
-        shutdown=53,
-        gains=(1600, 180, 0, 0, 400),
-        supply=50,
-    ),
-    "XC330-M": Factory2(
-        temperature=70,
-        voltages=(35, 70),
-        current=2352,
-        velocity=350,
-        slope=140,
-        gains=(1600, 50, 500, 0, 1100),
-        supply=50,
-    ),
+    "XL330-M077": Factory2(**_FIVE_VOLTS, current=1750, velocity=1620, shutdown=53, gains=(400, 40, 0, 400, 400)),
+    "XL330": Factory2(**_FIVE_VOLTS, current=1750, velocity=445, shutdown=53, gains=(1600, 180, 0, 0, 400)),
+    "XC330-M": Factory2(**_FIVE_VOLTS, current=2352, velocity=350, gains=(1600, 50, 500, 0, 1100)),
     "XC330-T": Factory2(
         temperature=70, voltages=(55, 140), current=910, velocity=320, slope=255, gains=(1200, 40, 0, 0, 900)
     ),

@@ -21,24 +21,9 @@ REVERSE = 0x01  # Drive Mode
 VELOCITY_STEP_S = 0.01
 TICKS_PER_REPLY_DELAY_US = 2
 
-FACTORY2 = {
-    "firmware": 46,
-    "id": 1,
-    "baud": 1,
-    "return_delay": 250,
-    "operating_mode": POSITION_MODE,
-    "status_return": 2,
-    "temperature": 31,
-}
-FACTORY1 = {
-    "firmware": 24,
-    "id": 1,
-    "baud": 1,
-    "return_delay": 250,
-    "status_return": 2,
-    "shutdown": 36,
-    "temperature": 31,
-}
+_COMMON = {"id": 1, "baud": 1, "return_delay": 250, "status_return": 2, "temperature": 31}
+FACTORY2 = _COMMON | {"firmware": 46, "operating_mode": POSITION_MODE}
+FACTORY1 = _COMMON | {"firmware": 24, "shutdown": 36}
 READ_ONLY = (
     "model",
     "firmware",

@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 from enum import IntEnum
 from random import Random
 
-from bodyschema.drivers.bench import faults
-from bodyschema.drivers.bench.asked_faults import ON_THE_WIRE, FaultKinds
 from bodyschema.drivers.bench.chain import ServoChain, mixed
 from bodyschema.drivers.bench.device import Angle, Faults, Reply, Sampling
+from bodyschema.drivers.bench.faults import ON_THE_WIRE, FaultKinds
 from bodyschema.drivers.bench.servo_arm import AT_THE_START, ServoArm
 from bodyschema.drivers.feetech.bench.servo import Servo
 from bodyschema.drivers.feetech.config import FeetechConfig, ServoConfig
@@ -24,11 +23,6 @@ def swapped(reply: Reply, rng: Random) -> Reply:
     data[2] = (reply.id + rng.choice((-1, 1))) % 253
     data[-1] = ~sum(data[2:-1]) & 0xFF
     return replace(reply, data=bytes(data))
-
-
-def storm(intensity: float, rng: Random, longest_late_s: float = 0.05) -> faults.Storm:
-    """Mix all faults in equal shares; `intensity` is the probability that an answer is affected."""
-    return faults.storm(intensity, rng, swapped, longest_late_s=longest_late_s)
 
 
 BROADCAST = 0xFE

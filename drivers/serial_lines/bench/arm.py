@@ -10,9 +10,9 @@ from typing import ClassVar
 
 import msgspec
 
-from bodyschema.drivers.bench.asked_faults import ON_THE_WIRE, AskedFault, FaultKinds, WireFaults
 from bodyschema.drivers.bench.device import Angle
 from bodyschema.drivers.bench.dry_run import GLITCH_TICKS, BenchArm
+from bodyschema.drivers.bench.faults import ON_THE_WIRE, AskedFault, FaultKinds, WireFaults
 from bodyschema.drivers.serial_lines.config import EncoderConfig, SerialLinesConfig
 
 from .board import EncoderBoard
