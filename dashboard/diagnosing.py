@@ -14,8 +14,8 @@ from typing import Self
 
 import msgspec
 
+from bodyschema.cli.recordings.diagnosis import DIAGNOSIS, REPORT
 from bodyschema.cli.recordings.recorder import History
-from bodyschema.cli.terminal.diagnosis_run import DIAGNOSIS, REPORT
 from bodyschema.daemon.service.signals import with_parent
 from bodyschema.diagnosis.report.result import DiagnosisFile
 from bodyschema.interfaces.errors import BodyschemaError, RecordingError, RequestError

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from bodyschema.cli.terminal.diagnosis_run import (
+from bodyschema.cli.recordings.diagnosis import (
     Asked,
     ReportedDiagnosis,
     Source,

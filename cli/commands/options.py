@@ -15,7 +15,7 @@ from rich.console import Console
 
 if TYPE_CHECKING:
     from bodyschema.cli.cameras.calibration import Board, Images
-    from bodyschema.cli.terminal.diagnosis_run import Asked
+    from bodyschema.cli.recordings.diagnosis import Asked
     from bodyschema.daemon.config import Config
 
 
@@ -80,7 +80,7 @@ class SearchOptions:
 
     def asked(self) -> Asked:
         """Return the effects to look for; RequestError for an unknown one."""
-        from bodyschema.cli.terminal.diagnosis_run import Asked
+        from bodyschema.cli.recordings.diagnosis import Asked
 
         return Asked.of(self.effects, self.exclude, self.seed)
 

@@ -1,1 +1,1 @@
-"""Get recordings: from the running robot, from other programs, from the simulation."""
+"""Get recordings from the running robot, from other programs and from the simulation, and diagnose them."""

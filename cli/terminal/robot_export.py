@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
-from bodyschema.cli.terminal.diagnosis_run import DIAGNOSIS
+from bodyschema.cli.recordings.diagnosis import DIAGNOSIS
 from bodyschema.daemon.config import Config
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.observations import Observations

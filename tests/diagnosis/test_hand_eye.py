@@ -9,7 +9,7 @@ from typing import cast
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bodyschema.cli.terminal.diagnosis_run import ReportedDiagnosis, Source
+from bodyschema.cli.recordings.diagnosis import ReportedDiagnosis, Source
 from bodyschema.diagnosis.assess.stored import predicted_pose_covariance
 from bodyschema.diagnosis.diagnosis import Diagnosis
 from bodyschema.diagnosis.fit.background import Scales

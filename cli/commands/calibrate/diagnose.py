@@ -1,4 +1,4 @@
-"""`bodyschema diagnose`: its options; `cli/terminal/diagnosis_run.py` does the work."""
+"""`bodyschema diagnose`: its options; `cli/recordings/diagnosis.py` does the work."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from bodyschema.cli.commands.options import (
 from bodyschema.interfaces.errors import RequestError
 
 if TYPE_CHECKING:
-    from bodyschema.cli.terminal.diagnosis_run import ReportedDiagnosis
+    from bodyschema.cli.recordings.diagnosis import ReportedDiagnosis
 
 
 def diagnose(
@@ -64,8 +64,8 @@ def diagnose(
     Next: open OUT/report.html; give OUT/extended.toml to any command as --robot, and
     `bodyschema export` turns it into models for MuJoCo, controllers and drivers.
     """
+    from bodyschema.cli.recordings.diagnosis import measured, results_in, run, written
     from bodyschema.cli.recordings.foreign import opened
-    from bodyschema.cli.terminal.diagnosis_run import measured, results_in, run, written
     from bodyschema.daemon.config import Config
 
     if servos.write and servos.lerobot is None:

@@ -18,7 +18,7 @@ from bodyschema.interfaces.errors import BusError, RequestError
 from bodyschema.interfaces.waits import STATUS_EVERY_S
 
 if TYPE_CHECKING:
-    from bodyschema.cli.terminal.diagnosis_run import Asked
+    from bodyschema.cli.recordings.diagnosis import Asked
     from bodyschema.fleet.recordings import Job
     from bodyschema.fleet.roster import Place
 
