@@ -64,8 +64,8 @@ class LeftOut(msgspec.Struct, frozen=True):
     second: int
     first_row: int | None  # number of the first such row of the first recording; None if there is none
     second_row: int | None  # the same for the second
-    # joint, by: for a first such row, the joint that differs most from the row of the same number in the other
-    # recording, and the difference [rad, m]
+    # joint, by: the joint that differs most between the first unmatched row and the row of the same number in the
+    # other recording, and by how much [rad, m]
     joint: str | None
     by: float | None
 

@@ -1,7 +1,7 @@
 """Diagnosis of many recordings on Dask: on this machine's cores, or on the workers of a scheduler.
 
-The recording and the robot's description are read here and sent to the worker. It needs this package, but none of our
-files.
+This process reads the recording and the robot's description and sends both to a worker. A worker needs bodyschema
+installed, but no access to these files.
 """
 
 from __future__ import annotations

@@ -37,11 +37,11 @@ class LearnerEvidence:
     wide: ChainBelief  # the same without the selection of narrower tolerances
     tolerances: ChainTolerances  # those of the first prior
     claim: PredictiveUncertainty  # uncertainty of the answering model
-    solved: bool  # True if that model is a solution, whose error the belief describes
+    solved: bool  # True if that model was solved together with `belief`
     pairs: int  # number of learnt pairs with the current tool
-    region: FloatArray  # poses (m, d) [rad, m] that represent the data's region
+    region: FloatArray  # poses (k, d) [rad, m] that represent the data's region
     seen: FloatArray  # poses (n, d) [rad, m] of some of them, evenly spread
-    # q, x: the newest that the solver knows, (m, d) [rad, m] and (m, 3) [m]
+    # q, x: the newest pairs that the solver knows, (m, d) [rad, m] and (m, 3) [m]
     q: FloatArray
     x: FloatArray
 

@@ -29,11 +29,11 @@ MARKER_LINK = "calibrated_marker"
 ROBOT_FILE = "robot.toml"
 # What an extended.toml adds to robot.toml: `bodyschema.effects.files` reads and writes it.
 EXTENSIONS = ("effects", "background", "unexplained")
-# What is next to nothing for a simulator, which would else give a link without a mass one of its own.
+# A negligible mass: simulators give a link without any mass a default one of their own.
 _NO_MASS = (
     '<inertial><mass value="1e-6"/><inertia ixx="1e-9" ixy="0" ixz="0" iyy="1e-9" iyz="0" izz="1e-9"/></inertial>'
 )
-# Store and checkpoint of the nominal robot are not this one's: what they hold is what it was learnt from.
+# A state directory of its own: the calibrated robot must not go on from the nominal robot's store and checkpoint.
 STATE_DIR = "state"
 
 
