@@ -14,7 +14,6 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.solvers.tolerance_selection import WORKMANSHIP
 from bodyschema.recordings.recording import Recording
 from bodyschema.robot.calibrated_files import CAMERA_LINK
-from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.hand_eye import HandEye
 from kbmaps import ChainBelief, ChainParameters, RigidLearner
 
@@ -70,7 +69,9 @@ def _splits(learner: RigidLearner, recording: Recording) -> tuple[FloatArray, Fl
     parameters = ChainParameters(learner.nominal)
     x, jacobian = parameters.linearised(learner.change, recording.q)
     residuals, tools = recording.x - x, jacobian[:, :, parameters.tool]
-    roots = _weights(residuals)[:, None]
+    squares = np.square(residuals).sum(axis=1)
+    far = _Settings.far**2 * max(float(np.median(squares)), np.finfo(float).tiny)
+    roots = np.sqrt(far / (far + squares))[:, None]
     prior = ChainBelief.from_tolerances(parameters, learner.tolerances)
     noise = np.sqrt(np.square(roots * residuals).mean())
     free = (roots[:, :, None] * jacobian).reshape(-1, parameters.size) @ prior.root / noise
@@ -86,13 +87,6 @@ def _splits(learner: RigidLearner, recording: Recording) -> tuple[FloatArray, Fl
         np.float64
     )
     return np.einsum("nj,nj->n", shifts, product) / np.square(target).sum(), shifts
-
-
-def _weights(residuals: FloatArray) -> FloatArray:
-    """Return square roots of the weights (n,) of residuals (n, 3)."""
-    squares = np.square(residuals).sum(axis=1)
-    far = _Settings.far**2 * max(float(np.median(squares)), np.finfo(float).tiny)
-    return np.sqrt(far / (far + squares))
 
 
 def _after(values: FloatArray) -> FloatArray:
@@ -217,6 +211,8 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
             Figure(*(float(unit * number) for number in numbers))
             for unit, *numbers in zip(_UNITS, named.drawn[:9], values[:9], halves[:9], strict=True)
         ]
+        least = np.where(robot.chain.prismatic, STILL_M, STILL_RAD)
+        moved = np.ptp(recording.q, axis=0)
         return cls(
             robot=robot.name,
             source=source,
@@ -239,7 +235,7 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
             # Everett and Hsu 1988: four for each joint that turns, two for each that slides, six for the ends of the
             # chain, less the three turns of the marker that its place does not show.
             showable=4 * int((~slides).sum()) + 2 * int(slides.sum()) + 3,
-            still=_still(robot, recording),
+            still=[name for name, still in zip(robot.joints, moved < least, strict=True) if still],
             first=first,
             other_tool_from=None if jump is None else first + jump.row - 1,
             other_tool_mm=None if jump is None else 1e3 * jump.distance_m,
@@ -339,12 +335,6 @@ def _badly_made(calibration: Calibration) -> list[str]:
         "considered. "
         "The URDF or the recording is of another arm."
     ]
-
-
-def _still(robot: RobotDescription, recording: Recording) -> list[str]:
-    least = np.where(robot.chain.prismatic, STILL_M, STILL_RAD)
-    moved = np.ptp(recording.q, axis=0)
-    return [name for name, still in zip(robot.joints, moved < least, strict=True) if still]
 
 
 def _mean_error(predicted: FloatArray, recording: Recording) -> float:

@@ -62,11 +62,6 @@ class AngleMemory(msgspec.Struct):
         self.ratio = DISCOUNT * self.ratio + angle**2 / max(claimed, 1e-18)
 
     @property
-    def mean_rad(self) -> float:
-        """Mean angle between prediction and measurement [rad]."""
-        return self.angle / max(self.weight, 1.0)
-
-    @property
     def surprise(self) -> float:
         """Ratio of the errors to the predicted ones, at least 1."""
         few = max(WARM - self.weight, 0.0)
@@ -147,7 +142,7 @@ class Orientations:
 
     def prequential_rad(self) -> dict[str, float]:
         """Return the recent mean angle between prediction and measurement, before learning [rad], by model."""
-        return {name: memory.mean_rad for name, memory in self.errors.items() if memory.weight}
+        return {name: memory.angle / max(memory.weight, 1.0) for name, memory in self.errors.items() if memory.weight}
 
     def learn(self, q: FloatArray, turn: FloatArray, cov: FloatArray | None, support: SupportSet | None) -> None:
         """Learn one pair: its orientation is predicted before it is learnt.

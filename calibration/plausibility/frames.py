@@ -54,7 +54,10 @@ def reordered_quaternions(
     chain: RigidChain, q: FloatArray, orientation: FloatArray, fit: ReadingFit
 ) -> Plausibility | None:
     """Return a refusal if the quaternions fit far better in another order, or inverted; else None."""
-    errors = _errors_rad(chain, q, fit.rotation, orientation)
+    plain, first, conjugate = orientation, np.roll(orientation, -1, axis=1), np.array([-1.0, -1.0, -1.0, 1.0])
+    readings = zip((_AS_IT_IS, *_REMEDIES), (plain, first, plain * conjugate, first * conjugate), strict=True)
+    hand = fit.rotation @ chain.orientation(q)
+    errors = {name: _scatter(hand.swapaxes(1, 2) @ rotation_matrices("orientation", read)) for name, read in readings}
     before, best = errors.pop(_AS_IT_IS), min(errors, key=errors.__getitem__)
     after = errors[best]
     better = before / max(after, THRESHOLDS.oriented_rad)
@@ -67,14 +70,6 @@ def reordered_quaternions(
         misread=True,
         better=better,
     )
-
-
-def _errors_rad(chain: RigidChain, q: FloatArray, rotation: FloatArray, turns: FloatArray) -> dict[str, float]:
-    """Return the median angle [rad] between the arm's hand and quaternions (n, 4), for each way to read them."""
-    plain, first, conjugate = turns, np.roll(turns, -1, axis=1), np.array([-1.0, -1.0, -1.0, 1.0])
-    readings = zip((_AS_IT_IS, *_REMEDIES), (plain, first, plain * conjugate, first * conjugate), strict=True)
-    hand = rotation @ chain.orientation(q)
-    return {name: _scatter(hand.swapaxes(1, 2) @ rotation_matrices("orientation", read)) for name, read in readings}
 
 
 def _scatter(turns: FloatArray) -> float:

@@ -266,7 +266,9 @@ def whole_range(fit: Fit, joint: int) -> tuple[float, float]:
 def apart_on(one: Fit, other: Fit | Nameless, motion: Motion) -> float:
     """Return the Δχ² by which two fits differ on a motion as long as theirs, the other refitted to it."""
     there = other.simulation.positions(motion) if isinstance(other, Fit) else other.positions(motion)
-    left = _beside(one.simulation.positions(motion) - there, _columns(other, motion))
+    apart = one.simulation.positions(motion) - there
+    flat = _columns(other, motion).reshape(apart.size, -1)
+    left = apart - (flat @ solved(flat.T @ flat, flat.T @ apart.ravel())).reshape(apart.shape)
     scale = float(np.median(np.linalg.det(one.observations.whitening))) ** (1.0 / 3.0)
     share = len(one.observations) / len(motion)
     return float(np.square(left * scale).sum() / one.noise.sigma**2 * share)
@@ -277,9 +279,3 @@ def _columns(fit: Fit | Nameless, motion: Motion) -> FloatArray:
     if isinstance(fit, Nameless):
         return fit.columns(motion)
     return amount_columns(fit.simulation.run(motion), fit.simulation.effects)
-
-
-def _beside(apart: FloatArray, columns: FloatArray) -> FloatArray:
-    """Return the part of `apart` (n, 3) that columns (n, 3, p) cannot follow."""
-    flat = columns.reshape(apart.size, -1)
-    return apart - (flat @ solved(flat.T @ flat, flat.T @ apart.ravel())).reshape(apart.shape)

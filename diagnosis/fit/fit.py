@@ -110,7 +110,10 @@ class Fit:
         """Prior cost of large effects and tolerances [nats]."""
         beyond = 0.5 * float(self.background.precision @ np.square(self.tolerated))
         beyond += self.background.volume(self.noise.sigma)
-        return _cost(self.simulation.effects[self.nuisances :]) + beyond
+        for effect in self.simulation.effects[self.nuisances :]:
+            for k in effect.amounts:
+                beyond += float(0.5 * (effect.values[k] / (LARGEST * effect.parameters[k].usual)) ** 2)
+        return beyond
 
     @cached_property
     def predicted(self) -> FloatArray:
@@ -609,14 +612,6 @@ def prior_precision(simulation: Simulation, nuisances: int) -> FloatArray:
         usual = np.array([effect.parameters[j].usual for j in effect.amounts])
         parts.append(1.0 / np.square((LARGEST if k >= nuisances else 1e4) * usual))
     return np.concatenate(parts) if parts else np.empty(0)
-
-
-def _cost(causes: Sequence[Effect]) -> float:
-    total = 0.0
-    for effect in causes:
-        for k in effect.amounts:
-            total += 0.5 * (effect.values[k] / (LARGEST * effect.parameters[k].usual)) ** 2
-    return float(total)
 
 
 def amount_columns(run: Simulated, effects: Sequence[Effect]) -> FloatArray:

@@ -51,7 +51,11 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
     # A tracker or a scanner has no intrinsics in robot.toml.
     seen_by = "instrument" if diagnosis.aligned.simulation.robot.calibration is None else "camera"
     causes = _causes(diagnosis, seen_by)
-    rms = _rms_mm(diagnosis)
+    kept = diagnosis.markers
+    figures = {name: 1e3 * float(np.sqrt(np.square(d[kept]).mean())) for name, d in diagnosis.held_out.items()}
+    traces = np.trace(diagnosis.noise[kept], axis1=1, axis2=2)
+    # Residuals of held-out rows contain all of the noise.
+    rms = Errors(**figures, noise_floor=min(1e3 * float(np.sqrt(traces.mean())), figures["extended"]))
     tolerances = _tolerances(diagnosis)
     verdict = _verdict(diagnosis, causes, percent, tolerances)
     counted = diagnosis.gain_with_outliers() if diagnosis.outliers else (None, None)
@@ -107,14 +111,6 @@ def _verdict(diagnosis: Diagnosis, causes: tuple[Cause, ...], gain_percent: floa
         return "undecided" if tolerances.leaves_open else "nothing_found"
     is_open = any(cause.leaves_open for cause in causes) or tolerances.leaves_open or gain_percent <= 0.0
     return "undecided" if is_open else "explained"
-
-
-def _rms_mm(diagnosis: Diagnosis) -> Errors:
-    kept = diagnosis.markers
-    figures = {name: 1e3 * float(np.sqrt(np.square(d[kept]).mean())) for name, d in diagnosis.held_out.items()}
-    traces = np.trace(diagnosis.noise[kept], axis1=1, axis2=2)
-    # Residuals of held-out rows contain all of the noise.
-    return Errors(**figures, noise_floor=min(1e3 * float(np.sqrt(traces.mean())), figures["extended"]))
 
 
 def _named_mm(diagnosis: Diagnosis) -> float | None:

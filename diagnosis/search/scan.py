@@ -318,7 +318,9 @@ class Scan:
             gains = np.append(gains, closer)[first]
         clock = self._fit.observations.motion.clock
         values = np.append(amounts, 0.5 * (clock[row - 1] + clock[row]))
-        interval = _interval(0.5 * (clock[tried - 1] + clock[tried]), gains)
+        shapes = 0.5 * (clock[tried - 1] + clock[tried])
+        near = np.flatnonzero(gains > gains.max() - float(chdtri(1, 0.05)))
+        interval = float(shapes[near[0]]), float(shapes[near[-1]])
         return Candidate(effect.with_values(values), float(gains.max()), dof, n - 2 * _Settings.beside, interval)
 
     def _linear(self, effect: Effect) -> System:
@@ -407,12 +409,6 @@ def _eigenvalues(matrices: FloatArray) -> FloatArray:
     """Return the eigenvalues (m, k) of symmetric matrices (m, k, k), in increasing order."""
     values = matrices[:, 0] if matrices.shape[1] == 1 else np.linalg.eigvalsh(matrices)
     return np.asarray(values, dtype=np.float64)
-
-
-def _interval(shapes: FloatArray, gains: FloatArray) -> tuple[float, float]:
-    """Return the first and the last of the shapes (m,) within the 95 % drop of the best gain."""
-    near = np.flatnonzero(gains > gains.max() - float(chdtri(1, 0.05)))
-    return float(shapes[near[0]]), float(shapes[near[-1]])
 
 
 def _with_amounts(effect: Effect, amounts: FloatArray) -> Effect:

@@ -259,7 +259,9 @@ class Search:
         """Return the multiplicity penalty for the number of places searched, beside other causes [nats]."""
         self._trials[candidate.effect.key] = candidate.trials
         others = list(beside)
-        first = self.multiplicity - float(np.log(1 + _names(others)))
+        zeros = [cause for cause in others if cause.kind.is_zero]
+        # All joint offsets together have one name.
+        first = self.multiplicity - float(np.log(1 + len(others) - max(len(zeros) - 1, 0)))
         is_another = candidate.effect.kind.is_zero and any(one.kind.is_zero for one in others)
         return (min(first, ANOTHER) if is_another else first) + float(np.log(candidate.trials))
 
@@ -441,12 +443,6 @@ def are_a_description(causes: Sequence[Effect]) -> bool:
 def simplicity(effect: Effect) -> int:
     """Return a complexity score; of equally probable causes the one with the lowest is named."""
     return len(effect.amounts) + len(effect.shapes) + (_Settings.of_a_link if effect.kind.in_parts else 0)
-
-
-def _names(causes: Sequence[Effect]) -> int:
-    """Return the number of names among causes; all joint offsets together have one."""
-    zeros = [cause for cause in causes if cause.kind.is_zero]
-    return len(causes) - max(len(zeros) - 1, 0)
 
 
 def describe(effect: Effect) -> str:

@@ -212,7 +212,7 @@ class Sets:
                 return seen[frozenset(here.chosen)]
             seen[frozenset(here.chosen)] = here
             better = self._without_one(here)
-            if better is None and self._count(here) < _MOST_TOGETHER:
+            if better is None and len({self.effects[k].identity for k in here.chosen}) < _MOST_TOGETHER:
                 better = self._with_one_more(here) or self._exchanged(here) or self._with_smaller_tolerances(here)
             if better is None:
                 return here
@@ -269,10 +269,6 @@ class Sets:
                 one = self.of((*here.chosen, *group), near)
                 best[key] = max(best.get(key, one), one, key=lambda tried: tried.worth)
         yield from ((self.effects[self._keys.index(key)], one) for key, one in best.items())
-
-    def _count(self, here: Together) -> int:
-        """Return the number of causes of a set."""
-        return len({self.effects[k].identity for k in here.chosen})
 
     def _losses(self, here: Together, groups: Sequence[tuple[int, ...]]) -> FloatArray:
         """Return the worth of each of some groups of numbers with scales and noise held fixed [nats]."""

@@ -158,7 +158,7 @@ class _Place:
     def __init__(self, fit: Fit, hypotheses: Sequence[Effect], others: Sequence[_Place]) -> None:
         self.fit = fit
         self._doubt = float(np.log(max(len(hypotheses), 1)))
-        self._sets = _sets_about(fit, hypotheses, self._doubt)
+        self._sets = _sets_of(fit, [_at_rest(one) for one in _beside_links(fit, _absent(fit, hypotheses))], self._doubt)
         own = self._sets.again(fit.causes)
         self.here = self._sets.of(own)
         if self.here.worth > max((place.here.worth for place in others), default=-np.inf) + COMES_NEAR:
@@ -231,15 +231,6 @@ def _own(fit: Fit, doubt: float) -> Together:
     parts = [part for cause in fit.causes for part in _in_parts(Candidate(cause, 0.0, 1))]
     sets = Sets(fit, parts, doubt)
     return sets.of(sets.again(fit.causes))
-
-
-def _sets_about(fit: Fit, hypotheses: Sequence[Effect], doubt: float) -> Sets:
-    """Return the sets of a fit's causes and of the hypotheses that are none.
-
-    Args:
-        doubt: minimum cost of naming one of them [nats].
-    """
-    return _sets_of(fit, [_at_rest(one) for one in _beside_links(fit, _absent(fit, hypotheses))], doubt)
 
 
 def _sets_of(fit: Fit, candidates: Sequence[Candidate], doubt: float) -> Sets:

@@ -118,21 +118,16 @@ def _blamed_on(element: Any, urdf: Path) -> Iterator[None]:
         raise RobotError(what, file=urdf, line=element.sourceline, remedy="Give numbers") from None
 
 
-def _origin(element: Any) -> FloatArray:
-    """Return the pose (4, 4) of an element's <origin>."""
-    origin, T = element.find("origin"), np.eye(4)
-    if origin is not None:
-        T[:3, :3] = rotation_of(_floats(origin.get("rpy", "0 0 0")))
-        T[:3, 3] = _floats(origin.get("xyz", "0 0 0"))
-    return T
-
-
 def _inertia(inertial: Any) -> FloatArray:
     """Return the inertia tensor (3, 3) along the link's axes, corrected to be physically possible."""
     element = inertial.find("inertia")
     xx, yy, zz, xy, xz, yz = (float(element.get(key, "0")) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
     moments, axes = np.linalg.eigh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    R = _origin(inertial)[:3, :3] @ axes
+    origin, T = inertial.find("origin"), np.eye(4)
+    if origin is not None:
+        T[:3, :3] = rotation_of(_floats(origin.get("rpy", "0 0 0")))
+        T[:3, 3] = _floats(origin.get("xyz", "0 0 0"))
+    R = T[:3, :3] @ axes
     return R @ np.diag(np.maximum(moments, LEAST_INERTIA)) @ R.T
 
 

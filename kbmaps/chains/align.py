@@ -165,7 +165,12 @@ def align(
         fit.shift = _start_shift(fit, sigma or 0.0, None if turns is None else numbers("turns", turns))
     if fit.fit_pose or fit.fit_marker:
         inliers = _fit_robustly(fit, sigma or 0.0)
-    return _alignment(chain, fit, inliers)
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = fit.rotation, fit.translation
+    square = np.square(fit.errors()).sum(axis=1)[inliers]
+    inliers.flags.writeable = False
+    fitted = chain.with_tool(fit.shift).transformed(transform)
+    return Alignment(fitted, frozen(transform), frozen(fit.shift), math.sqrt(float(square.mean())), inliers)
 
 
 def rigid_motion(points: FloatArray, targets: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -259,15 +264,6 @@ def _fit_robustly(fit: _Fit, sigma: float, tolerance: float = _Settings.step_tol
         if settled:
             break
     return inliers
-
-
-def _alignment(chain: RigidChain, fit: _Fit, inliers: BoolArray) -> Alignment:
-    transform = np.eye(4)
-    transform[:3, :3], transform[:3, 3] = fit.rotation, fit.translation
-    square = np.square(fit.errors()).sum(axis=1)[inliers]
-    inliers.flags.writeable = False
-    fitted = chain.with_tool(fit.shift).transformed(transform)
-    return Alignment(fitted, frozen(transform), frozen(fit.shift), math.sqrt(float(square.mean())), inliers)
 
 
 def _check_enough(pairs: int, pose_known: bool, marker_known: bool) -> None:

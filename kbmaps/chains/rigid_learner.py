@@ -313,11 +313,13 @@ class RigidLearner(Model):
             raise DegenerateDataError("there is nothing to report before the first pair was learnt")
         pairs, scatter = self.data, self._scatter(fit)
         widening = 1.0 if pairs.known else student(fit.freedom)
+        before, after = (np.sqrt(np.square(belief.root).sum(axis=1)) for belief in (self._prior, fit.belief))
+        lever = np.where(self._parameters.turning, self._parameters.reach, 1.0)
         return chain_report(
             self._parameters,
             fit.belief.mean,
             widening * self._deviations(fit, pairs),
-            self._hidden(fit, scatter.noise * scatter.misfit),
+            (after > _Settings.hardly_narrower * before) & (before * lever > (scatter.noise * scatter.misfit)),
             scatter=scatter,
             widening=widening,
             outliers=int((~fit.inliers).sum()),
@@ -329,12 +331,6 @@ class RigidLearner(Model):
         unit = math.sqrt(float(np.square(pairs.unit).mean()))
         noise, misfit = (unit, fit.noise) if pairs.known else (unit * fit.noise, 1.0)
         return Scatter(noise, misfit, fit.freedom)
-
-    def _hidden(self, fit: RigidFit, noise: float) -> BoolArray:
-        """Return True for each parameter (size,) that matters and was not determined; noise of a coordinate [m]."""
-        before, after = (np.sqrt(np.square(belief.root).sum(axis=1)) for belief in (self._prior, fit.belief))
-        lever = np.where(self._parameters.turning, self._parameters.reach, 1.0)
-        return (after > _Settings.hardly_narrower * before) & (before * lever > noise)
 
     def to_bytes(self) -> bytes:
         arrays = chain_arrays(self.nominal) | self.stored()

@@ -64,7 +64,8 @@ class WhiteNoise:
             return cls.as_claimed(joints)
         off = np.diff(errors, axis=0) * np.sqrt(0.5)
         alike = np.broadcast_to(np.eye(3), (len(errors), 1, 3, 3))
-        spread = np.concatenate([_outer(derivatives), covariances[:, None], alike], axis=1)
+        columns = derivatives.mT
+        spread = np.concatenate([(columns[..., :, None] * columns[..., None, :]), covariances[:, None], alike], axis=1)
         spread = 0.5 * (spread[1:] + spread[:-1])
         spread, units = in_typical_units(spread, off)
         shares, likelihood = most_probable_shares(spread, off)
@@ -82,12 +83,6 @@ class WhiteNoise:
     def covariances(self, covariances: FloatArray, derivatives: FloatArray) -> FloatArray:
         """Return covariances of pairs' errors (n, 3, 3) [m²]; arguments as in `of`."""
         return self.claimed * covariances + self.beside * np.eye(3) + self.of_readings(derivatives)
-
-
-def _outer(derivatives: FloatArray) -> FloatArray:
-    """Return the outer product of each joint's column (n, 3, d) with itself, (n, d, 3, 3)."""
-    columns = derivatives.mT
-    return columns[..., :, None] * columns[..., None, :]
 
 
 class _Settings:

@@ -117,10 +117,6 @@ class KeptPairs:
         self.behind = _last(self.behind, behind, kept)
         self.total += len(q)
 
-    def replace_model(self, model: Predictor) -> None:
-        """Replace the prior model behind the same pairs."""
-        self.behind = model.predict(self.q)
-
     def observations(self, kernel: ProductKernel) -> Observations:
         """Return the pairs, weighted by their sigma and their age."""
         pairs = with_units(self.q, self.x, self.sigma)
@@ -355,7 +351,7 @@ class KernelLearner(Model):
 
     def rebase(self, prior: Predictor) -> None:
         """Replace the prior for the same pairs, or use the same one after it has changed."""
-        self._pairs.replace_model(prior)
+        self._pairs.behind = prior.predict(self._pairs.q)
         self._prior, self._fit = prior, None
 
     def estimate(self, q: ArrayLike) -> Estimate:

@@ -67,7 +67,9 @@ class ChainPosterior:
                 raise ShapeError(name, str(shape), array.shape)
         self._change = np.array(change)
         self._spread = ChainBelief.from_covariance(self._parameters, change, covariance).root
-        self.noise, self.floor = noise, _checked_floor(floor)
+        if not (floor >= 0.0 and math.isfinite(floor)):
+            raise SettingError(f"floor must be finite and at least 0 m, got {floor!r}")
+        self.noise, self.floor = noise, floor
 
     @classmethod
     def of(cls, learner: RigidLearner | RecursiveRigidLearner, *, noise: float | None = None) -> ChainPosterior:
@@ -120,9 +122,3 @@ class ChainPosterior:
         """Return matrices R (n, 3, p) [m] at q (n, d): R_i R_jᵀ is the covariance of the positions at q_i and q_j."""
         _, jacobian = self._parameters.linearised(self._change, rows("q", q, self.joints))
         return jacobian @ self._spread
-
-
-def _checked_floor(floor: float) -> float:
-    if not (floor >= 0.0 and math.isfinite(floor)):
-        raise SettingError(f"floor must be finite and at least 0 m, got {floor!r}")
-    return floor

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import cast
 
@@ -139,7 +139,9 @@ class _Fitter:
             model.prune()
         posterior = model.posterior()
         self.used = sum(posterior.used.values())
-        step = posterior.mean - self._before_step(model.variances)
+        parts = [np.zeros(len(self._free))]
+        parts += [self._fresh.get(g, np.zeros(self._features.size(g))) for g in model.variances]
+        step = posterior.mean - np.concatenate(parts)
         moved = model.square_of(step) / model.noise**2
         self.variances, self.noise = dict(model.variances), model.noise
         self._take(posterior.mean, tuple(model.variances))
@@ -247,12 +249,6 @@ class _Fitter:
         )
         some = self._pairs.chosen(run)
         return some.whitened(design) / some.unit[:, None, None], some.whitened(target) / some.unit[:, None]
-
-    def _before_step(self, groups: Iterable[str]) -> FloatArray:
-        """Return the weights before the step."""
-        parts = [np.zeros(len(self._free))]
-        parts += [self._fresh.get(g, np.zeros(self._features.size(g))) for g in groups]
-        return np.concatenate(parts)
 
     def _take(self, mean: FloatArray, groups: Sequence[str]) -> None:
         start = len(self._free)

@@ -207,19 +207,14 @@ def _settle(pairs: Pairs, prior: CorePrior, z: FloatArray, noise: float) -> Fit:
             if optimiser.converged:
                 break
             continue
-        found = max(_noise(pairs, problem, z), pairs.noise_floor)
+        freedom = 1.0 - effective_parameters(problem, z) / (3.0 * len(pairs.x))
+        mean_square = float(np.square(problem.residuals(z))[pairs.unknown].mean())
+        found = max(math.sqrt(mean_square / max(freedom, 1e-9)), pairs.noise_floor)
         steady = abs(found / noise - 1.0) < _Settings.same_noise
         noise = found
         if (optimiser.converged and steady) or found == pairs.noise_floor:
             break
     return Fit(z, noise, used)
-
-
-def _noise(pairs: Pairs, problem: TensorProblem, z: FloatArray) -> float:
-    """Return the noise of a coordinate of the pairs that came without a sigma [m]."""
-    freedom = 1.0 - effective_parameters(problem, z) / (3.0 * len(pairs.x))
-    mean_square = float(np.square(problem.residuals(z))[pairs.unknown].mean())
-    return math.sqrt(mean_square / max(freedom, 1e-9))
 
 
 def _distances(pairs: Pairs, prior: CorePrior, fit: Fit) -> tuple[FloatArray, bool]:

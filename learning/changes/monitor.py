@@ -202,7 +202,11 @@ class ChangeMonitor:
         if self._reference is None:
             self._renew()  # not in `offer`: that runs in the background, and this takes a while
         if len(self._pairs) + len(pairs) > MOST_WATCHED and not self.alarmed:
-            self._shorten()
+            gone = len(self._pairs) // 2
+            self._drop(gone)
+            self._asked_at, self._next_at = max(self._asked_at - gone, 0), max(self._next_at - gone, 0)
+            if self._reference is not None:
+                self._hold(self._reference)
         for pair, learnt in zip(pairs, np.broadcast_to(kept, len(pairs)).tolist(), strict=True):
             turn = np.full(4, np.nan) if pair.R is None else pair.R
             self._pairs.append(_Watched(pair.seq, pair.q, pair.x, pair.cov, turn, learnt))
@@ -279,14 +283,6 @@ class ChangeMonitor:
         """Stop monitoring the first `count` pairs; they still show the noise."""
         self._earlier.extend(self._pairs[:count])
         del self._pairs[:count]
-
-    def _shorten(self) -> None:
-        """Drop the older half of the pairs."""
-        gone = len(self._pairs) // 2
-        self._drop(gone)
-        self._asked_at, self._next_at = max(self._asked_at - gone, 0), max(self._next_at - gone, 0)
-        if self._reference is not None:
-            self._hold(self._reference)
 
     def _renew(self) -> None:
         """Replace the reference by the next one."""

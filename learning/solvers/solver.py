@@ -161,7 +161,9 @@ class DirectSolver:
 
     def solutions(self) -> Iterator[Solved]:
         """Yield each model's solution as it is found, the rigid chain first: it is the quickest."""
-        task = self._started
+        if self._task is None:
+            raise RuntimeError("start a task first")
+        task = self._task
         if self._pairs >= _Settings.first_growth * self._solved_at:
             yield from self._solved_of_some(task)
         self._solved_at = self._pairs
@@ -215,12 +217,6 @@ class DirectSolver:
 
     def _first(self, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         return self._q[:count], self._x[:count], self._cov[:count]
-
-    @property
-    def _started(self) -> Task:
-        if self._task is None:
-            raise RuntimeError("start a task first")
-        return self._task
 
     @property
     def _before(self) -> ChainBelief:
