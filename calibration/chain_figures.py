@@ -50,7 +50,6 @@ class ChainFigures:
 
     @property
     def geometry(self) -> CalibratedGeometry:
-        """The most probable chain in the terms of the robot's files."""
         return self._geometry(self.beliefs[0].mean, self._split(self.beliefs[0]))
 
     @cached_property
@@ -217,7 +216,6 @@ def is_told(made: Sequence[tuple[float, float]]) -> bool:
 
 
 def _spread(belief: ChainBelief, which: IntArray) -> FloatArray:
-    """Return 1-sigma (k,) of some of the parameters."""
     return np.sqrt(np.square(belief.root[which]).sum(axis=1))
 
 

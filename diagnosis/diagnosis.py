@@ -111,7 +111,6 @@ class Diagnosis:
 
     @property
     def causes(self) -> tuple[Effect, ...]:
-        """The effects found."""
         return self.extended.causes
 
     @cached_property
@@ -165,7 +164,6 @@ class Diagnosis:
 
     @property
     def outliers(self) -> int:
-        """Number of outliers."""
         return int(self._off.sum())
 
     @property
@@ -231,7 +229,6 @@ class Diagnosis:
 
     @cached_property
     def shares(self) -> Shares:
-        """Shares of the explained squared error."""
         unnamed = None if self.left.model is None else self.left.model.explained
         return shares(self.aligned, self.extended, self.markers, unnamed)
 
@@ -367,7 +364,6 @@ class _Found:
     part: _Found | None = None
 
     def left(self, blocks: Blocks) -> Leftover:
-        """Return the residual structure that no effect fits."""
         # In many rows, all families take much memory to find nothing again.
         asked = self if self.part is None or self.explanation.unknown else self.part
         return leftover(asked.explanation, asked.unknowns, blocks, self.loose)
@@ -576,7 +572,6 @@ def _searched(begun: Fit, search: Search) -> Fit:
 
 
 def _with_small_ones_tolerated(fit: Fit) -> Fit:
-    """Refit with the periodic errors of drives that are no larger than those of other drives as tolerances."""
     fit = with_small_ripples(fit)
     small = _small_ones(fit)
     return fit.tolerating(tolerated(fit).scales, small) if small else fit

@@ -163,12 +163,10 @@ class EffectType(ABC):
 
     @cached_property
     def turning(self) -> tuple[Parameter, ...]:
-        """Parameters at a revolute joint, or at none."""
         return self.parameters(False)
 
     @cached_property
     def sliding(self) -> tuple[Parameter, ...]:
-        """Parameters at a prismatic joint."""
         return self.parameters(True)
 
     @cached_property
@@ -394,7 +392,6 @@ class Effect:
 
     @property
     def name(self) -> str:
-        """Name of its type."""
         return self.kind.name
 
     @property
@@ -419,7 +416,6 @@ class Effect:
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Parameters of its values."""
         return self.kind.sliding if self.prismatic else self.kind.turning
 
     @cached_property

@@ -39,7 +39,6 @@ class _Axis:
 
     @property
     def scale(self) -> float:
-        """Factor from readings to angles."""
         return np.pi / (self.high - self.low) if self.slides else 1.0
 
     def spread(self, count: int) -> FloatArray:
@@ -67,7 +66,6 @@ class _Axis:
 
     @property
     def last(self) -> int:
-        """Number of functions of the highest harmonic."""
         return 4 if self.slides else 2
 
     @property
@@ -78,7 +76,6 @@ class _Axis:
 
     @property
     def bases(self) -> list[JointBasis]:
-        """Bases of these columns."""
         waves = [JointBasis.trigonometric()] * int(self.harmonics).bit_length()
         return [JointBasis.prismatic(self.low, self.high), *waves] if self.slides else waves
 

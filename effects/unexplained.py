@@ -23,17 +23,13 @@ class StoredModel(Protocol):
     """A KB-Map that predicts and can be stored."""
 
     @property
-    def joints(self) -> int:
-        """Number of joints d."""
-        ...
+    def joints(self) -> int: ...
 
     def predict(self, q: ArrayLike) -> FloatArray:
         """Return outputs (n, 3) at q (n, d)."""
         ...
 
-    def to_bytes(self) -> bytes:
-        """Return the map as one self-describing byte string."""
-        ...
+    def to_bytes(self) -> bytes: ...
 
 
 _READERS: tuple[Callable[[bytes], StoredModel], ...] = (

@@ -181,7 +181,6 @@ def _figures(models: Sequence[Model]) -> list[_Figure]:
 
 
 def _odd(robot: int, figures: Sequence[_Figure]) -> tuple[Odd, ...]:
-    """Return the figures of the robot that stand out."""
     tried = sum(int(np.isfinite(figure.values).sum()) for figure in figures)
     found: list[tuple[float, Odd]] = []
     for figure in figures:
@@ -202,7 +201,6 @@ def _spread(values: FloatArray) -> float:
 
 
 def _camera_moved(found: ChainCalibration | None) -> tuple[float, float] | tuple[None, None]:
-    """Return the distance [mm] and the turn [°] from the camera pose in robot.toml."""
     if found is None:
         return None, None
     moved = math.dist([each.drawn for each in found.camera_xyz], [each.learnt for each in found.camera_xyz])
@@ -264,7 +262,6 @@ def _model(fleet: Fleet, robot: Member, q: FloatArray) -> Model:
 
 
 def view(comparisons: Sequence[TypeComparison], left_out: Sequence[str]) -> RenderableType:
-    """Return a table for each type, then who was left out."""
     parts: list[RenderableType] = []
     for comparison in comparisons:
         parts += [*map(Text, sentences(comparison)), Padding(_table(comparison.units), (1, 0, 1, 0))]
@@ -273,7 +270,6 @@ def view(comparisons: Sequence[TypeComparison], left_out: Sequence[str]) -> Rend
 
 
 def sentences(comparison: TypeComparison) -> list[str]:
-    """Return sentences on the compared robots and the outliers."""
     units = comparison.units
     said = [
         f"{len(units)} robots with the joints {', '.join(comparison.joints)}, at {comparison.poses} common poses, each "

@@ -63,7 +63,6 @@ def summary(results: Sequence[Diagnosed]) -> Summary:
 
 
 def row(result: Diagnosed) -> Row:
-    """Return one recording's row."""
     file = result.file
     return Row(
         name=result.job.name,

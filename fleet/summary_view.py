@@ -53,7 +53,6 @@ def _outcome(result: Diagnosed) -> str:
 
 
 def view(summary: Summary) -> RenderableType:
-    """Return a table with one row per recording, the failures, then the units of each type that are off."""
     with_robots = len({row.robot for row in summary.rows if row.error is None}) > 1
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
     table.add_column("recording", overflow="fold")
@@ -89,7 +88,6 @@ def sentences(one: Type) -> list[str]:
 
 
 def _cells(row: Row) -> tuple[RenderableType, ...]:
-    """Return all cells except the names."""
     if row.error is not None or row.verdict is None:
         return Text("failed", style="red"), "-", "-", "-"
     return (

@@ -15,13 +15,9 @@ class LearntModel(PositionModel, Protocol):
     """Map from joint angles to positions that later learning does not change."""
 
     @property
-    def digest(self) -> str:
-        """Hash that identifies the model."""
-        ...
+    def digest(self) -> str: ...
 
-    def to_bytes(self) -> bytes:
-        """Return the model as one self-describing byte string."""
-        ...
+    def to_bytes(self) -> bytes: ...
 
 
 PRIOR, INSTANT, RIGID, RESIDUAL, EXACT = "prior", "nlms", "rigid", "residual", "exact"
@@ -64,11 +60,9 @@ class ModelBank:
 
     @property
     def prior(self) -> KBMap:
-        """Prior map, where learning started."""
         return self._fixed[PRIOR]
 
     def model(self, name: str) -> LearntModel:
-        """Return one of the current models; later learning does not change it."""
         return self._residual if name == RESIDUAL and self._residual is not None else self.map(name)
 
     def map(self, name: str) -> KBMap:
@@ -105,11 +99,9 @@ class ModelBank:
         self._instant_map = None
 
     def ask(self) -> None:
-        """Record that the solver works on all pairs so far."""
         self._asked = self.map(INSTANT)
 
     def take(self, name: str, solution: LearntModel) -> None:
-        """Store the solver's solution for one of the models."""
         if isinstance(solution, KBMap):
             self._fixed[name] = solution
         else:

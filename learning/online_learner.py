@@ -72,7 +72,6 @@ class OnlineLearner:
 
     @property
     def snapshot(self) -> Snapshot:
-        """Snapshot of the answering model."""
         return self._snapshot
 
     @property
@@ -99,7 +98,6 @@ class OnlineLearner:
 
     @property
     def counters(self) -> Counters:
-        """Copy of all counters."""
         with self._lock:
             return copy.copy(self._counters)
 
@@ -237,7 +235,6 @@ class OnlineLearner:
                 self._publish()
 
     def refuse(self) -> None:
-        """Count a pair that could not be accepted."""
         with self._lock:
             self._counters.refused += 1
 
@@ -247,7 +244,6 @@ class OnlineLearner:
             self._counters.gaps_recovered += pairs
 
     def missed(self, pairs: int) -> None:
-        """Count pairs that are lost."""
         with self._lock:
             self._counters.missed += pairs
 

@@ -176,7 +176,6 @@ class Orientations:
         self._choose()
 
     def state(self) -> OrientationState:
-        """Return everything that `restore` needs."""
         packed = {name: chain.to_bytes() for name, chain in self._chains.items()}
         return OrientationState(
             pairs=self.pairs,

@@ -103,7 +103,6 @@ class Regime:
 
     @property
     def task(self) -> Task:
-        """Current task of the solver."""
         known = self._solver_prior
         prior = known or self.models.prior
         return Task(
@@ -117,7 +116,6 @@ class Regime:
 
     @property
     def owes_replays(self) -> bool:
-        """True if replay steps are due."""
         return self._replays_due >= 1.0 and len(self.memory) > 0
 
     @property
@@ -277,7 +275,6 @@ class Regime:
         self._replays_due += self._replays_per_pair * min(len(q), _Settings.recent)
 
     def ask(self) -> None:
-        """Record that the solver works on all pairs so far."""
         self._claims.solution_asked()
         self.models.ask()
         self.monitor.asked()
@@ -308,7 +305,6 @@ class Regime:
         self.monitor.offer(Reference(self.model, self.map, belief, wide, residual, claim, known, q, x, variance))
 
     def take_orientation(self, solution: OrientationSolution) -> None:
-        """Store a solution of this regime's task for the orientations."""
         self.orientations.take(solution)
 
     @property

@@ -53,7 +53,6 @@ class Fitting:
         self.is_first = True
 
     def due(self, pairs: int) -> bool:
-        """Return True if it is time to fit."""
         return self.due_at is not None and pairs >= self.due_at
 
     def change_tool(self, before: KBMap, hand: RigidChain, first_at: int = PAIRS_TO_REFIT) -> None:
@@ -86,7 +85,6 @@ class Fitting:
         return Fit(belief.chain.to_kbmap(self._nominal.bases), placed, belief)
 
     def done(self, pairs: int, fit: Fit | None) -> None:
-        """Record a fit to this many pairs."""
         if fit is None:
             self.due_at = pairs + max(self._nominal.pairs_to_align, PAIRS_TO_REFIT)
         else:
@@ -98,7 +96,6 @@ class Fitting:
         return kept if self._before is None else kept | {"before_change": self._before.net}
 
     def restore(self, due_at: int | None, is_first: bool, arrays: Mapping[str, FloatArray]) -> None:
-        """Resume from these and from `arrays`."""
         nominal = self._nominal.chain
         self.due_at, self.is_first = due_at, is_first
         self.chain = RigidChain(arrays["chain_fixed"], nominal.axes, nominal.prismatic)
@@ -197,7 +194,6 @@ class Regimes:
 
     @property
     def memory(self) -> PairMemory:
-        """Pairs with the current tool."""
         return self.waiting if self.present is None else self.present.memory
 
     def state_before(self, first: int, counters: Counters, curve: Curve) -> LearningState:

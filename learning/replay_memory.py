@@ -63,7 +63,6 @@ class PairMemory:
     def restore(
         self, q: FloatArray, x: FloatArray, count: int, cov: FloatArray | None = None, turns: FloatArray | None = None
     ) -> None:
-        """Hold the newest of `count` pairs, as `append` takes them."""
         self._count = self._first = count - len(q)
         self.append(q, x, cov, turns)
 

@@ -87,7 +87,6 @@ class LearningState:
 
     @property
     def before(self) -> LearningState | None:
-        """State before the last change; None if there is none."""
         if self.header.before is None:
             return None
         arrays = {name.removeprefix(BEFORE): each for name, each in self.arrays.items() if name.startswith(BEFORE)}
@@ -119,7 +118,6 @@ class Curve:
 
     @property
     def points(self) -> list[CurvePoint]:
-        """Copy of the curve so far."""
         return list(self._points)
 
     def add(self, pairs: int, error_m: float) -> None:

@@ -236,7 +236,6 @@ class UncertaintyTracker:
         self._residuals.add(errors, self.errors[PRIOR].noise_variance)
 
     def solution_asked(self) -> None:
-        """Record that the solver works on all pairs so far."""
         self._asked = self._support.view
 
     def solution_taken(

@@ -99,12 +99,10 @@ class _Bag:
 
     @property
     def types(self) -> dict[str, str]:
-        """The type of each topic."""
         return {connection.topic: connection.msgtype for connection in self.reader.connections}
 
     @property
     def counts(self) -> Counter[str]:
-        """Number of messages of each topic."""
         counts: Counter[str] = Counter()
         for connection in self.reader.connections:
             counts[connection.topic] += connection.msgcount
@@ -117,12 +115,10 @@ class _Bag:
             yield received_ns / _NANO, self.reader.deserialize(data, connection.msgtype)
 
     def some(self, topic: str) -> Iterator[Any]:
-        """Yield a topic's first messages."""
         for _, (_, message) in zip(range(_FEW), self.messages(topic), strict=False):
             yield message
 
     def wrong(self, what: str, remedy: str) -> RecordingError:
-        """Return an error that lists what the bag has."""
         counts = self.counts
         listed = ", ".join(f"{topic} ({kind}, {counts[topic]})" for topic, kind in sorted(self.types.items()))
         ended = remedy if remedy.endswith(("?", ".")) else f"{remedy}."

@@ -143,7 +143,6 @@ class _Check:
 
     @property
     def _before(self) -> float:
-        """Distance of the pairs as they are [m]."""
         return self.search.fits[self.as_it_is].error
 
     @property
@@ -154,7 +153,6 @@ class _Check:
         return nameable(reading, self.search.fits[reading], self.spread)
 
     def _of_no_reading(self, nearest: Reading, fit: ReadingFit, after: float) -> Plausibility:
-        """Return the refusal of a recording that no reading explains."""
         doubted = ""
         if nearest != self.as_it_is:
             looks = nearest.looks(self.robot.joints, fit.zeros)
@@ -210,7 +208,6 @@ class _Check:
         return replace(found, warnings=(*found.warnings, perhaps))
 
     def _warnings(self, fit: ReadingFit) -> Plausibility:
-        """Return warnings of far joint offsets and of a poor fit."""
         names = self.robot.joints
         warnings = [
             f"with the nominal links, the zero of {name} comes out {math.degrees(zero):+.0f}°: it is wrong, or the "

@@ -241,12 +241,10 @@ class ReadingSearch:
         return tuple(name for name, error in zip(names, others, strict=True) if error < THRESHOLDS.much_better * own)
 
     def _whole_error(self, reading: Reading) -> float:
-        """Return the RMS distance [m] of all rows, outliers included."""
         q, x = reading.angles(self.q, self.chain.prismatic), reading.positions(self.x)
         return max(float(np.sqrt(np.square(self.distances(q, x, [(q, x)])).mean())), self.exact_m)
 
     def _best(self) -> list[Reading]:
-        """Return all readings, the best first."""
         return sorted(self.fits, key=lambda reading: self.fits[reading].nats + _Settings.a_change * reading.changes)
 
     def _most_probable(self, as_it_is: Reading) -> tuple[Reading, list[float]]:
@@ -297,7 +295,6 @@ class ReadingSearch:
         return fit.nats < best.nats + _Settings.certain or fit.error < THRESHOLDS.as_good * best.error
 
     def _try(self, readings: Iterable[Reading]) -> None:
-        """Fit readings that were not tried yet."""
         new = [reading for reading in dict.fromkeys(readings) if reading not in self._tried]
         self._tried.update(new)
         if new:

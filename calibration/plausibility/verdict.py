@@ -50,7 +50,6 @@ class Plausibility:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """All problems and warnings as sentences."""
         refused = () if self.refusal is None else (f"{self.refusal}. {self.remedy}",)
         return tuple(f"{text[0].upper()}{text[1:]}." for text in (*refused, *self.warnings))
 
@@ -66,5 +65,4 @@ class Plausibility:
 
 
 def mm(distance_m: float) -> str:
-    """Return a distance for people, as in `1.23 mm`."""
     return f"{1e3 * distance_m:.3g} mm" if distance_m < 1.0 else f"{distance_m:.3g} m"

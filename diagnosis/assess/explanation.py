@@ -81,7 +81,6 @@ class Explanation:
 
     @property
     def is_specific(self) -> bool:
-        """True if every unnamed cause is as specific as a named one."""
         return all(way.family.is_specific for way in self.unknown)
 
 
@@ -108,11 +107,7 @@ def explain(
 
 
 def _compared(found: Fit, path: Sequence[Fit], unknowns: Unknowns, search: Search, counted: float) -> Explanation:
-    """Return the most probable explanation.
-
-    Args:
-        counted: effective number of independent rows per row.
-    """
+    """Return the most probable explanation."""
     whole = _length(found, found.run.measured - path[0].run.measured)
     best = _with_unknown(found, unknowns, search, counted)
     inexact = max(_Settings.of_the_causes * whole, _Settings.of_the_way * _length(found, changed_by_the_way(found)))

@@ -45,7 +45,6 @@ class Leftover:
 
     @property
     def is_there(self) -> bool:
-        """True if there is any structure."""
         return bool(self.what)
 
     @property

@@ -56,7 +56,6 @@ class Nameless:
 
     @property
     def what(self) -> str:
-        """Short description."""
         return self.apart.chosen[0].family.what
 
     @property

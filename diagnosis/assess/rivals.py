@@ -100,11 +100,7 @@ class Standing:
 
 
 def standings(fit: Fit, search: Search, blocks: Blocks, seed: int, unknowns: Unknowns | None = None) -> list[Standing]:
-    """Assess each cause of a fit.
-
-    Args:
-        unknowns: unnamed families that may be rivals as well.
-    """
+    """Assess each cause of a fit."""
     return [_standing(fit, cause, search, blocks, seed, unknowns) for cause in fit.causes]
 
 

@@ -77,7 +77,6 @@ class Fit:
 
     @property
     def causes(self) -> tuple[Effect, ...]:
-        """The effects that are findings."""
         return self.simulation.effects[self.nuisances :]
 
     @cached_property
@@ -137,7 +136,6 @@ class Fit:
 
     @property
     def columns(self) -> FloatArray:
-        """Whitened and weighted `run_columns`."""
         return np.concatenate([self.effect_columns, self.tolerance_columns.reshape(*self.left.shape, -1)], axis=2)
 
     @cached_property
@@ -157,7 +155,6 @@ class Fit:
 
     @property
     def amounts(self) -> int:
-        """Number of amounts of all effects."""
         return sum(len(effect.amounts) for effect in self.simulation.effects)
 
     def doubtful(self, effects: Iterable[Effect] | None = None) -> NDArray[np.bool_]:
@@ -311,7 +308,6 @@ class Fit:
 
     @cached_property
     def own_tangent(self) -> Tangent:
-        """Derivatives about this fit."""
         return Tangent.of(self.simulation.effects, self._columns_of_each(None), self.background, self.noise.weights)
 
     @property
@@ -425,7 +421,6 @@ class Fit:
         return _at(self.observations, simulation, self.nuisances, self.noise, self.background, tolerated)
 
     def over(self, observations: Observations) -> Fit:
-        """Refit to observations of another motion of the same arm."""
         return improved(self._about(self.settled_simulation, self.background.scales, observations))
 
     def _about(self, simulation: Simulation, scales: Scales | None, observations: Observations | None = None) -> Fit:
@@ -436,7 +431,6 @@ class Fit:
         return _at(observations, simulation, self.nuisances, self.noise, background, run=run)
 
     def to(self, observations: Observations, start: Simulation | None = None) -> Fit:
-        """Refit to other observations of the same motion, optionally from another simulation."""
         simulation = start or self.simulation
         fit = _at(observations, simulation, self.nuisances, self.noise, self.background, self.tolerated)
         return improved(replace(fit, tangent=self.own_tangent))
@@ -468,7 +462,6 @@ class Fit:
 
     @property
     def settled_simulation(self) -> Simulation:
-        """The simulation with the tolerances moved into it."""
         if self.background.scales is None:
             return self.simulation
         return self.simulation.with_background(self.background.with_amounts(self.tolerated))
@@ -486,21 +479,17 @@ class Fit:
         return improved(self._about(self.settled_simulation, None, observations)).simulation
 
     def untolerated(self) -> Fit:
-        """Refit without any tolerance."""
         if self.background.scales is None:
             return self
         return improved(self._about(self.simulation.with_background(self.background.given), None))
 
     def without(self, cause: Effect) -> Fit:
-        """Refit with all causes but one."""
         return self.with_causes([effect for effect in self.causes if effect.identity != cause.identity])
 
     def with_causes(self, causes: Sequence[Effect]) -> Fit:
-        """Refit with other causes in place of the present ones."""
         return improved(self.starting(causes))
 
     def starting(self, causes: Sequence[Effect]) -> Fit:
-        """Replace the causes, without fitting."""
         started = self.at(self.simulation.with_effects((*self.simulation.effects[: self.nuisances], *causes)))
         return replace(started, tangent=self.own_tangent)
 

@@ -46,7 +46,6 @@ _UNTESTED_WEIGHT = "sag, which was not tested: robot.toml says that the hand bor
 
 
 def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
-    """Return the machine-readable form of a diagnosis."""
     percent, interval = diagnosis.gain()
     # A tracker or a scanner has no intrinsics in robot.toml.
     seen_by = "instrument" if diagnosis.aligned.simulation.robot.calibration is None else "camera"

@@ -80,11 +80,7 @@ class Number:
 
 
 def numbers_of(cause: Cause, *, timed: bool) -> list[Number]:
-    """Return the formatted numbers of a cause.
-
-    Args:
-        timed: True if the recording has times; otherwise a moment is a row number.
-    """
+    """Return the formatted numbers of a cause."""
     names = [name for name in cause.parameters if name not in _SAID_AGAIN or not _has_amplitude(cause)]
     return [number(name, cause.parameters[name], timed=timed) for name in names]
 
@@ -103,7 +99,6 @@ def telling(numbers: list[Number]) -> list[Number]:
 
 
 def number(name: str, interval: Interval, *, timed: bool = True) -> Number:
-    """Format one number with its interval."""
     factor, unit = _unit(name, timed)
     value, low, high = (factor * v for v in (interval.value, *interval.ci95))
     half = 0.5 * (high - low)
@@ -135,14 +130,12 @@ def place(what: Cause | Rejected) -> str:
 
 
 def chance(p: float) -> str:
-    """Format a p-value."""
     if p < 0.001:
         return "< 0.001"
     return "1" if p >= 0.995 else f"{p:.2g}"
 
 
 def percent(share: float) -> str:
-    """Format a probability, never as certain."""
     if share >= 0.995:
         return "> 99 %"
     return "< 1 %" if share < 0.005 else f"{100.0 * share:.0f} %"
@@ -154,7 +147,6 @@ def share(of_hundred: float) -> str:
 
 
 def mm(value: float | None) -> str:
-    """Format a length given in mm."""
     if value is None or not math.isfinite(value):
         return "–"
     return _fixed(value, 0 if value >= 100 else 1 if value >= 10 else 2 if value >= 0.1 else 3, "")

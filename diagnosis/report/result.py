@@ -161,7 +161,6 @@ class Tolerances(msgspec.Struct, frozen=True):
 
     @property
     def share_percent(self) -> float:
-        """Share of the gain of all tolerances together."""
         return self.links_share_percent + self.drives_share_percent
 
     @property

@@ -24,7 +24,6 @@ _ERRORS = (
 
 
 def errors(diagnosis: DiagnosisFile) -> str:
-    """Return a table of RMS and mean of each simulation."""
     rms, mean = diagnosis.rms_mm, diagnosis.mean_mm
     longest = max(value for name, _ in _ERRORS[1:] if (value := getattr(rms, name)) is not None) or 1.0
     rows = []

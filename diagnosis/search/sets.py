@@ -220,7 +220,6 @@ class Sets:
         return here
 
     def _without_one(self, here: Together) -> Together | None:
-        """Remove one cause or a part of one, where that is more probable."""
         present = frozenset(here.chosen)
         groups = [group for group in self._groups if present.issuperset(group)]
         losses = self._losses(here, groups)
@@ -236,7 +235,6 @@ class Sets:
         return _better([self.of((*here.chosen, *group), here) for group in more[:_TRIED]], here)
 
     def _exchanged(self, here: Together) -> Together | None:
-        """Exchange one cause for another, where that is more probable."""
         tried = []
         for identity in dict.fromkeys(self.effects[k].identity for k in here.chosen):
             own = tuple(k for k in here.chosen if self.effects[k].identity == identity)
@@ -279,7 +277,6 @@ class Sets:
         return squares + volumes - self._costs_of(here.chosen, groups, are_in=True)
 
     def _cost(self, chosen: Sequence[int]) -> float:
-        """Return the cost of naming the causes of a set [nats]."""
         total, kinds = 0.0, set[EffectType]()
         numbers: Counter[Key] = Counter()
         for k in chosen:
@@ -466,7 +463,6 @@ class Sets:
         return factor, variances, dpotrs(factor, toward / sigma**2, lower=True)[0]
 
     def causes(self, here: Together) -> list[Effect]:
-        """Return the causes of a set, with their amounts."""
         found: dict[Identity, Effect] = {}
         for k in here.chosen:
             effect, places = self.effects[k], self._places[k]
@@ -479,7 +475,6 @@ class Sets:
 
 
 def _usual(effects: Sequence[Effect]) -> FloatArray:
-    """Return the usual sizes of the amounts of effects (p,)."""
     return np.array([effect.parameters[k].usual for effect in effects for k in effect.amounts])
 
 

@@ -58,7 +58,6 @@ class Rattle:
 
     @property
     def what(self) -> str:
-        """Short description."""
         return f"the marker is loose on the hand, by ±{1e3 * self.half_m:.2g} mm"
 
     def ways_of(self, fit: Fit) -> FloatArray:

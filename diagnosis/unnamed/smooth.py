@@ -61,11 +61,7 @@ class SmoothModel:
 
 
 def smooth_model(alone: Fit, apart: Apart, families: Sequence[Family], blocks: Blocks) -> SmoothModel:
-    """Learn the families' functions beside the causes of a fit.
-
-    Args:
-        apart: the same causes beside the families.
-    """
+    """Learn the families' functions beside the causes of a fit."""
     said = apart.predicted - alone.predicted
     lasting = [family for family in families if not family.over_time]
     # All families of image position share the same functions, so one stands for all.
@@ -106,7 +102,6 @@ def _learnt(
 
 
 def _noise_m(fit: Fit) -> float:
-    """Return the RMS length of the noise [m]."""
     roots = np.linalg.inv(fit.observations.whitening)
     return fit.noise.sigma * float(np.sqrt(np.square(roots).sum(axis=(1, 2)).mean()))
 
@@ -141,7 +136,6 @@ class _Functions:
 
     @cached_property
     def columns(self) -> FloatArray:
-        """Functions at the rows of the fit (n, 3, p)."""
         return self._at(self.given) / self._scales
 
     def stored(self, amounts: FloatArray, tolerance_m: float) -> tuple[Unexplained, float]:
@@ -260,7 +254,6 @@ class _Amounts:
 
     @property
     def of_functions(self) -> FloatArray:
-        """Amounts of the functions that last (p,)."""
         return self._all[self._causes :][: self._lasting]
 
     @property
@@ -293,7 +286,6 @@ class _Amounts:
         return more
 
     def _missed(self, size: float) -> float:
-        """Return the sum of squares left on held-out rows."""
         total = 0.0
         for k, (inner, toward, square) in enumerate(self._products):
             amounts = self._solved(size, without=k)

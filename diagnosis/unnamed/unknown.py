@@ -119,7 +119,6 @@ class Way:
 
     @property
     def moves(self) -> int:
-        """Number of motions."""
         return self.moved.shape[2]
 
     @property
@@ -183,7 +182,6 @@ class Unknowns:
         self._apart: WeakKeyDictionary[Noise, dict[tuple[Way, ...], Apart]] = WeakKeyDictionary()
 
     def _way(self, k: int) -> Way:
-        """Return a family, prepared on first use."""
         if k not in self._prepared:
             family = self._families[k]
             joint = family.joint if family.kind == "joint" else None
@@ -192,13 +190,11 @@ class Unknowns:
 
     @cached_property
     def _by_joint(self) -> list[FloatArray]:
-        """Displacements (n, 3, 1) by each joint, whitened."""
         moved = self._start.observations.whitened(self._run.by_joint)
         return [moved[:, :, [k]] for k in range(moved.shape[2])]
 
     @property
     def count(self) -> int:
-        """Number of families."""
         return len(self._families)
 
     def again(self, ways: Sequence[Way]) -> tuple[Way, ...]:

@@ -276,5 +276,4 @@ def _onto_z(axis: FloatArray) -> FloatArray:
 
 
 def _numbers(T: FloatArray) -> list[float]:
-    """Return the upper three rows of a pose, row by row."""
     return T[:3].ravel().tolist()

@@ -104,7 +104,6 @@ def placed(T: FloatArray) -> dict[str, str]:
 
 
 def texts(values: FloatArray) -> str:
-    """Return numbers as an attribute, exactly."""
     return " ".join(map(repr, (np.atleast_1d(values) + 0.0).tolist()))  # no minus before a zero
 
 

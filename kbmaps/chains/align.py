@@ -62,7 +62,6 @@ class _Fit:
     shift: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     def markers(self) -> FloatArray:
-        """Return the marker positions (n, 3) in the nominal frame."""
         return self.nominal_positions + self.nominal_rotations @ self.shift
 
     def errors(self) -> FloatArray:
@@ -83,7 +82,6 @@ class _Fit:
         return max(float(np.partition(self.norms(), rank)[rank]) / MEDIAN_NORM, least)
 
     def place(self, weights: FloatArray) -> None:
-        """Fit the best pose for the current marker offset."""
         self.rotation, self.translation = rigid_motion(self.markers(), self.x, weights)
 
     def improve(self, weights: FloatArray) -> float:

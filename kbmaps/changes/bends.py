@@ -186,7 +186,6 @@ def _log_prior(k: int) -> FloatArray:
 
 
 def _sizes(k: int) -> FloatArray:
-    """Return the sizes of bends of the k-th length."""
     return np.array(_Settings.bends if k == 0 else _Settings.bends[1:])
 
 

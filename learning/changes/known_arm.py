@@ -29,7 +29,6 @@ class KnownArm:
 
     @classmethod
     def from_bytes(cls, chain: bytes, tolerances: ChainTolerances, residual: bytes | None) -> KnownArm:
-        """Return the arm from the bytes of its parts' `to_bytes`."""
         known = None if residual is None else ResidualModel.from_bytes(residual)
         return cls(ChainBelief.from_bytes(chain), tolerances, known)
 

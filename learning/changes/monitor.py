@@ -131,7 +131,6 @@ class _Shown:
     off: FloatArray
 
     def with_newer(self, other: _Shown) -> _Shown:
-        """Return the newest of both."""
         return _Shown(
             *(
                 np.concatenate([getattr(self, name), getattr(other, name)])[-MOST_SURPRISES:]
@@ -167,7 +166,6 @@ class ChangeMonitor:
 
     @property
     def detector(self) -> ChangeDetector | None:
-        """Detector that compares the pairs with the current reference; None before there is one."""
         return self._detector
 
     @property
@@ -285,7 +283,6 @@ class ChangeMonitor:
         del self._pairs[:count]
 
     def _renew(self) -> None:
-        """Replace the reference by the next one."""
         if self._next is not None:
             self._drop(self._next_at)
             self._asked_at, self._next_at = max(self._asked_at - self._next_at, 0), 0

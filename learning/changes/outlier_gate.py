@@ -36,7 +36,6 @@ class OutlierGate:
 
     @property
     def in_a_row(self) -> int:
-        """Number of consecutive outliers up to now."""
         return self._in_a_row
 
     @property

@@ -125,7 +125,6 @@ class DirectSolver:
         self._q = self._x = self._cov = np.empty((0, 0))
 
     def start(self, task: Task) -> None:
-        """Forget all pairs and begin a new task."""
         self._solved_at = 0
         self._task, self._folded, self._folded_residual = task, task.belief, task.residual or task.belief
         within = Memory(window=WINDOW)
@@ -138,7 +137,6 @@ class DirectSolver:
     def learn(
         self, q: FloatArray, x: FloatArray, cov: FloatArray | None = None, turns: FloatArray | None = None
     ) -> None:
-        """Add pairs, as `Solver` does."""
         if self._orientations is not None and turns is not None:
             self._orientations.learn(q, x, turns)
         if self._exact is not None:
@@ -156,7 +154,6 @@ class DirectSolver:
         self._solved += self.solutions()
 
     def poll(self) -> Solved | None:
-        """Return the next answer to the last `solve`."""
         return self._solved.pop(0) if self._solved else None
 
     def solutions(self) -> Iterator[Solved]:
@@ -314,7 +311,6 @@ class SolverClient:
 
     @property
     def due(self) -> bool:
-        """True if it is time to ask."""
         enough = min(self._every, max(_Settings.growth * self._solved_at, 1.0))
         return self.fed > 0 and (self._soon or self.fed - self._solved_at >= enough)
 
@@ -353,12 +349,10 @@ class SolverClient:
         self.fed = fed
 
     def ask(self) -> None:
-        """Request the solutions of all pairs so far."""
         self._solver.solve()
         self.busy, self._soon, self._solved_at = True, False, self.fed
 
     def poll(self) -> Solved | None:
-        """Return the next answer if there is one, without waiting."""
         solved = self._solver.poll()
         if solved is not None:
             self.busy = not solved.last

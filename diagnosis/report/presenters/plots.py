@@ -32,7 +32,6 @@ def scatter_plot(
     title: str,
     axes: tuple[str, str],
 ) -> Panel:
-    """Plot single samples, their means, and the fitted curve."""
     x, y = points
     some = residuals.some(POINTS, rows)
     bins = binned(x[rows], y[rows])
@@ -104,7 +103,6 @@ def remembered(residuals: Residuals, effect: Effect) -> FloatArray:
 
 
 def over_time_since(residuals: Residuals, effect: Effect) -> Panel:
-    """Plot the displacement along a jump, over time."""
     begins = float(residuals.clock[0]) - 1.0
     always = residuals.instead(effect, np.append(effect.values[:-1], begins))
     partial, _ = attributed(residuals, effect)

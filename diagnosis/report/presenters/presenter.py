@@ -50,7 +50,6 @@ class Found:
 
     @classmethod
     def of(cls, cause: Cause) -> Found:
-        """Return a cause with all of its numbers."""
         return cls(cause.where, cause.source, {name: interval.value for name, interval in cause.parameters.items()})
 
     @property
@@ -60,27 +59,22 @@ class Found:
 
     @property
     def shift(self) -> str:
-        """Length of its shift."""
         return f"{1e3 * self._size('x_m', 'y_m', 'z_m'):.3g} mm"
 
     @property
     def turn(self) -> str:
-        """Angle of its turn."""
         return f"{self._size('rx_rad', 'ry_rad', 'rz_rad') * DEG:.2g}°"
 
     @property
     def shifts(self) -> list[str]:
-        """Axes of its shift."""
         return [axis for axis in "xyz" if f"{axis}_m" in self.numbers]
 
     @property
     def turns(self) -> list[str]:
-        """Axes of its turn."""
         return [axis for axis in "xyz" if f"r{axis}_rad" in self.numbers]
 
     @property
     def moved(self) -> str:
-        """Its shift and its turn."""
         return " and ".join(said for said, axes in ((self.shift, self.shifts), (self.turn, self.turns)) if axes)
 
     @property
@@ -95,7 +89,6 @@ class Found:
         return self.signed(base).lstrip("+")
 
     def signed(self, base: str) -> str:
-        """Return such a number with its sign."""
         if f"{base}_rad" in self.numbers:
             return f"{self.numbers[f'{base}_rad'] * DEG:+.3g}°"
         return f"{self.numbers[f'{base}_m'] * 1e3:+.3g} mm"
@@ -122,7 +115,6 @@ class Workshop:
 
     @property
     def in_urdf(self) -> str:
-        """Hint at the corrected URDF."""
         return f" (--out writes {corrected_file(self.robot)}, which has it)"
 
     def joint(self, found: Found) -> int:
@@ -130,7 +122,6 @@ class Workshop:
         return self.robot.joints.index(found.where or "")
 
     def slides(self, found: Found) -> bool:
-        """Return True for a cause at a prismatic joint."""
         return bool(self.robot.chain.prismatic[self.joint(found)])
 
     def amount(self, found: Found, base: str) -> str:
@@ -178,7 +169,6 @@ class Presenter(ABC):
         """Return what to do about a cause."""
 
     def panel(self, residuals: Residuals, effect: Effect) -> Panel:
-        """Plot the evidence for a cause."""
         return measured_against_predicted(residuals, effect)
 
 
@@ -213,7 +203,6 @@ def toml_pose(T: FloatArray) -> str:
 
 
 def short(value: float, digits: int) -> str:
-    """Return a number without trailing zeros."""
     return f"{round(value, digits) + 0.0:.{digits}f}".rstrip("0").rstrip(".")
 
 
