@@ -15,7 +15,6 @@ import numpy as np
 
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import FARTHEST_M, LARGEST_Q, FloatArray, Pair
-from bodyschema.learning.changes.record import ChangeRecord
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.data_outlook import LearnerEvidence
 from bodyschema.learning.model_bank import PRIOR, SOLVED
@@ -25,7 +24,7 @@ from bodyschema.learning.regimes import Regimes
 from bodyschema.learning.snapshot import Snapshot
 from bodyschema.learning.solvers.solver import Solver, SolverClient
 from bodyschema.learning.state import Counters, Curve, LearningState
-from bodyschema.learning.status import CurvePoint, OrientationStatus
+from bodyschema.learning.status import ChangeRecord, CurvePoint, OrientationStatus
 from bodyschema.learning.uncertainty import WARM
 from kbmaps import ChainBelief, Recent
 

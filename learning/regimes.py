@@ -14,7 +14,6 @@ from bodyschema.interfaces.records import FloatArray, Pair
 from bodyschema.learning.changes.known_arm import Adapted, KnownArm, Origin
 from bodyschema.learning.changes.monitor import LOOK_AGAIN, DetectedChange
 from bodyschema.learning.changes.outlier_gate import DOUBT, FEWEST_FOR_CHANGE, explained, sound
-from bodyschema.learning.changes.record import NAMED_WITHIN, ChangeRecord, KindOfChange
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.model_bank import PRIOR
 from bodyschema.learning.nominal import PAIRS_TO_REFIT, NominalModel, chain_tolerances
@@ -22,6 +21,7 @@ from bodyschema.learning.regime import Regime
 from bodyschema.learning.replay_memory import PairMemory
 from bodyschema.learning.solvers.solver import fitted_belief
 from bodyschema.learning.state import NET, PAIRS, Counters, Curve, LearningHeader, LearningState, StateError
+from bodyschema.learning.status import NAMED_WITHIN, ChangeRecord, KindOfChange
 from bodyschema.learning.uncertainty import UncertaintyTracker
 from kbmaps import ChainBelief, ChainTolerances, DegenerateDataError, Explanation, KBMap, RigidChain
 

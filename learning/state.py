@@ -10,10 +10,9 @@ import numpy as np
 
 from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.records import FARTHEST_M, LARGEST_Q, FloatArray
-from bodyschema.learning.changes.record import ChangeRecord
 from bodyschema.learning.model_bank import PRIOR
 from bodyschema.learning.orientation import OrientationState
-from bodyschema.learning.status import CurvePoint
+from bodyschema.learning.status import ChangeRecord, CurvePoint
 from bodyschema.learning.uncertainty import UncertaintyState
 
 # Prefix of the arrays of the state before a change.

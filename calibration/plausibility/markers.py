@@ -8,8 +8,7 @@ from scipy.cluster.hierarchy import fcluster, linkage
 
 from bodyschema.interfaces.records import FloatArray
 
-from .poses import Poses
-from .search import ReadingSearch
+from .search import Poses, ReadingSearch
 from .verdict import Plausibility, mm
 
 

@@ -9,8 +9,8 @@ from scipy.special import fdtrc
 
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.search.held_out import Blocks
+from bodyschema.diagnosis.unnamed.families import joints_of
 from bodyschema.diagnosis.unnamed.rattle import Rattle
-from bodyschema.diagnosis.unnamed.sensitivity import joints_of
 from bodyschema.diagnosis.unnamed.smooth import SmoothModel, smooth_model
 from bodyschema.diagnosis.unnamed.unknown import Apart, Unknowns, basis_of
 

@@ -13,7 +13,7 @@ from bodyschema.diagnosis.diagnosis import MOST_DOUBTFUL, Diagnosis
 from bodyschema.diagnosis.fit.background import ANGLE_RAD, DRIVE_RAD, LENGTH_M
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.worth import NAMED, nats
-from bodyschema.diagnosis.search.aliases import alias_sentences
+from bodyschema.diagnosis.search.drives import alias_sentences
 from bodyschema.diagnosis.search.scan import Candidate
 from bodyschema.diagnosis.search.together import is_at_limit
 from bodyschema.effects import Effect, Identity

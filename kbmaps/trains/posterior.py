@@ -105,7 +105,7 @@ def _phases(bases: Sequence[JointBasis], q: FloatArray) -> FloatArray:
 
 
 class TensorPosterior:
-    """Gauss-Newton posterior of a train's cores. A `kbmaps.planning.posterior.Posterior`.
+    """Gauss-Newton posterior of a train's cores. A `kbmaps.planning.design.Posterior`.
 
     Args:
         train: the most likely one.

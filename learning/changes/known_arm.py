@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.changes.monitor import DetectedChange
-from bodyschema.learning.changes.record import NAMED, TOOL
 from bodyschema.learning.solvers.solver import fitted_belief
+from bodyschema.learning.status import NAMED, TOOL
 from kbmaps import ChainBelief, ChainTolerances, ChangeKind, Explanation, KBMap, ResidualModel, any_change, explanations
 
 # 1-sigma of each coordinate [m] of the marker's displacement by another tool, and of an unknown marker position about
