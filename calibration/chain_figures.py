@@ -72,7 +72,9 @@ class ChainFigures:
         covariance = np.zeros((len(self.values), len(self.values)))
         for belief, share in zip(self.beliefs, self.shares, strict=True):
             split = self._split(belief)
-            jacobian = self._derivatives(split)
+            steps = _Settings.step * np.eye(len(split))
+            here = self._figures(split)
+            jacobian = np.array([_unwound(self._figures(moved) - here) for moved in split + steps]).T / _Settings.step
             apart = _unwound(self._figures(split) - self.values)
             inner = _given(belief.covariance, self._hidden)
             covariance += share * (jacobian @ inner @ jacobian.T + np.outer(apart, apart))
@@ -150,11 +152,6 @@ class ChainFigures:
         geometry = self._geometry(split, split)
         camera = geometry.T_parent_camera
         return np.concatenate([camera[:3, 3], rpy_of(camera[:3, :3]), geometry.marker_xyz, split[self._zeros]])
-
-    def _derivatives(self, change: FloatArray) -> FloatArray:
-        steps = _Settings.step * np.eye(len(change))
-        here = self._figures(change)
-        return np.array([_unwound(self._figures(moved) - here) for moved in change + steps]).T / _Settings.step
 
 
 def after_exact_pairs(prior: ChainBelief, change: FloatArray, robot: RobotDescription) -> ChainBelief:

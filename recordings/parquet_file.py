@@ -32,7 +32,9 @@ def read_parquet_table(file: Path, joints: tuple[str, ...]) -> Table:
         names = tuple(parquet.schema_arrow.names)
         check_header(names, joints)
         for name in names:
-            _check_kind(arrow, name, parquet.schema_arrow.field(name).type)
+            kind = parquet.schema_arrow.field(name).type
+            if not (arrow.types.is_floating(kind) or arrow.types.is_integer(kind)):
+                raise Fault(f"the column holds {kind}, not numbers", column=name, remedy="Write it as double")
         content = _read(arrow, parquet)
     if content.num_rows == 0:
         raise Fault("there are no rows", remedy="Record at least one pair")
@@ -98,11 +100,6 @@ def write_parquet_table(file: Path, table: Table) -> None:
     }
     with file.open("wb") as stream:
         parquet.write_table(arrow.table(columns), stream)
-
-
-def _check_kind(arrow: Any, name: str, kind: Any) -> None:
-    if not (arrow.types.is_floating(kind) or arrow.types.is_integer(kind)):
-        raise Fault(f"the column holds {kind}, not numbers", column=name, remedy="Write it as double")
 
 
 def _column(name: str, column: Any) -> np.ndarray:

@@ -74,7 +74,10 @@ class Recording:
         object.__setattr__(self, "extra", MappingProxyType(extra))
         self._check_shapes()
         try:
-            self._check_values()
+            table = self.to_table()
+            check_header(table.names, self.joints)
+            check_finite(table)
+            check_values(table)
         except Fault as fault:
             raise _located(fault, self.file) from None
 
@@ -211,12 +214,6 @@ class Recording:
                 raise ValueError(f"extra column {name} has the shape {column.shape}, not {(n,)}")
         if self.cov is not None and not (self.cov == np.swapaxes(self.cov, 1, 2)).all():
             raise ValueError("cov is not symmetric")
-
-    def _check_values(self) -> None:
-        table = self.to_table()
-        check_header(table.names, self.joints)
-        check_finite(table)
-        check_values(table)
 
 
 def read_table(file: Path, joints: tuple[str, ...]) -> Table:

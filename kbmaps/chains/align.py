@@ -153,7 +153,13 @@ def align(
         raise ShapeError("x", f"({len(angles)}, 3) to go with q", positions.shape)
     if sigma is not None and not (sigma > 0.0 and math.isfinite(sigma)):
         raise SettingError(f"sigma must be finite and greater than 0, got {sigma!r}")
-    _check_enough(len(angles), pose_known, marker_known)
+    pairs = len(angles)
+    needed = 1 if pose_known else 3 if marker_known else 4
+    if pairs < needed:
+        raise DegenerateDataError(
+            f"aligning needs at least {needed} pairs when pose_known = {pose_known} and marker_known = {marker_known}, "
+            f"got {pairs}; record more"
+        )
     poses = chain.poses(angles)
     fit = _Fit(poses[:, :3, :3], poses[:, :3, 3], positions, not pose_known, not marker_known)
     if fit.fit_pose:
@@ -264,15 +270,6 @@ def _fit_robustly(fit: _Fit, sigma: float, tolerance: float = _Settings.step_tol
         if settled:
             break
     return inliers
-
-
-def _check_enough(pairs: int, pose_known: bool, marker_known: bool) -> None:
-    needed = 1 if pose_known else 3 if marker_known else 4
-    if pairs < needed:
-        raise DegenerateDataError(
-            f"aligning needs at least {needed} pairs when pose_known = {pose_known} and marker_known = {marker_known}, "
-            f"got {pairs}; record more"
-        )
 
 
 def _check_spread(points: FloatArray, what: str) -> None:

@@ -179,7 +179,11 @@ class ExperimentDesign:
     def add(self, roots: FloatArray) -> None:
         """Count pairs at `roots` (n, 3, p) as measured."""
         self._factor = self._with(roots)
-        self._settle()
+        self._left = self._reduced(self._region)
+        variances: FloatArray = np.einsum("tip,tip->t", self._left, self._left) + 3.0 * self._floor_square
+        weights = 0.5 / np.sqrt(np.maximum(variances, VARIANCE_FLOOR)) / len(variances)
+        flat = (self._left * np.sqrt(weights)[:, None, None]).reshape(-1, self._left.shape[2])
+        self._moment = flat.T @ flat
 
     def begin_with(self, roots: FloatArray) -> None:
         """Count pairs at `roots` (n, 3, p) as measured, and no others."""
@@ -198,13 +202,6 @@ class ExperimentDesign:
         """
         stacked = np.concatenate([self._factor.T, roots.reshape(-1, roots.shape[2]) / math.sqrt(self._noise_square)])
         return cast(FloatArray, np.linalg.qr(stacked, mode="r")).T
-
-    def _settle(self) -> None:
-        self._left = self._reduced(self._region)
-        variances: FloatArray = np.einsum("tip,tip->t", self._left, self._left) + 3.0 * self._floor_square
-        weights = 0.5 / np.sqrt(np.maximum(variances, VARIANCE_FLOOR)) / len(variances)
-        flat = (self._left * np.sqrt(weights)[:, None, None]).reshape(-1, self._left.shape[2])
-        self._moment = flat.T @ flat
 
     def _reduced(self, roots: FloatArray) -> FloatArray:
         return _under(self._factor, roots)

@@ -135,7 +135,10 @@ class GroupedModel:
         active = self.variances if active is None else active
         moments = self._moments if moments is None else moments
         index = self.index(active)
-        variance = self._variance(active)
+        parts: list[FloatArray] = [np.ones(len(self._centre))]
+        for name, value in active.items():
+            parts.append(value * np.ones(self._columns[name].stop - self._columns[name].start))
+        variance = np.concatenate(parts)
         precision = 1.0 / self.noise**2
         centre = np.zeros(len(index))
         centre[: len(self._centre)] = self._centre
@@ -308,12 +311,6 @@ class GroupedModel:
         gains = 0.5 * (tried * squares / (1.0 + tried * values) - np.log1p(tried * values)).sum(axis=1)
         best = int(gains.argmax())
         return float(gains[best]), float(tried[best, 0])
-
-    def _variance(self, active: Mapping[str, float]) -> FloatArray:
-        parts: list[FloatArray] = [np.ones(len(self._centre))]
-        for name, value in active.items():
-            parts.append(value * np.ones(self._columns[name].stop - self._columns[name].start))
-        return np.concatenate(parts)
 
     def _used(self, active: Mapping[str, float], determined: FloatArray) -> dict[str, float]:
         used: dict[str, float] = {}
