@@ -437,7 +437,7 @@ class OnlineLearner:
             if solved.model is not None:
                 regime.take(solved, solved.model, self._solving.fed)
             if solved.orientation is not None:
-                regime.take_orientation(solved.orientation)
+                regime.orientations.take(solved.orientation)
             self._publish()
         return True
 

@@ -17,7 +17,6 @@ from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.model_bank import EXACT, INSTANT, PRIOR, RESIDUAL, RIGID, LearntModel, ModelBank
 from bodyschema.learning.orientation import FEWEST_TO_BELIEVE, OrientationModel, Orientations
 from bodyschema.learning.replay_memory import PairMemory, Permutations
-from bodyschema.learning.solvers.orientation import OrientationSolution
 from bodyschema.learning.solvers.solver import Solved, Task
 from bodyschema.learning.state import NET, LearningHeader
 from bodyschema.learning.uncertainty import UncertaintyTracker
@@ -303,9 +302,6 @@ class Regime:
         variance = self._claims.errors[PRIOR].noise_variance
         residual = self._claims.residual
         self.monitor.offer(Reference(self.model, self.map, belief, wide, residual, claim, known, q, x, variance))
-
-    def take_orientation(self, solution: OrientationSolution) -> None:
-        self.orientations.take(solution)
 
     @property
     def orientation(self) -> OrientationModel | None:

@@ -152,7 +152,8 @@ class ChangeMonitor:
         self._next_at = self._asked_at = 0
         self._pairs: list[_Watched] = []
         self._earlier: deque[_Watched] = deque(maxlen=LOOKED_BACK)
-        self._detector: ChangeDetector | None = None
+        # Compares the pairs with the current reference; None before there is one.
+        self.detector: ChangeDetector | None = None
         self._white = WhiteNoise.as_claimed(0)
         self._change: ChangeScore | None = None
         self._look_at = 0
@@ -162,11 +163,7 @@ class ChangeMonitor:
     @property
     def ready(self) -> bool:
         """True if there is a reference that has been tried out."""
-        return self._detector is not None and self._shown is not None
-
-    @property
-    def detector(self) -> ChangeDetector | None:
-        return self._detector
+        return self.detector is not None and self._shown is not None
 
     @property
     def held(self) -> int:
@@ -208,15 +205,15 @@ class ChangeMonitor:
         for pair, learnt in zip(pairs, np.broadcast_to(kept, len(pairs)).tolist(), strict=True):
             turn = np.full(4, np.nan) if pair.R is None else pair.R
             self._pairs.append(_Watched(pair.seq, pair.q, pair.x, pair.cov, turn, learnt))
-        if self._detector is None:
+        if self.detector is None:
             return
         self._feed(self._pairs[-len(pairs) :])
         if not self.ready:
             if self._reference is not None and len(self._pairs) >= _trial(self._reference.known):
                 self._show()
                 self._hold(self._reference)
-        elif self._detector.due:
-            self._suspect(self._detector)
+        elif self.detector.due:
+            self._suspect(self.detector)
         tried = len(self._pairs) - self._next_at
         if self._next is not None and self.ready and not self.alarmed and tried >= _trial(self._next.known):
             self._show()
@@ -243,7 +240,7 @@ class ChangeMonitor:
         Args:
             run: number of the last pairs that have shown it in another way: it began there if not before.
         """
-        reference, detector = self._reference, self._detector
+        reference, detector = self._reference, self.detector
         if reference is None or detector is None or not self.ready or not (self.alarmed or run):
             return None
         first = earliest = latest = len(self._pairs) - run
@@ -267,9 +264,9 @@ class ChangeMonitor:
 
     def _show(self) -> None:
         """Record the distances of the pairs from a model that does not know them."""
-        if self._detector is None or self._reference is None:
+        if self.detector is None or self._reference is None:
             return
-        surprises = self._detector.surprises
+        surprises = self.detector.surprises
         pairs = self._pairs[-len(surprises) :]
         q, _, covariances = self._measured(self._reference, pairs)
         # In metres, because the next weighting of pairs may differ.
@@ -306,10 +303,10 @@ class ChangeMonitor:
         noise = seen.at_least(SharedNoise.repeated(read).times(seen.single))
         noise_m = float(np.sqrt(noise.single * _traces(covariances).mean() / 3.0))
         distance_m = float(np.linalg.norm(reference.x, axis=1).mean())
-        self._detector = ChangeDetector(reference.belief, noise, noise_m, distance_m)
+        self.detector = ChangeDetector(reference.belief, noise, noise_m, distance_m)
         if float(np.square(reference.beyond_chain(q)).mean()) < (_Settings.alone * noise_m) ** 2:
             # Terms that another model learnt from these pairs would hide the arm's bends.
-            self._detector.recall(q, reference.x - reference.belief.predict(q), covariances)
+            self.detector.recall(q, reference.x - reference.belief.predict(q), covariances)
         self._change, self._look_at = None, 0
         self._odds = self._refuted_odds = -math.inf
         self._feed(self._pairs)
@@ -320,8 +317,8 @@ class ChangeMonitor:
         return SharedNoise.of(np.matvec(inverse_roots(covariances), shown.off))
 
     def _feed(self, pairs: Sequence[_Watched]) -> None:
-        if self._reference is not None and self._detector is not None and pairs:
-            self._detector.add(*self._measured(self._reference, pairs))
+        if self._reference is not None and self.detector is not None and pairs:
+            self.detector.add(*self._measured(self._reference, pairs))
 
     def _measured(self, reference: Reference, pairs: Sequence[_Watched]) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return joint values (n, d), errors (n, 3) [m] and the covariances of these (n, 3, 3) [m²]."""

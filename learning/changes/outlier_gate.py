@@ -32,16 +32,12 @@ class OutlierGate:
 
     def __init__(self, joints: int) -> None:
         self._memory = PairMemory(joints, CHANGE)
-        self._in_a_row = 0
-
-    @property
-    def in_a_row(self) -> int:
-        return self._in_a_row
+        self.in_a_row = 0
 
     @property
     def changed(self) -> bool:
         """True if the run of outliers is long enough to prove a change."""
-        return self._in_a_row >= CHANGE
+        return self.in_a_row >= CHANGE
 
     @property
     def perhaps_changed(self) -> bool:
@@ -51,7 +47,7 @@ class OutlierGate:
     def doubt(self, q: FloatArray, x: FloatArray, distance_m: float, limit_m: float) -> bool:
         """Return True if the pair at q (d,), x (3,), `distance_m` from its prediction, is an outlier."""
         doubted = distance_m > limit_m
-        self._in_a_row = self._in_a_row + 1 if doubted else 0
+        self.in_a_row = self.in_a_row + 1 if doubted else 0
         if doubted:
             self._memory.append(q[None], x[None])
         else:
@@ -65,7 +61,7 @@ class OutlierGate:
     def restore(self, q: FloatArray, x: FloatArray, in_a_row: int) -> None:
         """Resume from the run q (n, d), x (n, 3), of which `in_a_row` were counted."""
         self._memory.restore(q, x, in_a_row)
-        self._in_a_row = in_a_row
+        self.in_a_row = in_a_row
 
 
 def sound(distances_m: FloatArray, noise_m: float) -> NDArray[np.bool_]:
