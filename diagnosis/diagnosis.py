@@ -75,39 +75,22 @@ MOST_DOUBTFUL = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """The errors found in a simulation, with all that a report shows of them.
+    """The errors found in a simulation, with all that a report shows of them."""
 
-    Attributes:
-        hypotheses: the effects that were tested, and the reasons why others were not.
-        nominal: the unchanged simulation.
-        aligned: fit of the parameters that robot.toml does not know.
-        geometry: fit with all lengths, axes, joint offsets, the tool and the camera's pose free.
-        extended: fit with the causes, the tolerances, and the smooth model of the unnamed causes.
-        alone: the same without the smooth model.
-        stored: the part of it that is surely better on another recording, which is written to extended.toml.
-        tolerated: sizes of the tolerances.
-        standings: assessment of each cause against its rivals.
-        left: residual structure that no effect fits.
-        blocks: blocks of time for held-out errors.
-        seed: seed of the resampling.
-        part: the observations in which causes were sought; None for all.
-        ended_early: True if the causes describe the error and do not explain it, as there are too many.
-    """
-
-    hypotheses: Hypotheses
-    nominal: Fit
-    aligned: Fit
-    geometry: Fit
-    extended: Fit
-    alone: Fit
-    stored: Fit
-    tolerated: Tolerated
-    standings: tuple[Standing, ...]
-    left: Leftover
-    blocks: Blocks
-    seed: int
-    part: Observations | None = None
-    ended_early: bool = False
+    hypotheses: Hypotheses  # the effects that were tested, and the reasons why others were not
+    nominal: Fit  # the unchanged simulation
+    aligned: Fit  # fit of the parameters that robot.toml does not know
+    geometry: Fit  # fit with all lengths, axes, joint offsets, the tool and the camera's pose free
+    extended: Fit  # fit with the causes, the tolerances, and the smooth model of the unnamed causes
+    alone: Fit  # the same without the smooth model
+    stored: Fit  # the part of it that is surely better on another recording, which is written to extended.toml
+    tolerated: Tolerated  # sizes of the tolerances
+    standings: tuple[Standing, ...]  # assessment of each cause against its rivals
+    left: Leftover  # residual structure that no effect fits
+    blocks: Blocks  # blocks of time for held-out errors
+    seed: int  # seed of the resampling
+    part: Observations | None = None  # the observations in which causes were sought; None for all
+    ended_early: bool = False  # True if the causes describe the error and do not explain it, as there are too many
 
     @property
     def causes(self) -> tuple[Effect, ...]:
@@ -344,24 +327,16 @@ def diagnose(
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """What a search found in some observations.
+    """What a search found in some observations."""
 
-    Attributes:
-        start: fit of the parameters that robot.toml does not know.
-        standings: assessment of each cause against its rivals.
-        loose: play of the marker; None for one that is fixed.
-        is_reshaped: True if the noise has another shape than stated.
-        part: what was found in a part of the observations; None where all were searched.
-    """
-
-    start: Fit
+    start: Fit  # fit of the parameters that robot.toml does not know
     search: Search
     unknowns: Unknowns
     explanation: Explanation
-    standings: Sequence[Standing]
-    loose: Rattle | None
-    is_reshaped: bool
-    part: _Found | None = None
+    standings: Sequence[Standing]  # assessment of each cause against its rivals
+    loose: Rattle | None  # play of the marker; None for one that is fixed
+    is_reshaped: bool  # True if the noise has another shape than stated
+    part: _Found | None = None  # what was found in a part of the observations; None where all were searched
 
     def left(self, blocks: Blocks) -> Leftover:
         # In many rows, all families take much memory to find nothing again.

@@ -8,15 +8,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """A part of the work.
+    """A part of the work."""
 
-    Attributes:
-        what: short description.
-        ends: share of the work done at its end [%], from times of some hundred pairs.
-    """
-
-    what: str
-    ends: float
+    what: str  # short description
+    ends: float  # share of the work done at its end [%], from times of some hundred pairs
 
 
 SETS = Stage("comparing sets of causes", 45.0)

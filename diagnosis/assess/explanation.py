@@ -41,25 +41,15 @@ class _Settings:
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """A set of named causes with a set of unnamed ones.
+    """A set of named causes with a set of unnamed ones."""
 
-    Attributes:
-        fit: the fit with the named causes alone.
-        apart: fit with the unnamed causes removed from the data; None if there is no unnamed cause.
-        worth: log-evidence of the whole, comparable only with that of other explanations [nats].
-        size: RMS change by the unnamed causes beyond the named ones, in units of the stated noise.
-        promise: first-order gain of the best single unnamed cause beside the named ones [nats].
-        counted: effective number of independent rows per row (0, 1].
-        inexact: RMS change by an imperfect shape of the named causes, in the same units.
-    """
-
-    fit: Fit
-    apart: Apart | None
-    worth: float
-    size: float = 0.0
-    promise: float = -np.inf
-    counted: float = 1.0
-    inexact: float = 0.0
+    fit: Fit  # the fit with the named causes alone
+    apart: Apart | None  # fit with the unnamed causes removed from the data; None if there is no unnamed cause
+    worth: float  # log-evidence of the whole, comparable only with that of other explanations [nats]
+    size: float = 0.0  # RMS change by the unnamed causes beyond the named ones, in units of the stated noise
+    promise: float = -np.inf  # first-order gain of the best single unnamed cause beside the named ones [nats]
+    counted: float = 1.0  # effective number of independent rows per row (0, 1]
+    inexact: float = 0.0  # RMS change by an imperfect shape of the named causes, in the same units
 
     @property
     def wanders(self) -> bool:

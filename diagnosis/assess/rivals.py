@@ -45,25 +45,15 @@ PROBABLE = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Rival:
-    """An alternative to a cause.
+    """An alternative to a cause."""
 
-    Attributes:
-        instead: the fit with it in the place of the cause.
-        itself: the effect with its best-fitting numbers, or what has no name.
-        probability: given that the cause or one of its rivals is present.
-        difference: Δχ² by which this motion is expected to separate them.
-        anywhere: the same for as many poses over the whole range of the joints.
-        signal: Δχ² of the cause itself on those poses.
-        is_one: True if the cause, refitted, also covers this rival on any motion, and it does not matter which is
-            corrected.
-    """
-
-    instead: Fit | Nameless
-    itself: Effect | Nameless
-    probability: float
-    difference: float
-    anywhere: float
-    signal: float
+    instead: Fit | Nameless  # the fit with it in the place of the cause
+    itself: Effect | Nameless  # the effect with its best-fitting numbers, or what has no name
+    probability: float  # given that the cause or one of its rivals is present
+    difference: float  # Δχ² by which this motion is expected to separate them
+    anywhere: float  # the same for as many poses over the whole range of the joints
+    signal: float  # Δχ² of the cause itself on those poses
+    # True if the cause, refitted, also covers this rival on any motion, and it does not matter which is corrected
     is_one: bool
 
     @property
@@ -79,23 +69,15 @@ class Rival:
 
 @dataclass(frozen=True, eq=False)
 class Standing:
-    """Assessment of one cause against all rivals.
+    """Assessment of one cause against all rivals."""
 
-    Attributes:
-        itself: the cause with its best first-order fit.
-        probability: probability of the cause or its equivalents.
-        dof: number of its amounts that the data determine.
-        gain: its Δχ².
-        rivals: the probable ones, the most probable first.
-        is_like_sag: True if a joint that gives under the arm's weight explains nearly as much, and was not tested, or
-            with weights that are assumed.
-    """
-
-    itself: Candidate
-    probability: float
-    dof: int
-    gain: float
-    rivals: tuple[Rival, ...]
+    itself: Candidate  # the cause with its best first-order fit
+    probability: float  # probability of the cause or its equivalents
+    dof: int  # number of its amounts that the data determine
+    gain: float  # its Δχ²
+    rivals: tuple[Rival, ...]  # the probable ones, the most probable first
+    # True if a joint that gives under the arm's weight explains nearly as much, and was not tested, or with weights
+    # that are assumed
     is_like_sag: bool = False
 
 

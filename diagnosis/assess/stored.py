@@ -57,16 +57,11 @@ def is_better_with(model: SmoothModel, simpler: Fit, markers: NDArray[np.bool_],
 
 @dataclass(frozen=True, eq=False)
 class _Elsewhere:
-    """What a fit is expected to do on another recording.
-
-    Attributes:
-        squares: sum of squared held-out errors in each long block, over the number of all rows (blocks,) [m²].
-        variance: mean squared distance between its predictions of new poses [m²].
-    """
+    """What a fit is expected to do on another recording."""
 
     fit: Fit
-    squares: FloatArray
-    variance: float
+    squares: FloatArray  # sum of squared held-out errors in each long block, over the number of all rows (blocks,) [m²]
+    variance: float  # mean squared distance between its predictions of new poses [m²]
 
     @classmethod
     def of(cls, fit: Fit, markers: NDArray[np.bool_]) -> _Elsewhere:

@@ -51,29 +51,17 @@ class _Settings:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A simulation fitted to observations.
+    """A simulation fitted to observations."""
 
-    Attributes:
-        observations: the data of the fit.
-        simulation: with all effects, the nuisances first.
-        nuisances: number of leading effects that are not findings.
-        background: changes that the tolerances allow.
-        tolerated: amount of each of them (p,).
-        run: the simulation over the observed motion.
-        residuals: (n, 3) in units of the stated noise.
-        noise: the fitted noise model.
-        tangent: derivatives about a similar fit, for the first steps; None where there is none.
-    """
-
-    observations: Observations
-    simulation: Simulation
-    nuisances: int
-    background: Background
-    tolerated: FloatArray
-    run: Simulated
-    residuals: FloatArray
-    noise: Noise
-    tangent: Tangent | None = None
+    observations: Observations  # the data of the fit
+    simulation: Simulation  # with all effects, the nuisances first
+    nuisances: int  # number of leading effects that are not findings
+    background: Background  # changes that the tolerances allow
+    tolerated: FloatArray  # amount of each of them (p,)
+    run: Simulated  # the simulation over the observed motion
+    residuals: FloatArray  # (n, 3) in units of the stated noise
+    noise: Noise  # the fitted noise model
+    tangent: Tangent | None = None  # derivatives about a similar fit, for the first steps; None where there is none
 
     @property
     def causes(self) -> tuple[Effect, ...]:

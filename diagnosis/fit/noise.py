@@ -37,18 +37,12 @@ class Noise:
     """A mixture: most fixes have the stated noise times `sigma`; a share of outliers lies anywhere.
 
     Outliers are scattered. Where many rows in a row are off, something has changed.
-
-    Attributes:
-        sigma: size of the noise, in units of the stated one.
-        share: share of outliers.
-        weights: probability of each fix to be the marker (n,).
-        log_likelihood: log-likelihood of all residuals [nats].
     """
 
-    sigma: float
-    share: float
-    weights: FloatArray
-    log_likelihood: float
+    sigma: float  # size of the noise, in units of the stated one
+    share: float  # share of outliers
+    weights: FloatArray  # probability of each fix to be the marker (n,)
+    log_likelihood: float  # log-likelihood of all residuals [nats]
 
     @classmethod
     def of(

@@ -29,29 +29,18 @@ _SAME_READING, _FEWEST_GAPS, _OFF_A_MULTIPLE = 1e-9, 20, 0.02
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Measured positions over a motion.
+    """Measured positions over a motion."""
 
-    Attributes:
-        motion: the encoder readings.
-        x: measured positions (n, 3) [m].
-        stated: covariance (n, 3, 3) [m²] of the instrument, known up to one factor.
-        rounding: covariance (n, 3, 3) [m²] from encoder quantisation.
-        stated_factor: factor of the instrument's standard deviations over the stated ones.
-        doubtful: rows (n,) at which the simulation lacks a state it needs; None for no such rows.
-        rattling: covariance (n, 3, 3) [m²] of a loose marker; None for one that is fixed.
-        play: displacement (n, 3) [m] of a loose marker that was taken out of `x`; 0 for none.
-        is_whole: True if no row is ignored, since each is predicted by its own readings alone.
-    """
-
-    motion: Motion
-    x: FloatArray
-    stated: FloatArray
-    rounding: FloatArray
-    stated_factor: float = 1.0
+    motion: Motion  # the encoder readings
+    x: FloatArray  # measured positions (n, 3) [m]
+    stated: FloatArray  # covariance (n, 3, 3) [m²] of the instrument, known up to one factor
+    rounding: FloatArray  # covariance (n, 3, 3) [m²] from encoder quantisation
+    stated_factor: float = 1.0  # factor of the instrument's standard deviations over the stated ones
+    # rows (n,) at which the simulation lacks a state it needs; None for no such rows
     doubtful: NDArray[np.bool_] | None = None
-    rattling: FloatArray | None = None
-    play: FloatArray | float = 0.0
-    is_whole: bool = False
+    rattling: FloatArray | None = None  # covariance (n, 3, 3) [m²] of a loose marker; None for one that is fixed
+    play: FloatArray | float = 0.0  # displacement (n, 3) [m] of a loose marker that was taken out of `x`; 0 for none
+    is_whole: bool = False  # True if no row is ignored, since each is predicted by its own readings alone
 
     @classmethod
     def of(cls, recording: Recording, simulation: Simulation) -> Observations:

@@ -24,21 +24,13 @@ _ROUNDED_OFF = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """Normal equations of m choices of k columns each.
+    """Normal equations of m choices of k columns each."""
 
-    Attributes:
-        inner: products (m, k, k), after projecting out the fitted parameters.
-        onto: products with the directions that the fitted amounts can change (m, k, r).
-        toward: products with the residuals (m, k, s), in each of the s places.
-        raw: squares (m, k) of the unprojected columns.
-        freed: directions (r, f) that are freed, in each of the places.
-    """
-
-    inner: FloatArray
-    onto: FloatArray
-    toward: FloatArray
-    raw: FloatArray
-    freed: Sequence[FloatArray]
+    inner: FloatArray  # products (m, k, k), after projecting out the fitted parameters
+    onto: FloatArray  # products with the directions that the fitted amounts can change (m, k, r)
+    toward: FloatArray  # products with the residuals (m, k, s), in each of the s places
+    raw: FloatArray  # squares (m, k) of the unprojected columns
+    freed: Sequence[FloatArray]  # directions (r, f) that are freed, in each of the places
 
     @classmethod
     def of(cls, inner: FloatArray, onto: FloatArray, toward: FloatArray, freed: Sequence[FloatArray]) -> System:
@@ -142,19 +134,12 @@ class Products:
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Contributions of each row to the normal equations of columns (n, 3, k).
+    """Contributions of each row to the normal equations of columns (n, 3, k)."""
 
-    Attributes:
-        inner: products with one another (n, k, k).
-        onto: products with the directions that the fitted amounts can change (n, k, r).
-        toward: products with the residuals (n, k, s), in each of the places.
-        freed: as in `System`.
-    """
-
-    inner: FloatArray
-    onto: FloatArray
-    toward: FloatArray
-    freed: Sequence[FloatArray]
+    inner: FloatArray  # products with one another (n, k, k)
+    onto: FloatArray  # products with the directions that the fitted amounts can change (n, k, r)
+    toward: FloatArray  # products with the residuals (n, k, s), in each of the places
+    freed: Sequence[FloatArray]  # as in `System`
 
     def scaled(self, factors: FloatArray) -> System:
         """Return the system of rows times factors (n, m)."""

@@ -60,20 +60,14 @@ _LOPSIDED = 0.3
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """One formatted number of a cause.
+    """One formatted number of a cause."""
 
-    Attributes:
-        label: name of the quantity.
-        value, interval: with unit; the interval as a half width or as both ends, "" where there is none.
-        may_be_none: True if its interval contains zero.
-        is_told: True if the recording determines it.
-    """
-
-    label: str
+    label: str  # name of the quantity
+    # value, interval: with unit; the interval as a half width or as both ends, "" where there is none
     value: str
     interval: str
-    may_be_none: bool
-    is_told: bool = True
+    may_be_none: bool  # True if its interval contains zero
+    is_told: bool = True  # True if the recording determines it
 
     def __str__(self) -> str:
         return f"{self.value} {self.interval}".rstrip()

@@ -17,17 +17,11 @@ from .residuals import ARROWS, POINTS, Residuals, binned, structure
 
 @dataclass(frozen=True)
 class Panel:
-    """A plot with its title.
+    """A plot with its title."""
 
-    Attributes:
-        title: description of the plot.
-        svg: the plot.
-        tells: share of the variance before that depends on the plotted quantity.
-    """
-
-    title: str
-    svg: str
-    tells: float = 1.0
+    title: str  # description of the plot
+    svg: str  # the plot
+    tells: float = 1.0  # share of the variance before that depends on the plotted quantity
 
     @property
     def is_telling(self) -> bool:

@@ -34,21 +34,16 @@ ASPECT = (Layout.right - Layout.left) / (Layout.bottom - Layout.top)
 
 @dataclass(frozen=True)
 class Plot:
-    """Axes: x is linear, y is linear or logarithmic.
+    """Axes: x is linear, y is linear or logarithmic."""
 
-    Attributes:
-        x_label, y_label: with units.
-        x, y: their ranges; from high to low where the axis runs the other way.
-        names: labels for whole numbers on the x axis, instead of figures.
-        log_y: True for a logarithmic y axis; its range is positive.
-    """
-
+    # x_label, y_label: with units
     x_label: str
     y_label: str
+    # x, y: their ranges; from high to low where the axis runs the other way
     x: tuple[float, float]
     y: tuple[float, float]
-    names: Sequence[str] = ()
-    log_y: bool = False
+    names: Sequence[str] = ()  # labels for whole numbers on the x axis, instead of figures
+    log_y: bool = False  # True for a logarithmic y axis; its range is positive
 
     def svg(self, *marks: str) -> str:
         """Return the plot with marks, the first at the back."""

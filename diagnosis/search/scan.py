@@ -48,21 +48,13 @@ _Tried = tuple[int, FloatArray, FloatArray, int]
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A hypothesis with its best first-order fit.
+    """A hypothesis with its best first-order fit."""
 
-    Attributes:
-        effect: with the amounts of the linear fit, and the moment or period found.
-        gain: Δχ².
-        dof: number of its amounts that the data determine.
-        trials: number of moments, periods or choices of its numbers tried.
-        interval: 95 % interval of the moment; None for an effect that has none.
-    """
-
-    effect: Effect
-    gain: float
-    dof: int
-    trials: float = 1
-    interval: tuple[float, float] | None = None
+    effect: Effect  # with the amounts of the linear fit, and the moment or period found
+    gain: float  # Δχ²
+    dof: int  # number of its amounts that the data determine
+    trials: float = 1  # number of moments, periods or choices of its numbers tried
+    interval: tuple[float, float] | None = None  # 95 % interval of the moment; None for an effect that has none
 
 
 class Scan:

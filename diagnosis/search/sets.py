@@ -61,31 +61,18 @@ _Solution = tuple[FloatArray, FloatArray, FloatArray]
 
 @dataclass(frozen=True, eq=False)
 class Together:
-    """A set of causes with its evidence.
+    """A set of causes with its evidence."""
 
-    Attributes:
-        chosen: indices of its candidates.
-        worth: its evidence less the cost of naming its causes [nats]; comparable only with that of other sets.
-        scales: scales of the tolerances.
-        logs: logarithms of these scales, then of the sizes of poses in usual ones.
-        group: the index (p,) in `logs` of each column's prior width; -1 where it is 1.
-        sigma: size of the noise, in units of the stated one.
-        spent: effective number of data that determine each scale (4,).
-        amounts: amounts of all its columns (p,).
-        factor: lower Cholesky factor (p, p) of their precision; what is above its diagonal has no meaning.
-        columns: indices of its columns (p,).
-    """
-
-    chosen: tuple[int, ...]
-    worth: float
-    scales: Scales
-    logs: FloatArray
-    group: NDArray[np.int64]
-    sigma: float
-    spent: FloatArray
-    amounts: FloatArray
-    factor: FloatArray
-    columns: NDArray[np.intp]
+    chosen: tuple[int, ...]  # indices of its candidates
+    worth: float  # its evidence less the cost of naming its causes [nats]; comparable only with that of other sets
+    scales: Scales  # scales of the tolerances
+    logs: FloatArray  # logarithms of these scales, then of the sizes of poses in usual ones
+    group: NDArray[np.int64]  # the index (p,) in `logs` of each column's prior width; -1 where it is 1
+    sigma: float  # size of the noise, in units of the stated one
+    spent: FloatArray  # effective number of data that determine each scale (4,)
+    amounts: FloatArray  # amounts of all its columns (p,)
+    factor: FloatArray  # lower Cholesky factor (p, p) of their precision; what is above its diagonal has no meaning
+    columns: NDArray[np.intp]  # indices of its columns (p,)
 
     @cached_property
     def covariance(self) -> FloatArray:

@@ -34,19 +34,12 @@ _FOLLOWED = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Tolerated:
-    """Estimated sizes of the tolerances.
+    """Estimated sizes of the tolerances."""
 
-    Attributes:
-        scales: the most probable ones.
-        unsure: standard deviations of their logarithms (4,).
-        seen: True for scales that show in the data (4,).
-        most: the largest ones (4,) that the data do not rule out with 95 %; of use where they do not show.
-    """
-
-    scales: Scales
-    unsure: FloatArray
-    seen: NDArray[np.bool_]
-    most: FloatArray
+    scales: Scales  # the most probable ones
+    unsure: FloatArray  # standard deviations of their logarithms (4,)
+    seen: NDArray[np.bool_]  # True for scales that show in the data (4,)
+    most: FloatArray  # the largest ones (4,) that the data do not rule out with 95 %; of use where they do not show
 
 
 def together(start: Fit, hypotheses: Sequence[Effect], tell: Callable[[str], None] = lambda _: None) -> Fit:

@@ -37,32 +37,22 @@ Columns = Callable[[Simulated], FloatArray]
 
 @dataclass(frozen=True, eq=False)
 class Family:
-    """One family of smooth errors.
+    """One family of smooth errors."""
 
-    Attributes:
-        what: short description.
-        kind: the erring part: a joint, a body (a link, the tool, the camera), the place in the image, or the clock.
-        joint: the erring joint, or the joint after the erring link; None where there is no single joint.
-        drivers: the one or two joints on which alone it depends; empty for other families.
-        over_time: True if it depends on time.
-        moves: displacements (n, 3, a) [m] per unit of each motion.
-        amounts: functions (n, b) that it may depend on; each motion is a linear combination of them.
-        ties: instead, each motion is proportional to its own amount (b = a), by factors that are these mixtures (a, p)
-            of the parameters; None for free functions.
-        is_specific: True if it is as specific as a named effect.
-        undone: function from measured positions (n, 3) and parameters (p,) to the positions (n, 3) without it; None
-            where subtracting the linear columns is exact.
-    """
-
-    what: str
+    what: str  # short description
+    # the erring part: a joint, a body (a link, the tool, the camera), the place in the image, or the clock
     kind: Literal["joint", "body", "place", "clock"]
-    joint: int | None
-    drivers: tuple[int, ...]
-    over_time: bool
-    moves: Columns
-    amounts: Columns
+    joint: int | None  # the erring joint, or the joint after the erring link; None where there is no single joint
+    drivers: tuple[int, ...]  # the one or two joints on which alone it depends; empty for other families
+    over_time: bool  # True if it depends on time
+    moves: Columns  # displacements (n, 3, a) [m] per unit of each motion
+    amounts: Columns  # functions (n, b) that it may depend on; each motion is a linear combination of them
+    # instead, each motion is proportional to its own amount (b = a), by factors that are these mixtures (a, p) of the
+    # parameters; None for free functions
     ties: FloatArray | None = None
-    is_specific: bool = False
+    is_specific: bool = False  # True if it is as specific as a named effect
+    # function from measured positions (n, 3) and parameters (p,) to the positions (n, 3) without it; None where
+    # subtracting the linear columns is exact
     undone: Callable[[FloatArray, FloatArray], FloatArray] | None = None
 
     def columns(self, run: Simulated) -> FloatArray:

@@ -43,20 +43,13 @@ _HARMONICS = {1: 14, 2: 4}
 
 @dataclass(frozen=True, eq=False)
 class SmoothModel:
-    """Smooth functions of families, fitted to the residuals of the causes.
+    """Smooth functions of families, fitted to the residuals of the causes."""
 
-    Attributes:
-        fit: the causes beside the stored part, which is in its simulation.
-        stored: the learnt model; None where everything changes with time or no lasting part remains.
-        explained: prediction of the functions at the rows (n, 3) [m].
-        unstored: the time-dependent part of it, which is not in the fit's simulation.
-        unseen: change of each row's prediction by the stored simulation due to that row being fitted (n, 3) [m].
-    """
-
-    fit: Fit
-    stored: Unexplained | None
-    explained: FloatArray
-    unstored: FloatArray
+    fit: Fit  # the causes beside the stored part, which is in its simulation
+    stored: Unexplained | None  # the learnt model; None where everything changes with time or no lasting part remains
+    explained: FloatArray  # prediction of the functions at the rows (n, 3) [m]
+    unstored: FloatArray  # the time-dependent part of it, which is not in the fit's simulation
+    # change of each row's prediction by the stored simulation due to that row being fitted (n, 3) [m]
     unseen: FloatArray
 
 

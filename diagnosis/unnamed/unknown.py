@@ -49,21 +49,13 @@ class _Settings:
 
 @dataclass(frozen=True, eq=False)
 class Way:
-    """A family, or a part of one, prepared for fits of the same observations.
+    """A family, or a part of one, prepared for fits of the same observations."""
 
-    Attributes:
-        family: the family.
-        moved: displacements (n, 3, m), whitened; many are scaled to about unit length, a single one is shared.
-        functions: functions (n, a) of each motion, scaled so that their columns have about unit length.
-        scales: lengths of the columns (p,): those of the motions times those of the functions.
-        choice: number of further parameters spent on choosing the part.
-    """
-
-    family: Family
-    moved: FloatArray
-    functions: FloatArray
-    scales: FloatArray
-    choice: int = 0
+    family: Family  # the family
+    moved: FloatArray  # displacements (n, 3, m), whitened; many are scaled to about unit length, a single one is shared
+    functions: FloatArray  # functions (n, a) of each motion, scaled so that their columns have about unit length
+    scales: FloatArray  # lengths of the columns (p,): those of the motions times those of the functions
+    choice: int = 0  # number of further parameters spent on choosing the part
 
     @classmethod
     def of(cls, family: Family, start: Fit, moved: FloatArray | None = None) -> Way:
@@ -138,21 +130,13 @@ class Way:
 
 @dataclass(frozen=True, eq=False)
 class Apart:
-    """A fit of the causes to the observations after removing the unnamed errors.
+    """A fit of the causes to the observations after removing the unnamed errors."""
 
-    Attributes:
-        observations: the complete observations.
-        chosen: the unnamed families.
-        numbers: parameters of each of them (p,).
-        fit: the fit of the causes.
-        precision: prior precision of these parameters, in units in which their columns have unit length.
-    """
-
-    observations: Observations
-    chosen: tuple[Way, ...]
-    numbers: tuple[FloatArray, ...]
-    fit: Fit
-    precision: float
+    observations: Observations  # the complete observations
+    chosen: tuple[Way, ...]  # the unnamed families
+    numbers: tuple[FloatArray, ...]  # parameters of each of them (p,)
+    fit: Fit  # the fit of the causes
+    precision: float  # prior precision of these parameters, in units in which their columns have unit length
 
     @property
     def predicted(self) -> FloatArray:

@@ -31,21 +31,15 @@ _DECIMAL = 1e-3
 
 @dataclass(frozen=True)
 class Found:
-    """A cause with its numbers.
+    """A cause with its numbers."""
 
-    Attributes:
-        where, source: the joint it acts on, and the joint that causes it; None where there is none.
-        numbers: of shifts and turns, only those given count.
-        seen_by: the kind of measuring device, as in `DiagnosisFile`.
-        timed: True if the recording has times; otherwise a moment is a row number.
-        weighed: True if the URDF states masses; otherwise compliances are those of links of an assumed weight.
-    """
-
+    # where, source: the joint it acts on, and the joint that causes it; None where there is none
     where: str | None
     source: str | None
-    numbers: Mapping[str, float]
-    seen_by: str = "camera"
-    timed: bool = True
+    numbers: Mapping[str, float]  # of shifts and turns, only those given count
+    seen_by: str = "camera"  # the kind of measuring device, as in `DiagnosisFile`
+    timed: bool = True  # True if the recording has times; otherwise a moment is a row number
+    # True if the URDF states masses; otherwise compliances are those of links of an assumed weight
     weighed: bool = True
 
     @classmethod
@@ -99,19 +93,12 @@ class Found:
 
 @dataclass(frozen=True)
 class Workshop:
-    """What is known of the robot to which a remedy is applied.
+    """What is known of the robot to which a remedy is applied."""
 
-    Attributes:
-        robot: the robot as described.
-        steps: encoder step of each joint (d,) [rad, m]; 0 where it is unknown.
-        torques: the largest torque of gravity on each joint (d,) [N·m, N].
-        causes: all causes, by effect.
-    """
-
-    robot: RobotDescription
-    steps: FloatArray
-    torques: FloatArray
-    causes: Mapping[str, Cause] = field(default_factory=dict)
+    robot: RobotDescription  # the robot as described
+    steps: FloatArray  # encoder step of each joint (d,) [rad, m]; 0 where it is unknown
+    torques: FloatArray  # the largest torque of gravity on each joint (d,) [N·m, N]
+    causes: Mapping[str, Cause] = field(default_factory=dict)  # all causes, by effect
 
     @property
     def in_urdf(self) -> str:
