@@ -22,17 +22,13 @@ IntArray = NDArray[np.intp]
 
 
 class _Settings:
-    # Where what is probable differs by more than this, the pairs do not tell.
-    told_within: float = 4.0
-    # A zero that is still as uncertain as it was before is nothing that the pairs show.
-    not_shown: float = 0.9
-    # Of the numerical derivatives by tilts, shifts and zeros [rad, m].
-    step: float = 1e-6
+    told_within: float = 4.0  # where what is probable differs by more than this, the pairs do not tell
+    not_shown: float = 0.9  # a zero that is still as uncertain as it was before is nothing that the pairs show
+    step: float = 1e-6  # of the numerical derivatives by tilts, shifts and zeros [rad, m]
     # Poses that stand for all, and the noise of exact pairs [m].
     poses: int = 100
     exact_m: float = 1e-6
-    # From one linearisation to the next the error along a curve is squared.
-    relinearised: int = 4
+    relinearised: int = 4  # from one linearisation to the next the error along a curve is squared
 
 
 HALF_WIDTH_95 = 1.959964

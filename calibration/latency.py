@@ -29,10 +29,8 @@ STEP_S = 0.004
 class _Settings:
     fewest_fixes: int = 60
     blocks: int = 10
-    # a second minimum is a rival if its residual is below this multiple of the best one's
-    rival: float = 1.15
-    # minimum distance of a rival
-    apart_s: float = 0.03
+    rival: float = 1.15  # a second minimum is a rival if its residual is below this multiple of the best one's
+    apart_s: float = 0.03  # minimum distance of a rival
     # relative to the largest motion: a direction without motion
     small: float = 1e-3
     ridge: float = 1e-6
@@ -45,10 +43,8 @@ class _Settings:
     # required ratio of the marker's RMS motion to its part that does not follow the joints
     follows: float = 4.0
     little_m: float = 0.01
-    # steps to reach the loosely fitted chain; from there two are enough
-    settling: int = 5
-    # on both sides of the smooth function's estimate
-    refined_s: float = 0.024
+    settling: int = 5  # steps to reach the loosely fitted chain; from there two are enough
+    refined_s: float = 0.024  # on both sides of the smooth function's estimate
 
 
 # Prior deviations of an arm from its URDF; they only constrain what the pairs do not determine.

@@ -27,8 +27,7 @@ class _Settings:
     explained_of_few: float = 0.8
     # Residuals beyond this multiple of the median get less weight, so that single outliers are no change.
     far: float = 5.0
-    # Excludes splits that the data cannot determine, e.g. where all poses are alike.
-    ridge: float = 1e-9
+    ridge: float = 1e-9  # Excludes splits that the data cannot determine, e.g. where all poses are alike.
     # Time stamps are late if the marker's velocity explains this share of the squared residuals: what they shift is
     # then a third of the scatter. In four simulated recordings at 0.2 m/s it is below 0.001 with stamps in time; 0.03
     # to 0.3 find delays from 1.5 to 4 ms on.
@@ -94,8 +93,7 @@ def _after(values: FloatArray) -> FloatArray:
     return np.cumsum(values[::-1], axis=0)[::-1][1:]
 
 
-# A joint that moved less is named [rad, m].
-STILL_RAD, STILL_M = math.radians(10.0), 0.02
+STILL_RAD, STILL_M = math.radians(10.0), 0.02  # a joint that moved less is named [rad, m]
 # Multiples of its tolerance beyond which a joint offset is reported, and beyond which it is not written. One in 370
 # exceeds the first if the tolerance is right; the second allows for a tolerance guessed at half its true value.
 FAR_OFF, TOO_FAR_OFF = 3.0, 5.0

@@ -37,10 +37,8 @@ STAGES: tuple[Stage, ...] = get_args(Stage)
 ShapeSearch = Literal["none", "moment", "cycles", "width", "shape", "load"]
 # Largest step of a period or a time constant, as a share of it; largest change in one step.
 _SHAPE_STEP, _SHAPE_CHANGE = 0.3, 2.0
-# Two moments at one place are told apart; further ones are a drift.
-_MOST_MOMENTS = 2
-# Step of numerical derivatives [rad, m, or a parameter's unit].
-STEP = 1e-6
+_MOST_MOMENTS = 2  # two moments at one place are told apart; further ones are a drift
+STEP = 1e-6  # step of numerical derivatives [rad, m, or a parameter's unit]
 
 
 class SimulatedArm(Protocol):
@@ -336,8 +334,7 @@ class TimeEffect(EffectType):
         return None
 
 
-# All effects by name, in order; `registry` enters them.
-EFFECT_TYPES: dict[str, EffectType] = {}
+EFFECT_TYPES: dict[str, EffectType] = {}  # all effects by name, in order; `registry` enters them
 
 
 @dataclass(frozen=True, eq=False)

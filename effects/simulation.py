@@ -38,10 +38,8 @@ from .motion import Motion
 from .optics import Optics
 from .parameter import Place
 
-# Relative step by a period or a time constant.
-_SHAPE_STEP = 1e-3
-# A spring's deflection changes its own load; each round adds the next order.
-SPRING_ROUNDS = 3
+_SHAPE_STEP = 1e-3  # relative step by a period or a time constant
+SPRING_ROUNDS = 3  # a spring's deflection changes its own load; each round adds the next order
 # Corrections (n,) of readings by the encoder effects that were evaluated there, as long as both live.
 _CORRECTIONS: WeakKeyDictionary[Motion, WeakKeyDictionary[Effect, FloatArray]] = WeakKeyDictionary()
 # Predictions (n, 3) of residuals, which no effect changes, as long as both live.

@@ -19,12 +19,10 @@ from kbmaps import JointBasis, KBMap
 from .unexplained import PLACE, Unexplained
 
 Shift = Callable[[FloatArray], FloatArray]
-# Maximum of harmonics, and of control points of a net.
-_MOST_HARMONICS, _LARGEST_NET = 15, 3**12
+_MOST_HARMONICS, _LARGEST_NET = 15, 3**12  # maximum of harmonics, and of control points of a net
 # Points along an axis and lines on which harmonics are sought; rows per batch.
 _POINTS, _LINES, _ROWS = 64, 12, 4096
-# Maximum of grid points.
-_LARGEST_GRID = 400_000
+_LARGEST_GRID = 400_000  # maximum of grid points
 
 
 @dataclass(frozen=True)

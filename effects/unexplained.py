@@ -15,8 +15,7 @@ from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.suggest import did_you_mean
 from kbmaps import KBMap, KBMapsError, KernelLearner, ModelFormatError, ResidualModel, TensorTrain
 
-# Coordinates of the marker, in place of a joint.
-PLACE = ("marker.x", "marker.y", "marker.z")
+PLACE = ("marker.x", "marker.y", "marker.z")  # coordinates of the marker, in place of a joint
 
 
 class StoredModel(Protocol):

@@ -29,8 +29,7 @@ from bodyschema.learning.status import ChainCalibration
 
 class _Settings:
     poses: int = 400
-    # With two robots, an outlier cannot be attributed to either.
-    fewest_to_judge: int = 3
+    fewest_to_judge: int = 3  # with two robots, an outlier cannot be attributed to either
     # A robot is off if one of its figures stands out, or if its model's distance from the median exceeds this multiple
     # of both the models' predicted errors and the robots' median distance.
     far: float = 3.0
@@ -39,8 +38,7 @@ class _Settings:
     rounds: int = 20
 
 
-# Standard error of a median of normal numbers, over that of their mean.
-MEDIAN_COSTS = math.sqrt(math.pi / 2.0)
+MEDIAN_COSTS = math.sqrt(math.pi / 2.0)  # standard error of a median of normal numbers, over that of their mean
 
 _quantile = NormalDist().inv_cdf
 

@@ -11,10 +11,8 @@ from kbmaps.pairs import Pairs
 
 # The norm of a residual with noise σ per axis has the median 1.538 σ in three dimensions (√ of χ²₃'s median).
 MEDIAN_NORM = 1.538
-# Residuals below a nanometre are rounding, even on noise-free data.
-ROUNDING_M = 1e-9
-# Variances [m² or rad²] below that of (1 pm)² are rounding.
-VARIANCE_FLOOR = 1e-24
+ROUNDING_M = 1e-9  # residuals below a nanometre are rounding, even on noise-free data
+VARIANCE_FLOOR = 1e-24  # variances [m² or rad²] below that of (1 pm)² are rounding
 # A pair this many sigma from its prediction by the others is an outlier: 3 in 100,000 good ones are farther out (chi,
 # three dimensions).
 OUTLIER_SIGMAS = 4.8

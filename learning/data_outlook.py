@@ -24,10 +24,8 @@ class _Settings:
     # Number of poses of a motion, and of the region where the arm is used. More would not make the figures steadier
     # than the posterior is.
     poses: int = 100
-    # A motion that gains this little more than continuing as so far is not reported.
-    worth: float = 0.05
-    # A gain below this share of the noise of a single measurement is not noticeable.
-    noticed: float = 0.1
+    worth: float = 0.05  # a motion that gains this little more than continuing as so far is not reported
+    noticed: float = 0.1  # a gain below this share of the noise of a single measurement is not noticeable
 
 
 @dataclass(frozen=True, eq=False)

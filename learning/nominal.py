@@ -30,10 +30,8 @@ from kbmaps.arrays import evenly_spread
 
 # Number of pairs after a tool change at which the tool is first fitted; later fits follow at doubled numbers.
 PAIRS_TO_REFIT = 5
-# A narrower stroke would make the basis needlessly stiff, and equal limits impossible.
-NARROWEST_STROKE_M = 0.1
-# Maximum number of postures at which an extended simulation is evaluated for a prior.
-LARGEST_GRID = 20_000
+NARROWEST_STROKE_M = 0.1  # a narrower stroke would make the basis needlessly stiff, and equal limits impossible
+LARGEST_GRID = 20_000  # maximum number of postures at which an extended simulation is evaluated for a prior
 
 
 @dataclass(frozen=True)

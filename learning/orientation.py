@@ -28,14 +28,11 @@ from kbmaps import (
     rotation_vectors,
 )
 
-# Order of trust while errors do not decide.
-TRUSTED = (RIGID, EXACT, PRIOR)
+TRUSTED = (RIGID, EXACT, PRIOR)  # order of trust while errors do not decide
 # The marker's rotation on the nominal chain's hand is fitted to at most this many first pairs, whenever they double.
 FIRST = 64
-# Minimum number of pairs to trust the solved chain before it has predicted any.
-FEWEST_TO_BELIEVE = 3
-# Mean length of a Gaussian turn over its RMS length, three equal axes.
-MEAN_OVER_RMS = 0.9213
+FEWEST_TO_BELIEVE = 3  # minimum number of pairs to trust the solved chain before it has predicted any
+MEAN_OVER_RMS = 0.9213  # mean length of a Gaussian turn over its RMS length, three equal axes
 
 
 class AngleMemory(msgspec.Struct):

@@ -23,16 +23,14 @@ from bodyschema.learning.uncertainty import UncertaintyTracker
 from bodyschema.learning.variance_terms import QueryPoints
 from kbmaps import ChainBelief, KBMap, Recent, follow_a_path
 
-# Number of learnt pairs on which a model's fit is assessed.
-LOOKED_BACK = 500
+LOOKED_BACK = 500  # number of learnt pairs on which a model's fit is assessed
 
 
 class _Settings:
     # Number of pairs that determine the errors of a refitted prior, and that are replayed on top of it.
     recent: int = 200
     replay_steps: int = 64
-    # Maximum number of pairs received during a solve that judge its solution.
-    judged_late: int = 100
+    judged_late: int = 100  # maximum number of pairs received during a solve that judge its solution
     # With this share of new pairs, the last solution no longer applies: the new one is judged by these pairs alone.
     judged_anew: float = 0.25
     looked_back_in_replay: int = 4

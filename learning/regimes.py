@@ -103,8 +103,7 @@ class Fitting:
             self._before = KBMap(self._nominal.bases, arrays["before_change"])
 
 
-# Ordinary RMS distance between a nominal model and reality [m].
-EXPECTED_M = 0.1
+EXPECTED_M = 0.1  # ordinary RMS distance between a nominal model and reality [m]
 
 
 class Regimes:

@@ -9,8 +9,7 @@ from bodyschema.interfaces.records import FloatArray
 
 IntArray = NDArray[np.intp]
 
-# Number of neighbours that are sampled together.
-RUN = 20
+RUN = 20  # number of neighbours that are sampled together
 
 
 class PairMemory:

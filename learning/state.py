@@ -15,16 +15,12 @@ from bodyschema.learning.orientation import OrientationState
 from bodyschema.learning.status import ChangeRecord, CurvePoint
 from bodyschema.learning.uncertainty import UncertaintyState
 
-# Prefix of the arrays of the state before a change.
-BEFORE = "before/"
-# Prefix of stored nets.
-NET = "net_"
-# Arrays with a row for each kept pair.
-PAIRS = ("q", "x", "cov", "turns")
+BEFORE = "before/"  # prefix of the arrays of the state before a change
+NET = "net_"  # prefix of stored nets
+PAIRS = ("q", "x", "cov", "turns")  # arrays with a row for each kept pair
 
 
-# of the learning curve
-MOST_POINTS = 400
+MOST_POINTS = 400  # of the learning curve
 
 
 class StateError(BodyschemaError):

@@ -79,10 +79,8 @@ class OrientationStatus(msgspec.Struct, frozen=True):
 
 
 TOOL, CAMERA, JOINT = "tool", "camera", "joint"
-# A kind at least this probable is named.
-NAMED = 0.95
-# A change is named or renamed within this many pairs; after them it stays as it is.
-NAMED_WITHIN = 500
+NAMED = 0.95  # a kind at least this probable is named
+NAMED_WITHIN = 500  # a change is named or renamed within this many pairs; after them it stays as it is
 
 
 class KindOfChange(msgspec.Struct, frozen=True):

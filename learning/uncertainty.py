@@ -24,8 +24,7 @@ from kbmaps import ChainBelief, JointBasis, PrequentialComparison, Recent, Resid
 from kbmaps.contest import CLEARLY
 from kbmaps.robust import OUTLIER_SIGMAS
 
-# Weight of the error one pair back: the memory is about 50 pairs long.
-DISCOUNT = 0.98
+DISCOUNT = 0.98  # Weight of the error one pair back: the memory is about 50 pairs long
 
 
 class ErrorMemory(msgspec.Struct):

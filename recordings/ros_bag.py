@@ -43,8 +43,7 @@ _NANO = 1_000_000_000
 # Of metadata.yaml, which is parsed at some 100 kB/s; a topic or a part of the bag takes 1 kB.
 MOST_METADATA_BYTES = 2**20
 MOST_SAID = 200  # characters of another library's message, which may quote the file
-# Messages that are looked at to learn which joints or frames a topic has.
-_FEW = 200
+_FEW = 200  # messages that are looked at to learn which joints or frames a topic has
 
 
 @dataclass(frozen=True)

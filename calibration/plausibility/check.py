@@ -33,12 +33,9 @@ class _Settings:
     # A fit with residuals above these shares of the positions' spread and of the arm's reach is not of this arm.
     unexplained: float = 0.25
     of_reach: float = 0.02
-    # ... and above this multiple of the known noise.
-    noises: float = 5.0
-    # Several markers are looked for from this share of the spread on.
-    of_one_marker: float = 0.01
-    # Distances below this share of the reach are not distinguished.
-    exact: float = 1e-5
+    noises: float = 5.0  # ... and above this multiple of the known noise.
+    of_one_marker: float = 0.01  # several markers are looked for from this share of the spread on
+    exact: float = 1e-5  # distances below this share of the reach are not distinguished
 
 
 def told_sigma(recording: Recording) -> float | None:

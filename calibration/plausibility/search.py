@@ -79,20 +79,16 @@ class _Settings:
     a_change: float = 3.0
     # A joint offset above this is mentioned: that of one in 300 generated arms with offsets of up to 10°.
     far_zero_rad: float = math.radians(20.0)
-    # ... unless the pairs fit about as well with half of it.
-    near_zero_rad: float = far_zero_rad / 2.0
-    # Share of its tolerance that is left to a joint offset that is held.
-    held: float = 1e-3
+    near_zero_rad: float = far_zero_rad / 2.0  # ... unless the pairs fit about as well with half of it.
+    held: float = 1e-3  # share of its tolerance that is left to a joint offset that is held
     # A zero of the last joint this far off is not fitted where the marker is known: its quarter turns are tried
     # instead.
     last_zero_rad: float = math.radians(3.0)
     # ... and named where the known marker comes out so many times nearer to its place: with 3, 2 of 32 markers that
     # were 50 mm off in each direction (1-sigma) came out so by chance.
     nearer: float = 5.0
-    # Axes are parallel if the cosine between them is above this: 2.6°.
-    parallel: float = 0.999
-    # Maximum number of other, equally good readings that are listed.
-    listed: int = 2
+    parallel: float = 0.999  # Axes are parallel if the cosine between them is above this: 2.6°
+    listed: int = 2  # maximum number of other, equally good readings that are listed
 
 
 @dataclass(frozen=True, slots=True)

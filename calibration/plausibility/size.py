@@ -23,8 +23,7 @@ from .verdict import THRESHOLDS, Plausibility, mm
 _STEPS = 3
 # Candidate noise levels, as shares of the residuals with nominal links: tolerances explain the rest of these.
 _NOISES = np.geomspace(0.01, 2.0, 16)
-# Rows farther off than this multiple of the median are outliers.
-_FAR = 5.0
+_FAR = 5.0  # rows farther off than this multiple of the median are outliers
 
 
 class _Settings:

@@ -39,8 +39,7 @@ class _Settings:
     next_to_it = 1e-3  # smallest move there, as a share of a far one
 
 
-# A less probable rival is not listed.
-PROBABLE = 0.02
+PROBABLE = 0.02  # a less probable rival is not listed
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,10 +19,8 @@ from bodyschema.interfaces.records import FloatArray
 
 # Number of long blocks of time, each of which is left out once. In short ones a walk stays near where it was.
 _PARTS = 10
-# One-sided probability of the t-test.
-_SURELY = 0.95
-# Number of new poses.
-_POSES = 400
+_SURELY = 0.95  # one-sided probability of the t-test
+_POSES = 400  # number of new poses
 
 
 def stored(candidates: Sequence[Fit], markers: NDArray[np.bool_]) -> Fit:

@@ -18,16 +18,11 @@ from bodyschema.interfaces.records import FloatArray
 
 # Workshop tolerances (1 sigma): link length [m], axis or joint offset [rad], drive over a turn [rad].
 LENGTH_M, ANGLE_RAD, DRIVE_RAD = 0.3e-3, float(np.radians(0.06)), float(np.radians(0.01))
-# Tolerance of a prismatic joint's drive [m].
-_DRIVE_M = 0.03e-3
-# Periodic errors of every drive: once and twice per turn of the joint.
-_TWICE = 2.0
-# A drive error within this multiple of the usual size is a tolerance.
-_LIKE_OTHERS = 3.0
-# A row counts in full if its weight differs from 1 by less.
-_COUNTS_IN_FULL = 1e-9
-# Prior standard deviation of the logarithms of the scales.
-SPREAD = 2.0
+_DRIVE_M = 0.03e-3  # tolerance of a prismatic joint's drive [m]
+_TWICE = 2.0  # Periodic errors of every drive: once and twice per turn of the joint
+_LIKE_OTHERS = 3.0  # a drive error within this multiple of the usual size is a tolerance
+_COUNTS_IN_FULL = 1e-9  # a row counts in full if its weight differs from 1 by less
+SPREAD = 2.0  # prior standard deviation of the logarithms of the scales
 # Smallest and largest scale. With all at the smallest, the arm is exactly as described, such as a simulated one.
 SMALLEST, MOST = 1e-3, 10.0
 

@@ -19,8 +19,7 @@ from .noise import ROUNDED, Noise, correlation
 from .observations import IntArray, Observations
 from .tangent import Tangent, solved
 
-# Prior limit of an effect, in units of its usual size; unidentifiable parameters stay near zero.
-LARGEST = 10.0
+LARGEST = 10.0  # prior limit of an effect, in units of its usual size; unidentifiable parameters stay near zero
 
 
 class _Settings:

@@ -12,8 +12,7 @@ from bodyschema.interfaces.records import FloatArray
 
 from .observations import Observations
 
-# Floor of the residuals, in units of the stated noise: numerical rounding.
-ROUNDED = 1e-9
+ROUNDED = 1e-9  # Floor of the residuals, in units of the stated noise: numerical rounding
 
 
 class _Settings:

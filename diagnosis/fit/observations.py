@@ -15,14 +15,10 @@ from bodyschema.recordings.recording import Recording
 
 IntArray = NDArray[np.intp]
 
-# Isotropic noise for recordings that state none; its size is estimated in any case [m].
-_UNIT_M = 1e-3
-# Outliers lie within this multiple of the spread of the measured positions.
-_OUTLIER_SPREAD = 2.0
-# Floor of a measured variance, as a share of the median one.
-_SMALLEST_VARIANCE = 1e-4
-# Shorter runs are single poses, not paths.
-_ROWS_A_RUN = 10
+_UNIT_M = 1e-3  # isotropic noise for recordings that state none; its size is estimated in any case [m]
+_OUTLIER_SPREAD = 2.0  # outliers lie within this multiple of the spread of the measured positions
+_SMALLEST_VARIANCE = 1e-4  # floor of a measured variance, as a share of the median one
+_ROWS_A_RUN = 10  # shorter runs are single poses, not paths
 # Closer readings are equal; minimum of distinct gaps to find a step; tolerance around its multiples.
 _SAME_READING, _FEWEST_GAPS, _OFF_A_MULTIPLE = 1e-9, 20, 0.02
 

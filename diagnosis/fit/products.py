@@ -18,8 +18,7 @@ from bodyschema.interfaces.records import FloatArray
 from .fit import Fit
 from .noise import ROUNDED
 
-# Relative size below which a direction that all others can change is rounding error.
-_ROUNDED_OFF = 1e-9
+_ROUNDED_OFF = 1e-9  # relative size below which a direction that all others can change is rounding error
 
 
 @dataclass(frozen=True, eq=False)

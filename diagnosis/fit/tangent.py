@@ -18,8 +18,7 @@ from .background import Background
 _COLLINEAR = 1e-11
 # A column that keeps a smaller share of its squares beside the others is not identifiable: it is of their rounding.
 TOLD_APART = 1e-7
-# Relative size below which an eigenvalue of normal equations is rounding.
-_SINGULAR = 1e-12
+_SINGULAR = 1e-12  # relative size below which an eigenvalue of normal equations is rounding
 
 dpotrf, dpotrs = get_lapack_funcs(("potrf", "potrs"), dtype=np.float64)
 

@@ -54,8 +54,7 @@ _LEAST_DIGITS, _MOST_DIGITS = 0, 6
 _UNTOLD = (("_rad", 0.5), ("_m", 0.1))
 # Parameters of time and shape rather than size.
 _SAYS_HOW = ("t0", "cycles", "phase", "time_constant", "length", "hold")
-# An interval whose halves differ by more than this share is written with both its ends.
-_LOPSIDED = 0.3
+_LOPSIDED = 0.3  # an interval whose halves differ by more than this share is written with both its ends
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,13 +14,11 @@ from bodyschema.effects import Effect, Simulation
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
 
-# Maximum of points in a plot, and of arrows in a projection.
-POINTS, ARROWS = 450, 220
+POINTS, ARROWS = 450, 220  # maximum of points in a plot, and of arrows in a projection
 # A joint's rows count if it moves the marker by this share of its median effect.
 _TELLS = 0.5
 _BINS, _FEWEST_IN_A_BIN = 16, 8
-# A larger p-value counts as chance.
-SIGNIFICANT = 1e-3
+SIGNIFICANT = 1e-3  # a larger p-value counts as chance
 
 
 @dataclass(frozen=True)

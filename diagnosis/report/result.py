@@ -6,12 +6,9 @@ from typing import Literal
 
 import msgspec
 
-# A cause with less weight [%] is told last and leaves the verdict as it is.
-SMALL = 5.0
-# A less probable cause leaves the verdict open, and is to be confirmed first.
-SURE = 0.9
-# Fixes that are not the marker, as a cause.
-OUTLIERS = "outliers"
+SMALL = 5.0  # a cause with less weight [%] is told last and leaves the verdict as it is
+SURE = 0.9  # a less probable cause leaves the verdict open, and is to be confirmed first
+OUTLIERS = "outliers"  # fixes that are not the marker, as a cause
 # Probability of what is no more probable than not.
 EVEN = 0.5
 Verdict = Literal["explained", "nothing_found", "undecided", "unexplained"]

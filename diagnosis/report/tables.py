@@ -10,8 +10,7 @@ from bodyschema.diagnosis.report.presenters.registry import rival_named
 from bodyschema.diagnosis.report.result import Cause, DiagnosisFile, Indistinguishable, Rejected
 from bodyschema.diagnosis.report.text import in_order, other_shares
 
-# Rows to omit where they equal another.
-_SAME_AS = {"aligned": "nominal", "extended": "aligned"}
+_SAME_AS = {"aligned": "nominal", "extended": "aligned"}  # rows to omit where they equal another
 # Number of rejected hypotheses shown at first.
 NEAREST = 12
 _ERRORS = (

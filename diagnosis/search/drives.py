@@ -11,10 +11,8 @@ from bodyschema.interfaces.records import FloatArray
 
 from .scan import FINEST, Scan
 
-# Maximum of rounds; each may add one ripple per joint.
-_ROUNDS = 8
-# Ripples whose phases differ by less over a joint's range are the same [turns].
-_APART = 0.75
+_ROUNDS = 8  # maximum of rounds; each may add one ripple per joint
+_APART = 0.75  # ripples whose phases differ by less over a joint's range are the same [turns]
 
 
 def with_small_ripples(fit: Fit) -> Fit:

@@ -29,26 +29,21 @@ from .search import Key
 
 # Rounds for scales and noise, from afar and beside a similar set; stop when their logarithms change by less.
 _ROUNDS, _ROUNDS_NEAR, STILL = 25, 8, 0.02
-# Limit of a step in the logarithms.
-_FARTHEST = 1.0
-# Lower limit of the noise as a share of that of the fit.
-_QUIETEST = 1e-3
-# Number of the most promising moves that are tried with their own scales.
-_TRIED = 4
+_FARTHEST = 1.0  # limit of a step in the logarithms
+_QUIETEST = 1e-3  # lower limit of the noise as a share of that of the fit
+_TRIED = 4  # number of the most promising moves that are tried with their own scales
 # Logarithms of the sizes, in usual ones, with which a pose is tried before its own is fitted.
 _SIZES = (0.0, -2.0, -4.0)
 # Prior width of what robot.toml does not know, about the fit, in usual sizes; the same in all fits, to compare them.
 _FREE = 100.0
 # Relative rounding of squares, and of columns that are collinear up to rounding.
 _ROUNDED_OFF, _ONE_BEYOND_ROUNDING = 1e-13, 1e-8
-# Evidence loss without a scale's tolerances from which they show in the data [nats].
-_SHOWN = 3.0
+_SHOWN = 3.0  # evidence loss without a scale's tolerances from which they show in the data [nats]
 # Loss of evidence that rules a scale out with 95 % (a likelihood ratio on one side), and the step of logarithms tried.
 _RULED_OUT, _FINER = 1.35, 0.2
 # Maximum of changes to a set of causes, and of its causes for more to be added: beyond, the first order is not enough.
 _MOST_MOVES, _MOST_TOGETHER = 60, 8
-# Margin to the best within which a set is refitted, and a change tried [nats].
-COMES_NEAR = 15.0
+COMES_NEAR = 15.0  # margin to the best within which a set is refitted, and a change tried [nats]
 
 _LOG_SMALLEST, _LOG_MOST, SCALES = math.log(SMALLEST), math.log(MOST), len(Scales())
 

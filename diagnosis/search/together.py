@@ -26,8 +26,7 @@ from .scan import Candidate, Scan
 from .search import Key
 from .sets import COMES_NEAR, SCALES, STILL, Sets, Together
 
-# Maximum of refitted sets.
-_MOST_REFITTED = 8
+_MOST_REFITTED = 8  # maximum of refitted sets
 # Tolerances may stand for a cause of which they leave less than this share of the squares; a third is left of a jump.
 _FOLLOWED = 0.1
 

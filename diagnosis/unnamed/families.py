@@ -324,8 +324,7 @@ def _with_one(amounts: FloatArray) -> FloatArray:
     return np.concatenate([np.ones((len(amounts), 1)), amounts], axis=1)
 
 
-# Smallest share of the variance at which an error counts as depending on a joint.
-_SHOWS = 0.05
+_SHOWS = 0.05  # smallest share of the variance at which an error counts as depending on a joint
 # Limit of extrapolation beyond the observed range, as a share of it.
 _BEYOND = 0.1
 _SEED = 0

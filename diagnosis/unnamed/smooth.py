@@ -37,8 +37,7 @@ class _Settings:
     left_out, too_far_off = 0.02, 0.5  # tolerance of a stored model, and its largest error, in units of the noise
 
 
-# Harmonics of one joint's angle, and of each of two joints' angles.
-_HARMONICS = {1: 14, 2: 4}
+_HARMONICS = {1: 14, 2: 4}  # harmonics of one joint's angle, and of each of two joints' angles
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,8 +26,7 @@ from bodyschema.interfaces.records import FloatArray
 from .families import Family, families
 from .low_rank import low_rank, numbers_of
 
-# Prior penalty of a family as specific as a named effect [nats].
-SPECIFIC = 5.0
+SPECIFIC = 5.0  # prior penalty of a family as specific as a named effect [nats]
 
 
 class _Settings:

@@ -10,8 +10,7 @@ from bodyschema.effects.motion import Motion
 from bodyschema.effects.parameter import Parameter, shifts
 from bodyschema.interfaces.records import FloatArray
 
-# A drift that ends within a smaller share of the recording is an offset from the beginning.
-_SHORTEST = 0.03
+_SHORTEST = 0.03  # a drift that ends within a smaller share of the recording is an offset from the beginning
 # Time constants tried, as shares of the recording's duration.
 _TIME_CONSTANTS = np.geomspace(_SHORTEST, 4.0, 24)
 

@@ -23,8 +23,7 @@ from bodyschema.robot.urdf import inverse
 from .arm_errors import BORNE_BY_HAND, LeftOut, moment_notes, residual_note, sentences
 
 FORMAT = "bodyschema correction 3"
-# Registers that every file has: 0 is the number of joints, 1 of registers.
-PACE, POSE, ANGLES = 2, 3, 15
+PACE, POSE, ANGLES = 2, 3, 15  # Registers that every file has: 0 is the number of joints, 1 of registers
 # Steps by number; from OUTWARDS on for one row, two, three.
 ADD, ADD_THREE, WAVE, MEMORY, TORQUE, SIDE, INWARDS, OUTWARDS = range(8)
 OUTWARDS_THREE = OUTWARDS + 2

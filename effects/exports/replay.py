@@ -15,8 +15,7 @@ from bodyschema.interfaces.records import FloatArray
 
 from .mjcf import LOOSE, MARKER, MEASUREMENT
 
-# A spring's deflection changes its own load; each round adds the next order.
-_SPRING_ROUNDS = 5
+_SPRING_ROUNDS = 5  # a spring's deflection changes its own load; each round adds the next order
 
 
 def mujoco_version() -> str | None:

@@ -25,8 +25,7 @@ class _Settings:
     step_tolerance: float = 1e-12
     # Starting points are only compared: the best one is fitted again, to the tolerance above.
     trial_tolerance: float = 1e-5
-    # This many evenly spread pairs suffice to place the arm.
-    placed: int = 64
+    placed: int = 64  # this many evenly spread pairs suffice to place the arm
     # Singular values below this share of the largest are directions that the data do not determine.
     rank_tolerance: float = 1e-7
 

@@ -10,8 +10,7 @@ import numpy as np
 from kbmaps.arrays import BoolArray, FloatArray, frozen
 from kbmaps.chains.parameters import ChainParameters
 
-# In standard deviations of a Gaussian.
-_HALF_WIDTH_95 = 1.959964
+_HALF_WIDTH_95 = 1.959964  # in standard deviations of a Gaussian
 
 _DEG = math.degrees(1.0)
 _MM = 1e3

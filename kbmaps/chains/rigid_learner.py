@@ -33,12 +33,10 @@ from kbmaps.variance_components import error_covariances, inverse_roots, tells_d
 
 
 class _Settings:
-    # A direction is open if at least this share of the prior's variance remains.
-    open: float = 0.5
+    open: float = 0.5  # a direction is open if at least this share of the prior's variance remains
     # No step along a direction changes a parameter by more than this [rad, m]: beyond, the second order does not hold.
     longest_step: float = 0.1
-    # The curvature of the posterior is estimated from about this many evenly spread pairs.
-    followed: int = 100
+    followed: int = 100  # the curvature of the posterior is estimated from about this many evenly spread pairs
     # A parameter counts as undetermined if its standard deviation stayed above this share of the prior's.
     hardly_narrower: float = 0.5
 

@@ -38,8 +38,7 @@ class _Settings:
     """
 
     least_window: int = 16
-    # With few pairs and no prior, an earlier fit may be far off: start from the nominal chain.
-    fresh: int = 200
+    fresh: int = 200  # With few pairs and no prior, an earlier fit may be far off: start from the nominal chain
     # The first refit comes with this pair, the next when the kept pairs have grown by this factor, or the window is
     # full.
     first: int = 8

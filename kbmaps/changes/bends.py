@@ -219,8 +219,7 @@ def _own_errors(angles: FloatArray, turning: FloatArray) -> FloatArray:
     return np.concatenate(columns, axis=2)
 
 
-# Maximum number of pairs, the newest ones, that are evaluated.
-MOST_PAIRS = 1200
+MOST_PAIRS = 1200  # maximum number of pairs, the newest ones, that are evaluated
 
 
 def log_ratios_if_it_bends(

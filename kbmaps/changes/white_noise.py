@@ -12,8 +12,7 @@ from scipy.special import ndtr, stdtrit  # pyright: ignore[reportMissingTypeStub
 from kbmaps.arrays import FloatArray, frozen
 from kbmaps.variance_components import in_typical_units, most_probable_shares
 
-# Minimum number of pairs for each estimated variance.
-_FEWEST = 10
+_FEWEST = 10  # minimum number of pairs for each estimated variance
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,17 +90,14 @@ class _Settings:
     # Sums over longer lags than this, or than this share of the series, would be dominated by noise.
     longest_lag: int = 200
     longest_lag_share: float = 0.125
-    # Neighbours share an error if their products are this many standard errors above 0.
-    clearly: float = 2.0
+    clearly: float = 2.0  # neighbours share an error if their products are this many standard errors above 0
     # The estimated variance must hold in the tail [sigmas], where a Gaussian coordinate falls once in as many pairs as
     # lie between false alarms.
     tail_sigmas: float = 4.5
-    # Longer runs are treated as this long.
-    longest_run: int = 1000
+    longest_run: int = 1000  # longer runs are treated as this long
     # Lower bound: residuals of 0 determine no variance, and no model is this much better than its claim.
     least: float = 1e-12
-    # A fit absorbs at most this share of the error that neighbours share.
-    most_taken: float = 0.8
+    most_taken: float = 0.8  # a fit absorbs at most this share of the error that neighbours share
 
 
 @dataclass(frozen=True, eq=False)

@@ -66,8 +66,7 @@ class _Settings:
     max_steps: int = 3000
     tolerance_m: float = 1e-7
     tolerance_rad: float = 1e-7
-    # Starts are chosen among this many times as many samples near the target.
-    candidates: int = 8
+    candidates: int = 8  # starts are chosen among this many times as many samples near the target
 
 
 Reason = Literal["reached", "out_of_reach", "steps_ran_out"]

@@ -160,8 +160,7 @@ def _last(old: FloatArray, new: FloatArray, kept: int) -> FloatArray:
 
 
 _KIND = "kernel learner, 1"
-# Rounding of positions, relative to the largest coordinate.
-_ROUNDING = 1e-11
+_ROUNDING = 1e-11  # rounding of positions, relative to the largest coordinate
 
 
 _THIRD_OF_A_TURN = 2.0 * math.pi / 3.0

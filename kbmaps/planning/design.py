@@ -128,8 +128,7 @@ class ChainPosterior:
 
 
 _EYE = np.eye(3)
-# Values tried per joint when a chosen pose is improved within its limits.
-_EXCHANGE_VALUES = 9
+_EXCHANGE_VALUES = 9  # values tried per joint when a chosen pose is improved within its limits
 # Rounds in which each pose of a plan is improved in the presence of the others; a third gains 2 % at most.
 _PLAN_ROUNDS = 2
 

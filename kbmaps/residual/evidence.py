@@ -16,8 +16,7 @@ from kbmaps.robust import VARIANCE_FLOOR
 
 # Candidate variances of a group, relative to the variance at which its best determined direction is barely visible.
 _TRIED = 10.0 ** np.arange(0.0, 7.0, 0.5)
-# Prior odds against a group [nats]. Its variance is optimised, which inflates the likelihood.
-PRICE = 2.0
+PRICE = 2.0  # Prior odds against a group [nats]. Its variance is optimised, which inflates the likelihood.
 
 
 class _Settings:
@@ -29,8 +28,7 @@ class _Settings:
 
     # Models less probable than the best by more than this many nats are left out of averages.
     window: float = 4.0
-    # A group that gains less is left out of averages: it makes almost no difference.
-    least_gain: float = 0.5
+    least_gain: float = 0.5  # A group that gains less is left out of averages: it makes almost no difference
     # Sets of groups less probable than the chosen one by more than this many nats are not extended.
     swap_window: float = 8.0
     rounds: int = 40

@@ -30,18 +30,14 @@ class _Settings:
     correlations: tuple[float, ...] = (0.0, 0.2, 0.4, 0.55, 0.65, 0.75, 0.8, 0.85, 0.88, 0.91, 0.94, 0.97)
     rounds: int = 6
     selections: int = 2
-    # Few enough rows for a processor's cache.
-    rows_at_once: int = 150
+    rows_at_once: int = 150  # few enough rows for a processor's cache
     # With fewer coordinates of pairs on a path, no group is added: it cannot be separated from shared errors.
     fewest_on_path: int = 30
-    # Number of runs of pairs left out in turn on a path.
-    blocks: int = 8
+    blocks: int = 8  # number of runs of pairs left out in turn on a path
     # A step that moves the predictions by less than this share of their posterior uncertainty is the last.
     small_step: float = 0.05
-    # Fixed-point rounds in which the noise settles well enough to compare correlations.
-    noise_rounds: int = 4
-    # A prior's noise counts as this many coordinates.
-    noise_rows: float = 10.0
+    noise_rounds: int = 4  # fixed-point rounds in which the noise settles well enough to compare correlations
+    noise_rows: float = 10.0  # a prior's noise counts as this many coordinates
     # A given noise explains a sum of squared residuals up to this many of its standard deviations (χ²) above its mean.
     misfit_sigmas: float = 3.0
 

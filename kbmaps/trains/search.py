@@ -19,8 +19,7 @@ from kbmaps.trains.train import TensorTrain
 
 
 class _Settings:
-    # Relative to the spread of the positions: smaller residuals are rounding.
-    noise_floor: float = 1e-13
+    noise_floor: float = 1e-13  # Relative to the spread of the positions: smaller residuals are rounding
     # With residuals below this share of the positions' spread, no further start is needed.
     explained: float = 1e-4
     first_noise: float = 2e-2
@@ -34,14 +33,12 @@ class _Settings:
     weight_scale: float = 4.0
     # Reweighting ends when no residual moves by more than this many standard deviations.
     same_lengths: float = 0.05
-    # Random starts use at most this many pairs per joint.
-    search_pairs: int = 40
+    search_pairs: int = 40  # random starts use at most this many pairs per joint
     # With fewer degrees of freedom per pair, residuals cannot separate noise from outliers.
     least_freedom: float = 0.2
 
 
-# Failed starts leave a tenth or more of the spread, and may agree on it by chance.
-PLAUSIBLE = 0.1
+PLAUSIBLE = 0.1  # failed starts leave a tenth or more of the spread, and may agree on it by chance
 
 
 @dataclass(frozen=True, eq=False)

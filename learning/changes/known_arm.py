@@ -53,17 +53,13 @@ class KnownArm:
 
 
 class _Settings:
-    # An unnamed change widens every kind at least this probable.
-    improbable: float = 0.02
+    improbable: float = 0.02  # an unnamed change widens every kind at least this probable
     # 1-sigma of the changed part: this multiple of its most probable change, and at least this many noises.
     wider: float = 3.0
     least_noises: float = 3.0
-    # Number of runs of neighbours left out in turn to compare the new model with the old one.
-    folds: int = 4
-    # Pairs farther from a prediction than this many sigmas are clipped.
-    clipped: float = 5.0
-    # Minimum number of pairs before the change that update the previous posterior.
-    fewest_before: int = 10
+    folds: int = 4  # number of runs of neighbours left out in turn to compare the new model with the old one
+    clipped: float = 5.0  # pairs farther from a prediction than this many sigmas are clipped
+    fewest_before: int = 10  # minimum number of pairs before the change that update the previous posterior
 
 
 @dataclass(frozen=True, eq=False)

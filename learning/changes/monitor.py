@@ -19,22 +19,17 @@ from kbmaps.variance_components import inverse_roots
 
 
 class _Settings:
-    # Minimum number of pairs of a reference model: with fewer it may be too far off.
-    fewest_known: int = 100
+    fewest_known: int = 100  # Minimum number of pairs of a reference model: with fewer it may be too far off
     # A newer model replaces the reference after half as many pairs as it knows, within these limits. It would absorb a
     # change that took longer to show.
     shortest_trial: int = 50
     longest_trial: int = 1000
-    # A model counts as the chain alone if it is this near to it, over the noise of a pair.
-    alone: float = 0.1
-    # Lower bound of a measurement's noise, whatever it claims [m].
-    smallest_m: float = 1e-6
+    alone: float = 0.1  # a model counts as the chain alone if it is this near to it, over the noise of a pair
+    smallest_m: float = 1e-6  # lower bound of a measurement's noise, whatever it claims [m]
 
 
-# If no newer model comes, the older half of this many pairs is dropped.
-MOST_WATCHED = 5000
-# Number of the model's own pairs that show its noise.
-LOOKED_BACK = 1000
+MOST_WATCHED = 5000  # if no newer model comes, the older half of this many pairs is dropped
+LOOKED_BACK = 1000  # number of the model's own pairs that show its noise
 # An alarm that a bent arm explains is evaluated again when the pairs since the change have grown by this factor, or the
 # alarm's log odds by this much.
 LOOK_AGAIN, GROWN_ODDS = 1.25, 4.0

@@ -10,14 +10,10 @@ from numpy.typing import NDArray
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.replay_memory import PairMemory
 
-# A pair is an outlier if it is this many times farther from the prediction than expected.
-DOUBT = 5.0
-# Median length of errors to their 1-sigma per axis, three equal axes: 1 / sqrt(2.366).
-MEDIAN_TO_SIGMA = 0.6501
-# No robot is this exact: an expected distance is never taken to be smaller [m].
-SMALLEST_M = 1e-3
-# This many consecutive outliers prove a change.
-CHANGE = 6
+DOUBT = 5.0  # a pair is an outlier if it is this many times farther from the prediction than expected
+MEDIAN_TO_SIGMA = 0.6501  # Median length of errors to their 1-sigma per axis, three equal axes: 1 / sqrt(2.366)
+SMALLEST_M = 1e-3  # No robot is this exact: an expected distance is never taken to be smaller [m]
+CHANGE = 6  # this many consecutive outliers prove a change
 # This many are enough if one other position of the marker explains them: their remaining distances are at most this
 # multiple of the expected ones, and at most this share of those from the prediction.
 FEWEST_FOR_CHANGE = 3

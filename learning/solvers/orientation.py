@@ -30,8 +30,7 @@ KEPT, FITTED = 4000, 1000
 # Growth of the number of pairs before the next solution, with a new search for the maps' precision; the chain with
 # residual waits for it too, since it takes up to a second.
 GROWTH = 1.15
-# Minimum number of orientations for a map: with fewer, the chain suffices.
-FEWEST_FOR_MAP = 30
+FEWEST_FOR_MAP = 30  # Minimum number of orientations for a map: with fewer, the chain suffices
 # An entry of a rotation matrix errs by this much of a small turn's 1-sigma about one axis: √(2/3).
 ENTRY_OF_TURN = 0.8165
 

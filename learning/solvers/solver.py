@@ -38,16 +38,13 @@ LARGEST_NET = 2187
 
 
 class _Settings:
-    # Growth of the number of pairs before the next search for the prior's precision.
-    retune: float = 1.25
-    # Number of pairs that a chain is fitted to, evenly spread.
-    fitted: int = 2000
+    retune: float = 1.25  # growth of the number of pairs before the next search for the prior's precision
+    fitted: int = 2000  # number of pairs that a chain is fitted to, evenly spread
     # With this growth of the number of pairs, this share of them is solved for first, if it is at least this many.
     first_growth: float = 1.5
     first_share: float = 0.75
     fewest_first: int = 5
-    # Minimum number of neighbours counting as one at which their correlation is not chance.
-    shared: float = 1.5
+    shared: float = 1.5  # minimum number of neighbours counting as one at which their correlation is not chance
     # While pairs are few, a solution is cheap, and renewed after this growth of their number.
     growth: float = 0.1
 

@@ -9,8 +9,7 @@ from bodyschema.effects import Effect
 from .plots import over_reading
 from .presenter import Found, Presenter, Workshop
 
-# A scale error below this reverses the joint's direction.
-_BACKWARDS = -1.0
+_BACKWARDS = -1.0  # a scale error below this reverses the joint's direction
 
 
 class JointScale(Presenter):

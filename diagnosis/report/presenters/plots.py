@@ -14,8 +14,7 @@ from bodyschema.effects.moments import after
 from bodyschema.interfaces.records import FloatArray
 
 _FINE = 500
-# A ripple with more cycles is plotted over its phase.
-_MANY_CYCLES = 4.0
+_MANY_CYCLES = 4.0  # a ripple with more cycles is plotted over its phase
 
 
 def attributed(residuals: Residuals, effect: Effect) -> tuple[FloatArray, FloatArray]:

@@ -23,10 +23,8 @@ from bodyschema.robot.rpy import rpy_of
 from .plots import measured_against_predicted
 
 DEG = math.degrees(1.0)
-# Ticks that divide a turn to within this share are counted per turn.
-_WHOLE_TURN = 0.01
-# A step is one decimal of a file, and no tick, if its logarithm is a whole number to this.
-_DECIMAL = 1e-3
+_WHOLE_TURN = 0.01  # ticks that divide a turn to within this share are counted per turn
+_DECIMAL = 1e-3  # a step is one decimal of a file, and no tick, if its logarithm is a whole number to this
 
 
 @dataclass(frozen=True)
