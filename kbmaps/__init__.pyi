@@ -16,10 +16,10 @@ from kbmaps.chains.search import find_chain as find_chain
 from kbmaps.changes.detector import ChangeDetector as ChangeDetector
 from kbmaps.changes.detector import ChangeScore as ChangeScore
 from kbmaps.changes.kinds import ChangeKind as ChangeKind
+from kbmaps.changes.kinds import Explanation as Explanation
 from kbmaps.changes.kinds import any_change as any_change
 from kbmaps.changes.kinds import change_kinds as change_kinds
-from kbmaps.changes.naming import Explanation as Explanation
-from kbmaps.changes.naming import explanations as explanations
+from kbmaps.changes.kinds import explanations as explanations
 from kbmaps.changes.white_noise import SharedNoise as SharedNoise
 from kbmaps.changes.white_noise import WhiteNoise as WhiteNoise
 from kbmaps.contest import PrequentialComparison as PrequentialComparison
