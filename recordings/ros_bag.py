@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from bodyschema.interfaces.errors import RecordingError
-from bodyschema.interfaces.extras import install_command
 from bodyschema.robot.limited import MOST_MEMORY_BYTES, bounded_memory, check_regular, read_at_most
 from bodyschema.robot.suggest import did_you_mean
 
+from .parquet_file import imported
 from .recording import Recording
 from .tracks import JointTrack, MarkerTrack, joined
 
@@ -126,19 +126,13 @@ class _Bag:
 
 @contextmanager
 def _opened(source: Path) -> Iterator[_Bag]:
-    try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise RecordingError(
-            "reading a ROS bag needs the extra `bags`", file=source, remedy=f"Type: {install_command('bags')}"
-        ) from error
+    highlevel, typesys = (imported(f"rosbags.{name}", "bags", "a ROS bag", source) for name in ("highlevel", "typesys"))
     if not source.exists():
         raise RecordingError("there is no such file", file=source, remedy="Name a bag that is there")
     try:
         _check_files(source)
-        store = get_typestore(Stores.ROS2_JAZZY)
-        with bounded_memory(MOST_MEMORY_BYTES), AnyReader([source], default_typestore=store) as reader:
+        store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
+        with bounded_memory(MOST_MEMORY_BYTES), highlevel.AnyReader([source], default_typestore=store) as reader:
             yield _Bag(source, reader)
     except RecordingError:
         raise
