@@ -140,10 +140,12 @@ class Presenter(ABC):
     Attributes:
         effect: name of the effect.
         noun: the cause in a few words without figures, with {joint}, {source} and {seen_by} to fill in.
+        plot: plots the evidence for a cause; `panel` may do it instead.
     """
 
     effect: ClassVar[str]
     noun: str
+    plot: ClassVar[staticmethod[[Residuals, Effect], Panel]] = staticmethod(measured_against_predicted)
 
     @abstractmethod
     def finding(self, found: Found) -> str:
@@ -154,7 +156,7 @@ class Presenter(ABC):
         """Return what to do about a cause."""
 
     def panel(self, residuals: Residuals, effect: Effect) -> Panel:
-        return measured_against_predicted(residuals, effect)
+        return self.plot(residuals, effect)
 
 
 class PlainPresenter(Presenter):
