@@ -51,18 +51,16 @@ class GravityLoad:
     Args:
         robot: its links have the masses of the URDF; if it states none that a joint bears, each link weighs
             `ROD_KG_PER_M` along straight lines between its joints.
-
-    Attributes:
-        known: True if the URDF states a mass that a joint bears.
-        bodies: by the index in q of the joint that carries them; None is the base.
-        outwards: indices in q of the joints, each after the one that carries it.
     """
 
     def __init__(self, robot: RobotDescription) -> None:
         self._robot = robot
         stated = _bodies(robot, robot.tree.masses)
+        # True if the URDF states a mass that a joint bears
         self.known = any(body.mass_kg > 0.0 for k, body in stated.items() if k is not None)
+        # by the index in q of the joint that carries them; None is the base
         self.bodies: Mapping[int | None, Body] = stated if self.known else _bodies(robot, _rods(robot))
+        # indices in q of the joints, each after the one that carries it
         self.outwards = [k for k in self._order() if k is not None]
 
     def of_payload(self, mass_kg: float, moment: FloatArray) -> GravityLoad:

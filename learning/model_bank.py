@@ -35,9 +35,6 @@ class ModelBank:
     Between two solutions, the solved models stay as they are. Instant steps on top of them would follow the newest
     pairs, and spoil them away from their path: measured, the error a few degrees away grew from 7 to 10 mm within 20
     pairs.
-
-    Attributes:
-        delayed: map of the instant learner when the current solutions were requested; None before any.
     """
 
     def __init__(self, prior: KBMap, step_size: float) -> None:
@@ -47,6 +44,7 @@ class ModelBank:
         self._instant = NLMS(prior, step_size)
         self._instant_map: KBMap | None = prior
         self._asked: KBMap | None = None
+        # map of the instant learner when the current solutions were requested; None before any
         self.delayed: KBMap | None = None
 
     @property

@@ -37,20 +37,16 @@ class Fit:
 
 
 class Fitting:
-    """Schedules and makes the fits: at first after few pairs, then whenever they have doubled.
-
-    Attributes:
-        due_at: number of pairs at the next fit; None if nothing is to be fitted.
-        is_first: true if nothing has been fitted yet.
-        chain: nominal chain, placed; after a tool change, the chain that gives the orientation of the hand.
-    """
+    """Schedules and makes the fits: at first after few pairs, then whenever they have doubled."""
 
     def __init__(self, nominal: NominalModel, tolerances: ChainTolerances) -> None:
         self._nominal, self._tolerances = nominal, tolerances
+        # nominal chain, placed; after a tool change, the chain that gives the orientation of the hand
         self.chain = nominal.chain
         self._before: KBMap | None = None
+        # number of pairs at the next fit; None if nothing is to be fitted
         self.due_at = None if nominal.frame_known else nominal.pairs_to_align
-        self.is_first = True
+        self.is_first = True  # true if nothing has been fitted yet
 
     def due(self, pairs: int) -> bool:
         return self.due_at is not None and pairs >= self.due_at
@@ -113,23 +109,17 @@ class Regimes:
         nominal: the nominal model, where learning starts.
         settings: of the learner.
         task_numbers: numbers for the solver's tasks that were never used.
-
-    Attributes:
-        present: the current regime; None before the frame is known.
-        claims: uncertainties of its models, including experience from earlier regimes.
-        fitting: fits of the frame or the tool as a whole.
-        waiting: the pairs that wait for the first regime.
-        change: the last change; None: there was none.
     """
 
     def __init__(self, nominal: NominalModel, settings: LearnerConfig, task_numbers: Iterator[int]) -> None:
         self._nominal, self._settings, self._task_numbers = nominal, settings, task_numbers
         self._fingerprint = nominal.fingerprint(chain_tolerances(settings))
+        # uncertainties of its models, including experience from earlier regimes
         self.claims = UncertaintyTracker(nominal.bases, EXPECTED_M)
-        self.fitting = Fitting(nominal, chain_tolerances(settings))
-        self.waiting = PairMemory(nominal.joints, settings.replay_capacity)
-        self.present: Regime | None = None
-        self.change: ChangeRecord | None = None
+        self.fitting = Fitting(nominal, chain_tolerances(settings))  # fits of the frame or the tool as a whole
+        self.waiting = PairMemory(nominal.joints, settings.replay_capacity)  # the pairs that wait for the first regime
+        self.present: Regime | None = None  # the current regime; None before the frame is known
+        self.change: ChangeRecord | None = None  # the last change; None: there was none
         self._origin: Origin | None = None
         self._look_at = 0
 

@@ -61,12 +61,6 @@ class Background:
         scales: scales of the tolerances; None for no background at all.
         before: the background from which this one is derived; None where the simulation's own errors are known and the
             tolerances are centred on them.
-
-    Attributes:
-        effects: the effects with zero amounts: a link at each joint, eccentricity and ripple of each drive.
-        columns: derivatives (n, 3, p) [m] of the measured positions with respect to the amounts.
-        tolerances: prior standard deviation of each amount (p,).
-        start: the simulation's amounts (p,), about which the columns are linearised.
     """
 
     def __init__(
@@ -75,17 +69,20 @@ class Background:
         simulation = run.simulation
         self._whitening, self.scales = whitening, scales
         own = () if scales is None else simulation.background or background_effects(simulation, run.motion.q)
+        # the effects with zero amounts: a link at each joint, eccentricity and ripple of each drive
         self.effects = tuple(_resting(effect) for effect in own)
         amounts = np.concatenate([np.empty(0), *(effect.values[effect.amounts] for effect in own)])
         # Tolerances are centred here.
         self._centre = amounts
         if before is not None and before.scales is not None:
             self._centre = np.append(before._centre, np.zeros(len(amounts) - len(before._centre)))
-        self.start = amounts - self._centre
+        self.start = amounts - self._centre  # the simulation's amounts (p,), about which the columns are linearised
         parts = [run.columns(effect)[:, :, effect.amounts] for effect in own]
+        # derivatives (n, 3, p) [m] of the measured positions with respect to the amounts
         self.columns = np.concatenate([np.empty((len(run.motion), 3, 0)), *parts], axis=2)
         self.group = np.concatenate([np.empty(0, int), *map(_groups, self.effects)])
         units = np.concatenate([np.empty(0), *map(_units, self.effects)])
+        # prior standard deviation of each amount (p,)
         self.tolerances = units if scales is None else units * np.asarray(scales)[self.group]
 
     def shift(self, amounts: FloatArray) -> FloatArray:

@@ -51,22 +51,19 @@ class Products:
 
     Args:
         besides: causes of the fit; each adds a place in which it is absent. The first place is the fit itself.
-
-    Attributes:
-        rows: number of fixes that are the marker.
-        squares: sum of squared residuals in each place.
     """
 
     def __init__(self, fit: Fit, besides: Sequence[Effect] = ()) -> None:
         self._fit = fit
         flat = fit.orthogonal.reshape(fit.left.size, -1)
-        self.rows = float(fit.noise.weights.sum())
+        self.rows = float(fit.noise.weights.sum())  # number of fixes that are the marker
         freed = [np.zeros((flat.shape[1], 0)), *(self._only_of(cause, flat) for cause in besides)]
         lefts = np.stack([fit.evident.ravel(), *(self._left_without(cause) for cause in besides)], axis=1)
         for place, free in enumerate(freed):
             seen = flat.T @ lefts[:, place]
             lefts[:, place] -= flat @ (seen - free @ (free.T @ seen))
         # The simulation's own output leaves no residuals except rounding.
+        # sum of squared residuals in each place
         self.squares = np.maximum(np.square(lefts).sum(axis=0), 3.0 * self.rows * ROUNDED**2)
         # Tested columns are not `unshared`, since their rows are scaled one by one; apply it twice to the rest instead.
         directions, shares = fit.absorbed

@@ -155,14 +155,11 @@ class Search:
     Args:
         hypotheses: the possible causes.
         tell: called with short messages on progress.
-
-    Attributes:
-        multiplicity: penalty for the number of hypotheses [nats].
     """
 
     def __init__(self, hypotheses: Sequence[Effect], tell: Callable[[str], None]) -> None:
         self._hypotheses, self._tell = hypotheses, tell
-        self.multiplicity = float(np.log(max(len(hypotheses), 1)))
+        self.multiplicity = float(np.log(max(len(hypotheses), 1)))  # penalty for the number of hypotheses [nats]
         self._trials: dict[Key, float] = {}
         self._known: tuple[Fit | None, Scan | None, dict[Identity, Beside]] = (None, None, {})
         # Lead of each cause when it was last reviewed, the log-likelihood then, and the observations [nats].

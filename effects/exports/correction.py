@@ -90,14 +90,11 @@ def write_correction(
 
 
 class _Program:
-    """Registers and the steps that fill them, as docs/exporting.md describes them.
-
-    Attributes:
-        angles: register of each joint's true angle, as far as the steps have come.
-    """
+    """Registers and the steps that fill them, as docs/exporting.md describes them."""
 
     def __init__(self, joints: int) -> None:
         self.readings = range(ANGLES + joints, ANGLES + 2 * joints)
+        # register of each joint's true angle, as far as the steps have come
         self.angles = list(range(ANGLES, ANGLES + joints))
         self._registers = [0.0] * self.readings.stop
         self._steps: list[tuple[int, int, int, int, int]] = []

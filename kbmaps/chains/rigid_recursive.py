@@ -50,12 +50,6 @@ class _Settings:
 class RigidWindow:
     """Keeps at most `size` pairs. Older ones are folded: linearised at a fit that also used the pairs after them.
 
-    Attributes:
-        belief: posterior of the chain before the kept pairs.
-        noise: noise estimated before them, from pairs that came without their sigma.
-        farthest: configuration (1, d) of the folded pair with the largest predicted uncertainty; (0, d) without any.
-        excess: variance [m²] of a coordinate that the chain did not explain at the last fit, with the noise given.
-
     Raises:
         SettingError: size below 16.
     """
@@ -67,10 +61,13 @@ class RigidWindow:
         if size < _Settings.least_window:
             raise SettingError(f"a window must hold at least {_Settings.least_window} pairs, got {size}")
         self.size = size
+        # posterior of the chain before the kept pairs
         self.belief = ChainBelief.from_tolerances(parameters, tolerances)
-        self.noise = NOTHING_KNOWN
+        self.noise = NOTHING_KNOWN  # noise estimated before them, from pairs that came without their sigma
+        # variance [m²] of a coordinate that the chain did not explain at the last fit, with the noise given
         self.excess = 0.0
         self._begun = False
+        # configuration (1, d) of the folded pair with the largest predicted uncertainty; (0, d) without any
         self.farthest = np.empty((0, parameters.reference.joints))
         self._place = PlacedStart(parameters, tolerances)
         self._joints, self._count = parameters.reference.joints, 0
