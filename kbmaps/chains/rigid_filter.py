@@ -68,9 +68,10 @@ class RigidFilter:
         self._reach = parameters.reach
         self._kernel = self._filter_kernel()
         self.change = np.zeros(parameters.size)  # the parameters (size,) as in `ChainParameters`
-        # linearisation point (size,); None: at `change`. Many directions of a chain have no effect on positions, and others
-        # hardly any. With one origin for all pairs, these directions are the same for each pair. With several, pairs seem
-        # to carry information about them, and the chain drifts along them (Huang, Mourikis and Roumeliotis 2010)
+        # linearisation point (size,); None: at `change`. Many directions of a chain have no effect on positions, and
+        # others hardly any. With one origin for all pairs, these directions are the same for each pair. With several,
+        # pairs seem to carry information about them, and the chain drifts along them (Huang, Mourikis and Roumeliotis
+        # 2010)
         self.origin: FloatArray | None = None
         self._covariance: FloatArray = np.diag(np.square(std[self._active] / self._scales))
         # the estimated variance [m²] of a coordinate of the pairs that came without their sigma

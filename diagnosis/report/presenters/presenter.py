@@ -135,16 +135,11 @@ class Workshop:
 
 
 class Presenter(ABC):
-    """Sentences and a plot for one effect.
+    """Sentences and a plot for one effect."""
 
-    Attributes:
-        effect: name of the effect.
-        noun: the cause in a few words without figures, with {joint}, {source} and {seen_by} to fill in.
-        plot: plots the evidence for a cause; `panel` may do it instead.
-    """
-
-    effect: ClassVar[str]
-    noun: str
+    effect: ClassVar[str]  # name of the effect
+    noun: str  # the cause in a few words without figures, with {joint}, {source} and {seen_by} to fill in
+    # plots the evidence for a cause; `panel` may do it instead
     plot: ClassVar[staticmethod[[Residuals, Effect], Panel]] = staticmethod(measured_against_predicted)
 
     @abstractmethod
