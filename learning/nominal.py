@@ -105,15 +105,12 @@ class NominalModel:
 
     def fingerprint(self, tolerances: ChainTolerances) -> str:
         """Return a hash of this nominal model with these tolerances; a state only fits the ones it came from."""
-        said = f"{self.pose_known} {self.marker_known} {tolerances} {self.prior().digest}"
+        said = f"{self.pose_known} {self.marker_known} {tolerances} {self.prior.digest}"
         return hashlib.blake2b(said.encode(), digest_size=8).hexdigest()
 
-    def prior(self) -> KBMap:
-        """Return the chain as a map in the learning bases, with the bends of the extended simulation."""
-        return self._prior
-
     @cached_property
-    def _prior(self) -> KBMap:
+    def prior(self) -> KBMap:
+        """Chain as a map in the learning bases, with the bends of the extended simulation."""
         prior = self.chain.to_kbmap(self.bases)
         if self.extended is None or (nodes := self._nodes()) is None:
             return prior

@@ -45,40 +45,23 @@ class Regime:
     """Learns the models of one tool side by side, and chooses the one that answers.
 
     It has no lock of its own. The results of earlier regimes come as `prior`, `arm` and `claims`.
-
-    Args:
-        prior: the map to learn on top of.
-        arm: prior of the arm before the first pair.
-        claims: uncertainties of the models; updated here while the regime lasts.
-        settings: of the learner.
-        task_numbers: numbers for the solver's tasks that no other regime has.
-
-    Attributes:
-        models: learnt side by side.
-        memory: the pairs with this tool.
-        gate: the outlier gate.
-        orientations: models of the marker's orientation, where pairs have one.
-        monitor: the change monitor.
-        arm: as given, or with the last solutions if these stand for pairs that are no longer kept.
-        answering: the model that answers.
-        task_number: of the solver's current task.
     """
 
     def __init__(
         self,
-        prior: KBMap,
-        arm: KnownArm,
-        claims: UncertaintyTracker,
+        prior: KBMap,  # the map to learn on top of
+        arm: KnownArm,  # prior of the arm before the first pair
+        claims: UncertaintyTracker,  # uncertainties of the models; updated here while the regime lasts
         settings: LearnerConfig,
-        task_numbers: Iterator[int],
+        task_numbers: Iterator[int],  # numbers for the solver's tasks that no other regime has
     ) -> None:
         self.models = ModelBank(prior, settings.step_size)
-        self.memory = PairMemory(prior.joints, settings.replay_capacity)
+        self.memory = PairMemory(prior.joints, settings.replay_capacity)  # the pairs with this tool
         self.gate = OutlierGate(prior.joints)
-        self.orientations = Orientations(arm.chain.chain)
+        self.orientations = Orientations(arm.chain.chain)  # models of the marker's orientation, where pairs have one
         self.monitor = ChangeMonitor()
-        self.arm = arm
-        self.answering = self._answering_map = PRIOR
+        self.arm = arm  # or with the last solutions if these stand for pairs that are no longer kept
+        self.answering = self._answering_map = PRIOR  # the model that answers
         self._claims, self._replays_per_pair = claims, settings.replays_per_pair
         claims.expect(arm.chain)
         self._met: list[tuple[Pair, FloatArray]] = []
@@ -87,7 +70,7 @@ class Regime:
         self._replays_due = 0.0
         self._solver_prior: KBMap | None = None
         self._task_numbers = task_numbers
-        self.task_number = next(task_numbers)
+        self.task_number = next(task_numbers)  # of the solver's current task
 
     @property
     def model(self) -> LearntModel:

@@ -128,7 +128,7 @@ class Regimes:
         """Return the state before any pair."""
         regimes = cls(nominal, settings, task_numbers)
         if nominal.frame_known:
-            regimes.present = regimes._regime(nominal.prior(), regimes._drawn(nominal.chain))
+            regimes.present = regimes._regime(nominal.prior, regimes._drawn(nominal.chain))
         return regimes
 
     @classmethod

@@ -123,25 +123,15 @@ class ChangeRecord(msgspec.Struct, frozen=True, kw_only=True):
     @classmethod
     def told(cls, last_seq: int) -> ChangeRecord:
         """Return the record of a reported tool change after the pair `last_seq`."""
-        first = last_seq + 1
-        return cls(
-            first_seq=first,
-            earliest_seq=first,
-            latest_seq=first,
-            noticed_seq=last_seq,
-            found=False,
-            kinds=[KindOfChange(TOOL, None, 1.0)],
-        )
+        return cls._begun(last_seq + 1, last_seq, False, [KindOfChange(TOOL, None, 1.0)])
 
     @classmethod
     def unnamed(cls, first_seq: int, noticed_seq: int, joints: int) -> ChangeRecord:
         """Return the record of a change detected when the arm was too poorly known to identify its kind."""
-        zeros = [KindOfChange(JOINT, joint, 1.0 / (3.0 * joints)) for joint in range(joints)]
-        return cls(
-            first_seq=first_seq,
-            earliest_seq=first_seq,
-            latest_seq=first_seq,
-            noticed_seq=noticed_seq,
-            found=True,
-            kinds=[KindOfChange(TOOL, None, 1.0 / 3.0), KindOfChange(CAMERA, None, 1.0 / 3.0), *zeros],
-        )
+        kinds = [KindOfChange(name, None, 1.0 / 3.0) for name in (TOOL, CAMERA)]
+        kinds += [KindOfChange(JOINT, joint, 1.0 / (3.0 * joints)) for joint in range(joints)]
+        return cls._begun(first_seq, noticed_seq, True, kinds)
+
+    @classmethod
+    def _begun(cls, first: int, noticed: int, found: bool, kinds: list[KindOfChange]) -> ChangeRecord:
+        return cls(first_seq=first, earliest_seq=first, latest_seq=first, noticed_seq=noticed, found=found, kinds=kinds)
