@@ -168,9 +168,6 @@ class NominalModel:
         Args:
             kbmap: the learnt map.
             chain: the nominal chain in the frame that the map was learnt in; it gives the hand's orientation.
-            q: joint values since the tool change.
-            x: positions since the tool change.
-
         Raises:
             DegenerateDataError: there are no pairs.
         """

@@ -195,10 +195,7 @@ class Regime:
         """Learn pairs, q (n, d) and x (n, 3), that waited for the prior: each once, in their order.
 
         Args:
-            q: joint values (n, d).
-            x: positions (n, 3).
-            cov: their covariances (n, 3, 3) [m²], NaN where a pair has none.
-            turns: their orientations, quaternions (n, 4), NaN where a pair has none.
+            cov, turns: as `PairMemory.append` takes them.
             belief: posterior of the chain from them.
         """
         self._claims.fitted(belief)

@@ -36,8 +36,6 @@ class PairMemory:
         """Keep pairs, q (n, d) and x (n, 3); drop the oldest to make room.
 
         Args:
-            q: joint values (n, d).
-            x: positions (n, 3).
             cov: their covariances (n, 3, 3) [m²], NaN where a pair has none; None: none has any.
             turns: their orientations, quaternions (n, 4), likewise.
         """

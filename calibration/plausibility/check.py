@@ -58,8 +58,6 @@ def plausibility(
     """Check pairs q (n, d) [rad, m] and x (n, 3) [m] before a fit to them is trusted.
 
     Args:
-        q: joint values (n, d) [rad, m].
-        x: positions (n, 3) [m].
         t: times (n,) [s] if known.
         chain: the nominal chain if it is not the robot's.
         sigma_m: 1-sigma of a coordinate [m] if known.

@@ -107,9 +107,7 @@ class Origin:
 
         Args:
             found: probability of each kind of change, the most probable first.
-            q: joint values since the change.
-            x: positions since the change.
-            cov: their covariances (n, 3, 3) [m²], NaN where a pair has none; None where no pair has any.
+            cov: as `PairMemory.append` takes them.
         """
         arm = self._forgetful(found)
         belief = fitted_belief(arm.chain, q, self._of_chain(q, x), cov)

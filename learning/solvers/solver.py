@@ -89,14 +89,7 @@ class Solver(Protocol):
     def learn(
         self, q: FloatArray, x: FloatArray, cov: FloatArray | None = None, turns: FloatArray | None = None
     ) -> None:
-        """Add pairs, q (n, d) [rad] and x (n, 3) [m].
-
-        Args:
-            q: joint values.
-            x: positions.
-            cov: their covariances (n, 3, 3) [m²], NaN where a pair has none; None where no pair has any.
-            turns: their orientations, quaternions (n, 4), likewise.
-        """
+        """Add pairs, q (n, d) [rad] and x (n, 3) [m], cov and turns as `PairMemory.append` takes them."""
 
     def solve(self) -> None:
         """Request the solutions of all pairs so far; `poll` returns them one by one, perhaps later."""
