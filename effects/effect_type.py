@@ -418,6 +418,12 @@ class Effect:
         frozen = frozen_array(values)
         return Effect(self.kind, self.where, self.source, frozen, self.prismatic, self.ordinal, self.free)
 
+    def with_amounts(self, amounts: FloatArray | float) -> Effect:
+        """Return the same effect with other amounts (p,), or all alike."""
+        values = self.values.copy()
+        values[self.amounts] = amounts
+        return self.with_values(values)
+
     def freeing(self, free: tuple[int, ...] | None) -> Effect:
         """Return the same effect with these amounts free, all for None, and the others nominal."""
         freed = replace(self, free=free)

@@ -70,7 +70,7 @@ class Background:
         self._whitening, self.scales = whitening, scales
         own = () if scales is None else simulation.background or background_effects(simulation, run.motion.q)
         # the effects with zero amounts: a link at each joint, eccentricity and ripple of each drive
-        self.effects = tuple(_resting(effect) for effect in own)
+        self.effects = tuple(effect.with_amounts(0.0) for effect in own)
         amounts = np.concatenate([np.empty(0), *(effect.values[effect.amounts] for effect in own)])
         # Tolerances are centred here.
         self._centre = amounts
@@ -93,7 +93,7 @@ class Background:
         """Return the background's effects with amounts (p,)."""
         ends = np.cumsum([len(effect.amounts) for effect in self.effects])
         return tuple(
-            _with(effect, (self._centre + amounts)[end - len(effect.amounts) : end])
+            effect.with_amounts((self._centre + amounts)[end - len(effect.amounts) : end])
             for effect, end in zip(self.effects, ends, strict=True)
         )
 
@@ -154,21 +154,11 @@ def background_effects(simulation: Simulation, q: FloatArray) -> tuple[Effect, .
     """Return the tolerance effects, with zero amounts, of each joint that moves over q (n, d) and each link between."""
     robot, found = simulation.robot, []
     for k, joint in enumerate(robot.joints):
-        found.append(_resting(Effect.at(robot, "link_geometry", joint)))
+        found.append(Effect.at(robot, "link_geometry", joint))
         if not robot.chain.prismatic[k] and np.ptp(q[:, k]) > 0.0:
-            found.append(_resting(Effect.at(robot, "joint_eccentricity", joint)))
-            found.append(_resting(Effect.at(robot, "joint_ripple", joint, values=[0.0, 0.0, _TWICE])))
-    return tuple(effect.one_more(-1) for effect in found)
-
-
-def _resting(effect: Effect) -> Effect:
-    return _with(effect, np.zeros(len(effect.amounts)))
-
-
-def _with(effect: Effect, amounts: FloatArray) -> Effect:
-    values = effect.values.copy()
-    values[effect.amounts] = amounts
-    return effect.with_values(values)
+            found.append(Effect.at(robot, "joint_eccentricity", joint))
+            found.append(Effect.at(robot, "joint_ripple", joint, values=[0.0, 0.0, _TWICE]))
+    return tuple(effect.with_amounts(0.0).one_more(-1) for effect in found)
 
 
 def _groups(effect: Effect) -> np.ndarray:

@@ -383,8 +383,8 @@ class Fit:
             amounts, shapes = amounts + len(effect.amounts), shapes + len(own)
         raise ValueError(f"{cause.name} is no effect of this fit")
 
-    def moved(self, step: FloatArray) -> tuple[Simulation, FloatArray]:
-        """Return the simulation and the tolerances after a step (p + s,)."""
+    def stepped(self, step: FloatArray) -> Fit:
+        """Return the fit after a step (p + s,), without further steps."""
         effects, first = [], 0
         shape = self.amounts + len(self.tolerated)
         for index, effect in enumerate(self.simulation.effects):
@@ -396,11 +396,8 @@ class Fit:
                     values[k] = effect.kind.bounded(effect, k, values[k] + step[shape], self.observations.motion)
                     shape += 1
             effects.append(effect.with_values(values))
-        return self.simulation.with_effects(effects), self.tolerated + step[first : first + len(self.tolerated)]
-
-    def stepped(self, step: FloatArray) -> Fit:
-        """Return the fit after a step (p + s,), without further steps."""
-        return self.at(*self.moved(step))
+        tolerated = self.tolerated + step[first : first + len(self.tolerated)]
+        return self.at(self.simulation.with_effects(effects), tolerated)
 
     def at(self, simulation: Simulation, tolerated: FloatArray | None = None) -> Fit:
         """Evaluate a simulation with the same nuisances, and the same tolerances by default, without fitting it."""

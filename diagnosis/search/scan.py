@@ -116,7 +116,7 @@ class Scan:
                 gains, amounts, dofs = self._solved(self._linear(effect), effect)
                 if not dofs[0]:
                     return None
-                return Candidate(_with_amounts(effect, amounts[0]), float(gains[0]), int(dofs[0]), choices(effect))
+                return Candidate(effect.with_amounts(amounts[0]), float(gains[0]), int(dofs[0]), choices(effect))
 
     def _in_parts(self, effect: Effect) -> Candidate | None:
         """Return an effect with those of its amounts free that are worth their number; None if none is identifiable."""
@@ -136,7 +136,7 @@ class Scan:
         if not np.isfinite(worths[best]):
             return None
         freed = effect.freeing(tuple(np.array(effect.amounts)[chosen[best]].tolist()))
-        found = _with_amounts(freed, amounts[best][chosen[best]])
+        found = freed.with_amounts(amounts[best][chosen[best]])
         return Candidate(found, float(gains[best]), int(dofs[best]), choices(found))
 
     def in_full(self, candidate: Candidate) -> Candidate:
@@ -391,12 +391,6 @@ def _units(effect: Effect) -> FloatArray:
 def _eigenvalues(matrices: FloatArray) -> FloatArray:
     values = matrices[:, 0] if matrices.shape[1] == 1 else np.linalg.eigvalsh(matrices)
     return np.asarray(values, dtype=np.float64)
-
-
-def _with_amounts(effect: Effect, amounts: FloatArray) -> Effect:
-    values = effect.values.copy()
-    values[effect.amounts] = amounts
-    return effect.with_values(values)
 
 
 def _most_gain(tried: tuple[_Tried, FloatArray]) -> float:

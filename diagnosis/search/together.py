@@ -255,9 +255,6 @@ def _in_parts(candidate: Candidate) -> list[Candidate]:
 
 def _at_rest(candidate: Candidate) -> Candidate:
     """Return the candidate at zero amounts, where it is linear in them."""
-    effect = candidate.effect
-    if not effect.kind.is_linear:
+    if not candidate.effect.kind.is_linear:
         return candidate
-    values = effect.values.copy()
-    values[effect.amounts] = 0.0
-    return Candidate(effect.with_values(values), candidate.gain, candidate.dof, candidate.trials)
+    return Candidate(candidate.effect.with_amounts(0.0), candidate.gain, candidate.dof, candidate.trials)
