@@ -104,6 +104,7 @@ class RigidLearner(Model):
 
     Raises:
         ShapeError: the prior is one of another chain.
+        DegenerateDataError: `scatter` and `report` before the first pair.
 
     Example:
         >>> import numpy as np
@@ -190,11 +191,7 @@ class RigidLearner(Model):
 
     @property
     def scatter(self) -> Scatter:
-        """Scatter of the pairs about the chain.
-
-        Raises:
-            DegenerateDataError: no pair has been learnt.
-        """
+        """Scatter of the pairs about the chain."""
         fit = self._fitted()
         if fit is None:
             raise DegenerateDataError("nothing lies around the chain before the first pair was learnt")
@@ -301,11 +298,7 @@ class RigidLearner(Model):
         return Estimate(x, sigma, near_data(variance, self._widest)).like(angles)
 
     def report(self) -> ChainReport:
-        """Return hand-eye, tool centre point and joint offsets with 95 % intervals.
-
-        Raises:
-            DegenerateDataError: no pairs have been learnt.
-        """
+        """Return hand-eye, tool centre point and joint offsets with 95 % intervals."""
         fit = self._fitted()
         if fit is None:
             raise DegenerateDataError("there is nothing to report before the first pair was learnt")

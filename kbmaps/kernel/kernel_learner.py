@@ -236,6 +236,7 @@ class KernelLearner(Model):
 
     Raises:
         SettingError: a precision that is neither None, "evidence", nor a number above 0.
+        DegenerateDataError: `noise`, `log_evidence`, `prior_precision` and `prior_std` before the first pair.
     """
 
     def __init__(
@@ -278,20 +279,12 @@ class KernelLearner(Model):
 
     @property
     def noise(self) -> float:
-        """Noise of a measured coordinate, 1-sigma [m]: estimated, or given with the pairs.
-
-        Raises:
-            DegenerateDataError: no pair has been learnt.
-        """
+        """Noise of a measured coordinate, 1-sigma [m]: estimated, or given with the pairs."""
         return math.sqrt(self._fitted().noise_variance) * self._pairs.mean_unit
 
     @property
     def log_evidence(self) -> float | None:
-        """Log marginal likelihood of the pairs; None for the exact solution.
-
-        Raises:
-            DegenerateDataError: no pair has been learnt.
-        """
+        """Log marginal likelihood of the pairs; None for the exact solution."""
         return self._fitted().log_evidence
 
     def predict(self, q: ArrayLike) -> FloatArray:
@@ -319,20 +312,12 @@ class KernelLearner(Model):
 
     @property
     def prior_precision(self) -> float:
-        """λ of the current fit; 0 for the exact one.
-
-        Raises:
-            DegenerateDataError: no pair has been learnt.
-        """
+        """λ of the current fit; 0 for the exact one."""
         return self._fitted().precision
 
     @property
     def prior_std(self) -> float:
-        """Standard deviation of the control points around the prior [m].
-
-        Raises:
-            DegenerateDataError: no pair has been learnt.
-        """
+        """Standard deviation of the control points around the prior [m]."""
         return math.sqrt(self._fitted().prior_variance)
 
     def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
