@@ -303,8 +303,12 @@ class RecursiveRigidLearner(Model):
             raise SettingError(f"tolerance must be finite and greater than 0 m, got {tolerance!r}")
         if self.kept >= _Settings.first:
             self._window.fold(self._set_right(), self.kept)
-        belief = ChainBelief.from_covariance(self._parameters, self._filter.change, self._filter.covariance)
-        self._go_on_from(belief.with_other_tool(tolerance), fitted=False)
+        before = ChainBelief.from_covariance(self._parameters, self._filter.change, self._filter.covariance)
+        belief = before.with_other_tool(tolerance)
+        self._filter.go_on_from(belief, fitted=False)
+        self._window.begin_with(belief)
+        self._widest = None
+        self._due = _Settings.first
 
     def predict(self, q: ArrayLike) -> FloatArray:
         return self._parameters.positions(self._filter.change, rows_or_vector("q", q, self.joints))
@@ -364,9 +368,3 @@ class RecursiveRigidLearner(Model):
             coordinates = fit.freedom + self._window.noise.coordinates
             self._filter.noise_coordinates = float(np.clip(coordinates, NOISE_COORDINATES, NOISE_MEMORY))
         return fit
-
-    def _go_on_from(self, belief: ChainBelief, *, fitted: bool) -> None:
-        self._filter.go_on_from(belief, fitted=fitted)
-        self._window.begin_with(belief)
-        self._widest = None
-        self._due = _Settings.first

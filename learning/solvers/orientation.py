@@ -80,9 +80,6 @@ class OrientationSolver:
         chain = fitted_orientation(belief, self._q[chosen], self._turns[chosen])
         if not self._with_map or self._pairs < FEWEST_FOR_MAP:
             return OrientationSolution(self._pairs, chain)
-        return self._with_solved_map(chain)
-
-    def _with_solved_map(self, chain: OrientedChain) -> OrientationSolution:
         prior = chain.chain.to_kbmap(self._bases, orientation=True)
         if self._exact is None:
             self._exact = ExactLearner(prior, memory=Memory(window=WINDOW))
