@@ -23,6 +23,17 @@ CLIPPED_SIGMAS = 4.0
 _ONE_SIGMA = 0.841344746
 
 
+def middle_sigma(norms: FloatArray, rank: float) -> float:
+    """Return the 1-sigma of a coordinate from the middle one of residuals' norms (n,), the one of this rank.
+
+    The rank lies above the median by the number of pairs that the fitted parameters can always explain (Rousseeuw and
+    Leroy 1987, least median of squares). Otherwise a few pairs would fit perfectly and the others would count as
+    outliers.
+    """
+    middle = min(int(rank), len(norms) - 1)
+    return float(np.partition(norms, middle)[middle]) / MEDIAN_NORM
+
+
 def student(freedom: float) -> float:
     """Return the factor by which a sigma with an estimated noise must be multiplied for Gaussian coverage."""
     # Imported here: it takes half a second, and not every process learns.

@@ -15,7 +15,7 @@ from kbmaps.chains.parameters import ChainParameters, ChainTolerances
 from kbmaps.errors import DegenerateDataError, SettingError, ShapeError
 from kbmaps.maps.kbmap import POSITION_OUTPUTS, KBMap
 from kbmaps.pairs import checked_pairs
-from kbmaps.robust import MEDIAN_NORM, ROUNDING_M, UNCALIBRATED_SIGMAS
+from kbmaps.robust import ROUNDING_M, UNCALIBRATED_SIGMAS, middle_sigma
 from kbmaps.rotations import cross_matrix, exponentials, nearest_rotation, rotation_vector
 
 
@@ -72,15 +72,8 @@ class _Fit:
         return np.linalg.norm(self.errors(), axis=1)
 
     def spread(self, least: float) -> float:
-        """Return a robust standard deviation [m] of one coordinate's error, at least `least`.
-
-        Taken from the middle distance. Its rank lies above the median by the number of pairs that the fitted parameters
-        can always explain (Rousseeuw and Leroy 1987, least median of squares). Otherwise a few pairs would fit
-        perfectly and the others would count as outliers.
-        """
-        free_pairs = 2 * self.fit_pose + self.fit_marker
-        rank = min(len(self.x) // 2 + free_pairs, len(self.x) - 1)
-        return max(float(np.partition(self.norms(), rank)[rank]) / MEDIAN_NORM, least)
+        """Return a robust standard deviation [m] of one coordinate's error, at least `least`."""
+        return max(middle_sigma(self.norms(), len(self.x) // 2 + 2 * self.fit_pose + self.fit_marker), least)
 
     def place(self, weights: FloatArray) -> None:
         self.rotation, self.translation = rigid_motion(self.markers(), self.x, weights)
@@ -355,18 +348,10 @@ def _robust_mean(offsets: FloatArray, sigma: float) -> FloatArray:
     centre = np.median(offsets, axis=0)
     for _ in range(len(offsets)):
         distances = np.linalg.norm(offsets - centre, axis=1)
-        mean = offsets[distances <= ROUNDING_M + UNCALIBRATED_SIGMAS * max(_spread(distances), sigma)].mean(axis=0)
+        # One pair is always explained by an offset.
+        spread = max(middle_sigma(distances, len(distances) // 2 + 1), sigma)
+        mean = offsets[distances <= ROUNDING_M + UNCALIBRATED_SIGMAS * spread].mean(axis=0)
         if (mean == centre).all():
             break
         centre = mean
     return centre
-
-
-def _spread(distances: FloatArray) -> float:
-    """Return the standard deviation of a coordinate from the middle distance.
-
-    Its rank lies above the median by the one pair that an offset can always explain (Rousseeuw and Leroy 1987, least
-    median of squares). Otherwise a few pairs would fit perfectly and the others would count as outliers.
-    """
-    rank = min(len(distances) // 2 + 1, len(distances) - 1)
-    return float(np.partition(distances, rank)[rank]) / MEDIAN_NORM
