@@ -18,8 +18,7 @@ from bodyschema.diagnosis.report.text import in_order
 
 from .diagnosing import Diagnosed, Done, Told
 
-# With at least this many units, a cause of more than half of them is attributed to the description.
-FEWEST_TO_SHARE = 3
+FEWEST_TO_SHARE = 3  # with at least this many units, a cause of more than half of them is attributed to the description
 # Causes of the robot's placement, which do not concern its type.
 PLACED = ("camera_pose", "camera_moved", "tool_offset", "tool_slip")
 

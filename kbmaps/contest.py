@@ -27,8 +27,7 @@ class _Settings:
     least_m: float = 1e-6  # a difference too small for any camera [m]
     # A squared error is capped at this multiple of the better model's median: an outlier says nothing about either.
     cap: float = 9.0
-    # Lower bound of the median [m²]: where a model is exact, another one that errs still loses.
-    least: float = 1e-30
+    least: float = 1e-30  # Lower bound of the median [m²]: where a model is exact, another one that errs still loses
 
 
 def shared_by(residuals: FloatArray) -> float:

@@ -16,8 +16,7 @@ VARIANCE_FLOOR = 1e-24  # variances [m² or rad²] below that of (1 pm)² are ro
 # A pair this many sigma from its prediction by the others is an outlier: 3 in 100,000 good ones are farther out (chi,
 # three dimensions).
 OUTLIER_SIGMAS = 4.8
-# An arm that is not calibrated has errors with long tails, which must not be rejected.
-UNCALIBRATED_SIGMAS = 15.0
+UNCALIBRATED_SIGMAS = 15.0  # an arm that is not calibrated has errors with long tails, which must not be rejected
 # Where single pairs are weighed, none counts for more than one this many sigmas away: it may be an outlier.
 CLIPPED_SIGMAS = 4.0
 _ONE_SIGMA = 0.841344746

@@ -18,8 +18,7 @@ log = logging.getLogger(__name__)
 
 
 class _Settings:
-    # Between joint readings farther apart than this nothing is interpolated, as in the sampler.
-    max_gap_s: float = 0.1
+    max_gap_s: float = 0.1  # between joint readings farther apart than this nothing is interpolated, as in the sampler
     # A pause between marker positions longer than this begins another segment, as in the sampler.
     segment_gap_s: float = 1.0
     # Rows whose interpolated joints are less sure than this are left out [rad, m]: the sampler's limit for late joints.

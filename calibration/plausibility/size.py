@@ -32,8 +32,7 @@ class _Settings:
     # Off by this many times its own uncertainty. Right recordings of real and generated arms come to 4.0, and fit
     # hardly better for it.
     far: float = 5.0
-    # Smaller ones are warned of: a joint whose ratio is 2 % off looks like positions 2.4 % off.
-    other: float = 0.04
+    other: float = 0.04  # Smaller ones are warned of: a joint whose ratio is 2 % off looks like positions 2.4 % off
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,8 +25,7 @@ class Layout:
     # Histogram: columns, the quantile of the errors at which it ends, and noise samples per row.
     most_columns, fewest_columns, pairs_a_column, shown, drawn = 48, 12, 12, 0.99, 20
     side, margin = 300, 26  # of a view with arrows
-    # Arrow length as a share of the largest span, for the given quantile of the errors before.
-    long, shorter = 0.1, 0.9
+    long, shorter = 0.1, 0.9  # arrow length as a share of the largest span, for the given quantile of the errors before
 
 
 ASPECT = (Layout.right - Layout.left) / (Layout.bottom - Layout.top)

@@ -11,8 +11,7 @@ from bodyschema.effects.parameter import Parameter, shifts
 from bodyschema.interfaces.records import FloatArray
 
 _SHORTEST = 0.03  # a drift that ends within a smaller share of the recording is an offset from the beginning
-# Time constants tried, as shares of the recording's duration.
-_TIME_CONSTANTS = np.geomspace(_SHORTEST, 4.0, 24)
+_TIME_CONSTANTS = np.geomspace(_SHORTEST, 4.0, 24)  # time constants tried, as shares of the recording's duration
 
 
 class ThermalDrift(TimeEffect):

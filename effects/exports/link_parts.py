@@ -24,8 +24,7 @@ from kbmaps.rotations import quaternions
 _MESHES = (".stl", ".obj", ".msh")
 _MOST_TRIANGLES = 200_000
 _STL_HEADER, _STL_TRIANGLE = 84, 50
-# A link without a shape becomes a rod from its joint to the next one [m].
-_ROD_RADIUS, _SHORTEST_ROD = 0.02, 0.01
+_ROD_RADIUS, _SHORTEST_ROD = 0.02, 0.01  # a link without a shape becomes a rod from its joint to the next one [m]
 # Floor of a moment of inertia [kg·m²]; MuJoCo needs a positive one.
 LEAST_INERTIA = 1e-9
 _GREY = "0.7 0.7 0.72 1"

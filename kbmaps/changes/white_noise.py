@@ -85,8 +85,7 @@ class WhiteNoise:
 
 
 class _Settings:
-    # Default number of neighbours of a path that share a model's error: 20 degrees of it.
-    usually_shared: int = 10
+    usually_shared: int = 10  # Default number of neighbours of a path that share a model's error: 20 degrees of it
     # Sums over longer lags than this, or than this share of the series, would be dominated by noise.
     longest_lag: int = 200
     longest_lag_share: float = 0.125

@@ -26,8 +26,7 @@ class _Settings:
     # over the whole turn that is a step of 8 degrees, along which a function that bends three times as fast still
     # shares 0.95.
     path_correlation: float = 0.995
-    # Relative to the largest eigenvalue of the kernel: smaller ones are rounding.
-    smallest_eigenvalue: float = 1e-15
+    smallest_eigenvalue: float = 1e-15  # Relative to the largest eigenvalue of the kernel: smaller ones are rounding
 
 
 FEWEST_BLOCKS = 4

@@ -26,8 +26,7 @@ class _Settings:
     but for `least_gain` by 5 %, `window` by 1 %; not varied: `rounds`.
     """
 
-    # Models less probable than the best by more than this many nats are left out of averages.
-    window: float = 4.0
+    window: float = 4.0  # models less probable than the best by more than this many nats are left out of averages
     least_gain: float = 0.5  # A group that gains less is left out of averages: it makes almost no difference
     # Sets of groups less probable than the chosen one by more than this many nats are not extended.
     swap_window: float = 8.0

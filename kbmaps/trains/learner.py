@@ -113,8 +113,7 @@ _FITTED = ("z", "sure", "used", "information", "absorbed")
 
 
 class _Settings:
-    # Initial noise of the first fit around a prior, relative to the residuals under the prior.
-    first_noise: float = 0.1
+    first_noise: float = 0.1  # initial noise of the first fit around a prior, relative to the residuals under the prior
     # A refit with this many times the noise of the fit before has diverged, and the search starts again.
     lost: float = 3.0
     share_before_refit: int = 4

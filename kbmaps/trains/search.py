@@ -31,11 +31,9 @@ class _Settings:
     # A pair farther than this many robust standard deviations is an outlier: 1.5e-5 of good pairs are.
     outlier_distance: float = 5.0
     weight_scale: float = 4.0
-    # Reweighting ends when no residual moves by more than this many standard deviations.
-    same_lengths: float = 0.05
+    same_lengths: float = 0.05  # reweighting ends when no residual moves by more than this many standard deviations
     search_pairs: int = 40  # random starts use at most this many pairs per joint
-    # With fewer degrees of freedom per pair, residuals cannot separate noise from outliers.
-    least_freedom: float = 0.2
+    least_freedom: float = 0.2  # with fewer degrees of freedom per pair, residuals cannot separate noise from outliers
 
 
 PLAUSIBLE = 0.1  # failed starts leave a tenth or more of the spread, and may agree on it by chance

@@ -33,8 +33,7 @@ from kbmaps.arrays import evenly_spread
 
 log = logging.getLogger(__name__)
 
-# Memory and time grow with the square and the cube of the control points: 3^7 take 77 MB and 0.2 s.
-LARGEST_NET = 2187
+LARGEST_NET = 2187  # Memory and time grow with the square and the cube of the control points: 3^7 take 77 MB and 0.2 s
 
 
 class _Settings:
@@ -45,8 +44,7 @@ class _Settings:
     first_share: float = 0.75
     fewest_first: int = 5
     shared: float = 1.5  # minimum number of neighbours counting as one at which their correlation is not chance
-    # While pairs are few, a solution is cheap, and renewed after this growth of their number.
-    growth: float = 0.1
+    growth: float = 0.1  # while pairs are few, a solution is cheap, and renewed after this growth of their number
 
 
 # The information about the chain of pairs older than those kept is folded into its prior, this many at a time.

@@ -18,8 +18,7 @@ from kbmaps.robust import ROUNDING_M
 WORKMANSHIP = ((0.0003, 0.0001), (0.001, 0.0005), (0.003, 0.001), (0.01, 0.003), (0.03, 0.01), (0.06, 0.03))
 FOLLOWED = 100  # pairs at which candidates are compared with the posterior, evenly spread
 LEAST_SHARE = 0.01  # less probable tolerances are not considered
-# Narrower tolerances are kept unless wider ones are more probable by more than the inverse of this.
-LIKELY = 1.0 / 3.0
+LIKELY = 1.0 / 3.0  # narrower tolerances are kept unless wider ones are more probable by more than the inverse of this
 
 
 @dataclass(frozen=True)
