@@ -35,8 +35,8 @@ from benchmarks.rough_arm import RoughArm, rough_arm
 from bodyschema.interfaces.records import FloatArray, Pair, frozen_array
 from bodyschema.learning.changes.known_arm import KnownArm, Origin
 from bodyschema.learning.changes.monitor import LOOKED_BACK, ChangeMonitor, Reference
-from bodyschema.learning.changes.record import ChangeRecord, KindOfChange
 from bodyschema.learning.solvers.solver import fitted_belief
+from bodyschema.learning.status import ChangeRecord, KindOfChange
 from bodyschema.learning.uncertainty import PredictiveUncertainty
 from kbmaps import ChainBelief, ChainParameters, ChainTolerances, Explanation, learning_bases
 from kbmaps.changes.kinds import log_ratios

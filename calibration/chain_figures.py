@@ -22,17 +22,13 @@ IntArray = NDArray[np.intp]
 
 
 class _Settings:
-    # Where what is probable differs by more than this, the pairs do not tell.
-    told_within: float = 4.0
-    # A zero that is still as uncertain as it was before is nothing that the pairs show.
-    not_shown: float = 0.9
-    # Of the numerical derivatives by tilts, shifts and zeros [rad, m].
-    step: float = 1e-6
+    told_within: float = 4.0  # where what is probable differs by more than this, the pairs do not tell
+    not_shown: float = 0.9  # a zero that is still as uncertain as it was before is nothing that the pairs show
+    step: float = 1e-6  # of the numerical derivatives by tilts, shifts and zeros [rad, m]
     # Poses that stand for all, and the noise of exact pairs [m].
     poses: int = 100
     exact_m: float = 1e-6
-    # From one linearisation to the next the error along a curve is squared.
-    relinearised: int = 4
+    relinearised: int = 4  # from one linearisation to the next the error along a curve is squared
 
 
 HALF_WIDTH_95 = 1.959964
@@ -50,7 +46,6 @@ class ChainFigures:
 
     @property
     def geometry(self) -> CalibratedGeometry:
-        """The most probable chain in the terms of the robot's files."""
         return self._geometry(self.beliefs[0].mean, self._split(self.beliefs[0]))
 
     @cached_property
@@ -73,7 +68,9 @@ class ChainFigures:
         covariance = np.zeros((len(self.values), len(self.values)))
         for belief, share in zip(self.beliefs, self.shares, strict=True):
             split = self._split(belief)
-            jacobian = self._derivatives(split)
+            steps = _Settings.step * np.eye(len(split))
+            here = self._figures(split)
+            jacobian = np.array([_unwound(self._figures(moved) - here) for moved in split + steps]).T / _Settings.step
             apart = _unwound(self._figures(split) - self.values)
             inner = _given(belief.covariance, self._hidden)
             covariance += share * (jacobian @ inner @ jacobian.T + np.outer(apart, apart))
@@ -152,11 +149,6 @@ class ChainFigures:
         camera = geometry.T_parent_camera
         return np.concatenate([camera[:3, 3], rpy_of(camera[:3, :3]), geometry.marker_xyz, split[self._zeros]])
 
-    def _derivatives(self, change: FloatArray) -> FloatArray:
-        steps = _Settings.step * np.eye(len(change))
-        here = self._figures(change)
-        return np.array([_unwound(self._figures(moved) - here) for moved in change + steps]).T / _Settings.step
-
 
 def after_exact_pairs(prior: ChainBelief, change: FloatArray, robot: RobotDescription) -> ChainBelief:
     """Return what exact pairs of all poses would leave of the prior, linearised at a change (size,)."""
@@ -217,7 +209,6 @@ def is_told(made: Sequence[tuple[float, float]]) -> bool:
 
 
 def _spread(belief: ChainBelief, which: IntArray) -> FloatArray:
-    """Return 1-sigma (k,) of some of the parameters."""
     return np.sqrt(np.square(belief.root[which]).sum(axis=1))
 
 

@@ -19,8 +19,7 @@ from kbmaps.chains.align import rigid_motion
 # Rows whose joints differ by more are not at the same joint angles [rad, m].
 SAME_ANGLES = 1e-6
 WORST = 5
-# A rigid alignment of fewer points leaves no residual.
-_FEWEST_ALIGNED = 4
+_FEWEST_ALIGNED = 4  # a rigid alignment of fewer points leaves no residual
 
 
 class Distances(msgspec.Struct, frozen=True):

@@ -29,10 +29,8 @@ STEP_S = 0.004
 class _Settings:
     fewest_fixes: int = 60
     blocks: int = 10
-    # a second minimum is a rival if its residual is below this multiple of the best one's
-    rival: float = 1.15
-    # minimum distance of a rival
-    apart_s: float = 0.03
+    rival: float = 1.15  # a second minimum is a rival if its residual is below this multiple of the best one's
+    apart_s: float = 0.03  # minimum distance of a rival
     # relative to the largest motion: a direction without motion
     small: float = 1e-3
     ridge: float = 1e-6
@@ -45,10 +43,8 @@ class _Settings:
     # required ratio of the marker's RMS motion to its part that does not follow the joints
     follows: float = 4.0
     little_m: float = 0.01
-    # steps to reach the loosely fitted chain; from there two are enough
-    settling: int = 5
-    # on both sides of the smooth function's estimate
-    refined_s: float = 0.024
+    settling: int = 5  # steps to reach the loosely fitted chain; from there two are enough
+    refined_s: float = 0.024  # on both sides of the smooth function's estimate
 
 
 # Prior deviations of an arm from its URDF; they only constrain what the pairs do not determine.
@@ -89,7 +85,6 @@ class Wiggle:
 
     @cached_property
     def _spline(self) -> BSpline:
-        """Spline of the angles, over the readings' indices."""
         return _smooth(self.q)
 
     @cached_property
@@ -177,12 +172,10 @@ class _Fit:
 
     @property
     def unknowns(self) -> int:
-        """Number of fitted parameters."""
         return 3 * self.terms(0.0).shape[1]
 
     @property
     def motion_m(self) -> float:
-        """RMS distance of the positions from their mean."""
         return math.sqrt(float(np.mean(np.sum((self.x - self.x.mean(axis=0)) ** 2, axis=1))))
 
     def terms(self, lag: float) -> FloatArray:
@@ -194,7 +187,6 @@ class _Fit:
         return np.hstack([np.ones((len(q), 1)), u, u[:, rows] * u[:, columns], nominal - nominal.mean(axis=0)])
 
     def residual(self, lag: float, keep: NDArray[np.bool_] | slice = slice(None)) -> FloatArray:
-        """Return the residual of the fitted smooth function, shape (m, 3) [m]."""
         A, x = self.terms(lag)[keep], self.x[keep]
         scale = np.linalg.norm(A, axis=0) + np.finfo(float).tiny
         A = A / scale
@@ -202,7 +194,6 @@ class _Fit:
         return x - A @ weights
 
     def whitened(self, lag: float) -> _Fit:
-        """Return the same fit with positions whitened by the covariance of the residual at `lag` (larger in depth)."""
         return replace(self, x=self.x @ _whitening(self.residual(lag)).T)
 
     def cost(self, lag: float, keep: NDArray[np.bool_] | slice = slice(None)) -> float:
@@ -237,7 +228,6 @@ class _RigidFit:
 
     @property
     def unknowns(self) -> int:
-        """Number of fitted parameters."""
         return self.parameters.size
 
     def fitted(
@@ -262,7 +252,6 @@ class _RigidFit:
         return self.fitted(lag, keep)[1] @ self.white.T
 
     def whitened(self, lag: float) -> _RigidFit:
-        """Return the same fit with residuals whitened by their covariance at `lag` (larger in depth)."""
         start, left = self.fitted(lag, steps=_Settings.settling)
         return replace(self, start=start, white=_whitening(left))
 
@@ -298,7 +287,6 @@ def _nearest(smooth: _Fit, lag: float) -> tuple[_AnyFit, float, float]:
 
 
 def _rms(left: FloatArray) -> float:
-    """Return the RMS length of vectors (m, 3)."""
     return math.sqrt(float(np.mean(np.sum(left**2, axis=1))))
 
 
@@ -346,7 +334,6 @@ def _require_following(fit: _Fit, cost: float) -> None:
 
 
 def _strange(fit: _Fit, cost: float) -> str:
-    """Return the message for a marker that does not move with the joints."""
     moved_m, residual_m = fit.motion_m, math.sqrt(cost / len(fit.x))
     return (
         f"the marker does not follow the joints: of {1e3 * moved_m:.0f} mm of motion (RMS) {1e3 * residual_m:.0f} mm "

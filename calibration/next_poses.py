@@ -82,7 +82,7 @@ class NextPoses:
         """
         check_target(file, replace=replace)
         with writing(file, RecordingError):
-            write_whole({file: (self._json() if file.suffix.lower() == JSON else self._csv())})
+            write_whole({file: self._json() if file.suffix.lower() == JSON else self._csv()})
 
     def _json(self) -> bytes:
         value = {

@@ -14,7 +14,6 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.solvers.tolerance_selection import WORKMANSHIP
 from bodyschema.recordings.recording import Recording
 from bodyschema.robot.calibrated_files import CAMERA_LINK
-from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.hand_eye import HandEye
 from kbmaps import ChainBelief, ChainParameters, RigidLearner
 
@@ -28,8 +27,7 @@ class _Settings:
     explained_of_few: float = 0.8
     # Residuals beyond this multiple of the median get less weight, so that single outliers are no change.
     far: float = 5.0
-    # Excludes splits that the data cannot determine, e.g. where all poses are alike.
-    ridge: float = 1e-9
+    ridge: float = 1e-9  # Excludes splits that the data cannot determine, e.g. where all poses are alike.
     # Time stamps are late if the marker's velocity explains this share of the squared residuals: what they shift is
     # then a third of the scatter. In four simulated recordings at 0.2 m/s it is below 0.001 with stamps in time; 0.03
     # to 0.3 find delays from 1.5 to 4 ms on.
@@ -70,7 +68,9 @@ def _splits(learner: RigidLearner, recording: Recording) -> tuple[FloatArray, Fl
     parameters = ChainParameters(learner.nominal)
     x, jacobian = parameters.linearised(learner.change, recording.q)
     residuals, tools = recording.x - x, jacobian[:, :, parameters.tool]
-    roots = _weights(residuals)[:, None]
+    squares = np.square(residuals).sum(axis=1)
+    far = _Settings.far**2 * max(float(np.median(squares)), np.finfo(float).tiny)
+    roots = np.sqrt(far / (far + squares))[:, None]
     prior = ChainBelief.from_tolerances(parameters, learner.tolerances)
     noise = np.sqrt(np.square(roots * residuals).mean())
     free = (roots[:, :, None] * jacobian).reshape(-1, parameters.size) @ prior.root / noise
@@ -88,20 +88,12 @@ def _splits(learner: RigidLearner, recording: Recording) -> tuple[FloatArray, Fl
     return np.einsum("nj,nj->n", shifts, product) / np.square(target).sum(), shifts
 
 
-def _weights(residuals: FloatArray) -> FloatArray:
-    """Return square roots of the weights (n,) of residuals (n, 3)."""
-    squares = np.square(residuals).sum(axis=1)
-    far = _Settings.far**2 * max(float(np.median(squares)), np.finfo(float).tiny)
-    return np.sqrt(far / (far + squares))
-
-
 def _after(values: FloatArray) -> FloatArray:
     """Return the sums of all values (n, ...) after each but the last: (n - 1, ...)."""
     return np.cumsum(values[::-1], axis=0)[::-1][1:]
 
 
-# A joint that moved less is named [rad, m].
-STILL_RAD, STILL_M = math.radians(10.0), 0.02
+STILL_RAD, STILL_M = math.radians(10.0), 0.02  # a joint that moved less is named [rad, m]
 # Multiples of its tolerance beyond which a joint offset is reported, and beyond which it is not written. One in 370
 # exceeds the first if the tolerance is right; the second allows for a tolerance guessed at half its true value.
 FAR_OFF, TOO_FAR_OFF = 3.0, 5.0
@@ -217,6 +209,8 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
             Figure(*(float(unit * number) for number in numbers))
             for unit, *numbers in zip(_UNITS, named.drawn[:9], values[:9], halves[:9], strict=True)
         ]
+        least = np.where(robot.chain.prismatic, STILL_M, STILL_RAD)
+        moved = np.ptp(recording.q, axis=0)
         return cls(
             robot=robot.name,
             source=source,
@@ -239,7 +233,7 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
             # Everett and Hsu 1988: four for each joint that turns, two for each that slides, six for the ends of the
             # chain, less the three turns of the marker that its place does not show.
             showable=4 * int((~slides).sum()) + 2 * int(slides.sum()) + 3,
-            still=_still(robot, recording),
+            still=[name for name, still in zip(robot.joints, moved < least, strict=True) if still],
             first=first,
             other_tool_from=None if jump is None else first + jump.row - 1,
             other_tool_mm=None if jump is None else 1e3 * jump.distance_m,
@@ -268,7 +262,6 @@ def _zeros(calibration: Calibration, values: FloatArray, halves: FloatArray) -> 
 
 
 def _far_off(calibration: Calibration, zeros: list[Zero], times: float) -> list[str]:
-    """Return messages about joint offsets larger than `times` their tolerance."""
     told = calibration.learner.tolerances
     said: list[str] = []
     for zero, slides in zip(zeros, calibration.robot.chain.prismatic, strict=True):
@@ -330,7 +323,6 @@ def _many_left_out(calibration: Calibration, first: int) -> list[str]:
 
 
 def _badly_made(calibration: Calibration) -> list[str]:
-    """Return a message if the geometric errors reach the largest that are considered; else an empty list."""
     made, (axes, points) = calibration.workmanship, WORKMANSHIP[-1]
     if made is None or made.axes < axes:
         return []
@@ -339,12 +331,6 @@ def _badly_made(calibration: Calibration) -> list[str]:
         "considered. "
         "The URDF or the recording is of another arm."
     ]
-
-
-def _still(robot: RobotDescription, recording: Recording) -> list[str]:
-    least = np.where(robot.chain.prismatic, STILL_M, STILL_RAD)
-    moved = np.ptp(recording.q, axis=0)
-    return [name for name, still in zip(robot.joints, moved < least, strict=True) if still]
 
 
 def _mean_error(predicted: FloatArray, recording: Recording) -> float:

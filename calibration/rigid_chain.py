@@ -128,7 +128,6 @@ class Calibration:
 
     @property
     def learner(self) -> RigidLearner:
-        """The most probable one."""
         return self.learners[0]
 
     @property

@@ -75,43 +75,25 @@ MOST_DOUBTFUL = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """The errors found in a simulation, with all that a report shows of them.
+    """The errors found in a simulation, with all that a report shows of them."""
 
-    Attributes:
-        hypotheses: the effects that were tested, and the reasons why others were not.
-        nominal: the unchanged simulation.
-        aligned: fit of the parameters that robot.toml does not know.
-        geometry: fit with all lengths, axes, joint offsets, the tool and the camera's pose free.
-        extended: fit with the causes, the tolerances, and the smooth model of the unnamed causes.
-        alone: the same without the smooth model.
-        stored: the part of it that is surely better on another recording, which is written to extended.toml.
-        tolerated: sizes of the tolerances.
-        standings: assessment of each cause against its rivals.
-        left: residual structure that no effect fits.
-        blocks: blocks of time for held-out errors.
-        seed: seed of the resampling.
-        part: the observations in which causes were sought; None for all.
-        ended_early: True if the causes describe the error and do not explain it, as there are too many.
-    """
-
-    hypotheses: Hypotheses
-    nominal: Fit
-    aligned: Fit
-    geometry: Fit
-    extended: Fit
-    alone: Fit
-    stored: Fit
-    tolerated: Tolerated
-    standings: tuple[Standing, ...]
-    left: ResidualStructure
-    blocks: Blocks
-    seed: int
-    part: Observations | None = None
-    ended_early: bool = False
+    hypotheses: Hypotheses  # the effects that were tested, and the reasons why others were not
+    nominal: Fit  # the unchanged simulation
+    aligned: Fit  # fit of the parameters that robot.toml does not know
+    geometry: Fit  # fit with all lengths, axes, joint offsets, the tool and the camera's pose free
+    extended: Fit  # fit with the causes, the tolerances, and the smooth model of the unnamed causes
+    alone: Fit  # the same without the smooth model
+    stored: Fit  # the part of it that is surely better on another recording, which is written to extended.toml
+    tolerated: Tolerated  # sizes of the tolerances
+    standings: tuple[Standing, ...]  # assessment of each cause against its rivals
+    left: ResidualStructure  # residual structure that no effect fits
+    blocks: Blocks  # blocks of time for held-out errors
+    seed: int  # seed of the resampling
+    part: Observations | None = None  # the observations in which causes were sought; None for all
+    ended_early: bool = False  # True if the causes describe the error and do not explain it, as there are too many
 
     @property
     def causes(self) -> tuple[Effect, ...]:
-        """The effects found."""
         return self.extended.causes
 
     @cached_property
@@ -165,7 +147,6 @@ class Diagnosis:
 
     @property
     def outliers(self) -> int:
-        """Number of outliers."""
         return int(self._off.sum())
 
     @property
@@ -231,7 +212,6 @@ class Diagnosis:
 
     @cached_property
     def shares(self) -> Shares:
-        """Shares of the explained squared error."""
         unnamed = None if self.left.model is None else self.left.model.explained
         return shares(self.aligned, self.extended, self.markers, unnamed)
 
@@ -347,27 +327,18 @@ def diagnose(
 
 @dataclass(frozen=True, eq=False)
 class _SearchResult:
-    """Result of a search in some observations.
+    """Result of a search in some observations."""
 
-    Attributes:
-        start: fit of the parameters that robot.toml does not know.
-        standings: assessment of each cause against its rivals.
-        loose: play of the marker; None for one that is fixed.
-        is_reshaped: True if the noise has another shape than stated.
-        part: what was found in a part of the observations; None where all were searched.
-    """
-
-    start: Fit
+    start: Fit  # fit of the parameters that robot.toml does not know
     search: Search
     unnamed: UnnamedFamilies
     explanation: Explanation
-    standings: Sequence[Standing]
-    loose: Rattle | None
-    is_reshaped: bool
-    part: _SearchResult | None = None
+    standings: Sequence[Standing]  # assessment of each cause against its rivals
+    loose: Rattle | None  # play of the marker; None for one that is fixed
+    is_reshaped: bool  # True if the noise has another shape than stated
+    part: _SearchResult | None = None  # what was found in a part of the observations; None where all were searched
 
     def left(self, blocks: Blocks) -> ResidualStructure:
-        """Return the residual structure that no effect fits."""
         # In many rows, all families take much memory to find nothing again.
         asked = self if self.part is None or self.explanation.unnamed_causes else self.part
         return residual_structure(asked.explanation, asked.unnamed, blocks, self.loose)
@@ -576,7 +547,6 @@ def _searched(begun: Fit, search: Search) -> Fit:
 
 
 def _with_small_ones_tolerated(fit: Fit) -> Fit:
-    """Refit with the periodic errors of drives that are no larger than those of other drives as tolerances."""
     fit = with_small_ripples(fit)
     small = _small_ones(fit)
     return fit.tolerating(tolerated(fit).scales, small) if small else fit

@@ -8,23 +8,17 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """A part of the work.
+    """A part of the work."""
 
-    Attributes:
-        what: short description.
-        ends: share of the work done at its end [%], from times of some hundred pairs.
-    """
-
-    what: str
-    ends: float
+    what: str  # short description
+    ends: float  # share of the work done at its end [%], from times of some hundred pairs
 
 
 SETS = Stage("comparing sets of causes", 45.0)
 SEARCH = Stage("searching for further causes", 65.0)
 UNNAMED = Stage("asking whether something without a name is at work", 80.0)
 RIVALS = Stage("asking what else it could be", 95.0)
-# The number of steps of a stage is unknown: each takes this share of what is left of it.
-_OF_THE_REST = 0.25
+_OF_THE_REST = 0.25  # The number of steps of a stage is unknown: each takes this share of what is left of it
 
 
 class Stages:

@@ -37,10 +37,8 @@ STAGES: tuple[Stage, ...] = get_args(Stage)
 ShapeSearch = Literal["none", "moment", "cycles", "width", "shape", "load"]
 # Largest step of a period or a time constant, as a share of it; largest change in one step.
 _SHAPE_STEP, _SHAPE_CHANGE = 0.3, 2.0
-# Two moments at one place are told apart; further ones are a drift.
-_MOST_MOMENTS = 2
-# Step of numerical derivatives [rad, m, or a parameter's unit].
-STEP = 1e-6
+_MOST_MOMENTS = 2  # two moments at one place are told apart; further ones are a drift
+STEP = 1e-6  # step of numerical derivatives [rad, m, or a parameter's unit]
 
 
 class SimulatedArm(Protocol):
@@ -95,62 +93,36 @@ class SimulationRun(Protocol):
 
 
 class EffectType(ABC):
-    """One way in which reality may differ from the simulation.
+    """One way in which reality may differ from the simulation."""
 
-    Attributes:
-        name: as in `diagnosis.json`.
-        stage: the stage of the simulation at which it acts.
-        rank: its place in lists among the effects of its stage; of equal rank, by name.
-        at_joint: True if it acts at a joint.
-        takes_source: True if another joint causes it.
-        turns_only: True if only a revolute joint can have it.
-        needs_times: True if it needs times, not only an order.
-        needs_stereo: True if it needs the stereo calibration.
-        needs_weight: True if it needs joints that bear the arm's weight.
-        in_parts: True if only some of its amounts may differ from nominal, as where a link is too long but straight.
-        rigid: True if a rigid chain can hold it.
-        scales_all: True if the lengths of all links, wrong by one factor, look like it.
-        is_spring: True if its joint yields in proportion to its load.
-        is_load: True if it is a mass that the URDF does not state.
-        moves_joints: True if the true joint angles differ from the readings.
-        is_zero: True for the zero of a joint, which is often wrong at several joints.
-        of_drive: True for a periodic error, of which every drive has a little.
-        stays_as: name of its permanent form, for an effect that begins at a moment.
-        drifts: True if it grows with time.
-        remembers: True if it depends on earlier readings.
-        by_direction: True if only the direction of the moves counts for it, and not their size.
-        is_linear: True if it is proportional to its amounts.
-        search: how its last parameter is searched.
-        refines: True if to first order it looks like a simpler effect, in whose place it is tried.
-        further_trials: factor on the number of shapes tried, for one that has a shape more than a simpler effect.
-        no_counterpart: reason why a model of the arm does not hold it.
-    """
-
-    name: ClassVar[str]
-    stage: ClassVar[Stage]
-    rank: ClassVar[int] = 100
-    at_joint: ClassVar[bool] = False
-    takes_source: ClassVar[bool] = False
-    turns_only: ClassVar[bool] = False
-    needs_times: ClassVar[bool] = False
-    needs_stereo: ClassVar[bool] = False
-    needs_weight: ClassVar[bool] = False
+    name: ClassVar[str]  # as in `diagnosis.json`
+    stage: ClassVar[Stage]  # the stage of the simulation at which it acts
+    rank: ClassVar[int] = 100  # its place in lists among the effects of its stage; of equal rank, by name
+    at_joint: ClassVar[bool] = False  # True if it acts at a joint
+    takes_source: ClassVar[bool] = False  # True if another joint causes it
+    turns_only: ClassVar[bool] = False  # True if only a revolute joint can have it
+    needs_times: ClassVar[bool] = False  # True if it needs times, not only an order
+    needs_stereo: ClassVar[bool] = False  # True if it needs the stereo calibration
+    needs_weight: ClassVar[bool] = False  # True if it needs joints that bear the arm's weight
+    # True if only some of its amounts may differ from nominal, as where a link is too long but straight
     in_parts: ClassVar[bool] = False
-    rigid: ClassVar[bool] = False
-    scales_all: ClassVar[bool] = False
-    is_spring: ClassVar[bool] = False
-    is_load: ClassVar[bool] = False
-    moves_joints: ClassVar[bool] = False
-    is_zero: ClassVar[bool] = False
-    of_drive: ClassVar[bool] = False
-    stays_as: ClassVar[str | None] = None
-    drifts: ClassVar[bool] = False
-    remembers: ClassVar[bool] = False
-    by_direction: ClassVar[bool] = False
-    is_linear: ClassVar[bool] = True
-    search: ClassVar[ShapeSearch] = "none"
-    refines: ClassVar[bool] = False
+    rigid: ClassVar[bool] = False  # True if a rigid chain can hold it
+    scales_all: ClassVar[bool] = False  # True if the lengths of all links, wrong by one factor, look like it
+    is_spring: ClassVar[bool] = False  # True if its joint yields in proportion to its load
+    is_load: ClassVar[bool] = False  # True if it is a mass that the URDF does not state
+    moves_joints: ClassVar[bool] = False  # True if the true joint angles differ from the readings
+    is_zero: ClassVar[bool] = False  # True for the zero of a joint, which is often wrong at several joints
+    of_drive: ClassVar[bool] = False  # True for a periodic error, of which every drive has a little
+    stays_as: ClassVar[str | None] = None  # name of its permanent form, for an effect that begins at a moment
+    drifts: ClassVar[bool] = False  # True if it grows with time
+    remembers: ClassVar[bool] = False  # True if it depends on earlier readings
+    by_direction: ClassVar[bool] = False  # True if only the direction of the moves counts for it, and not their size
+    is_linear: ClassVar[bool] = True  # True if it is proportional to its amounts
+    search: ClassVar[ShapeSearch] = "none"  # how its last parameter is searched
+    refines: ClassVar[bool] = False  # True if to first order it looks like a simpler effect, in whose place it is tried
+    # factor on the number of shapes tried, for one that has a shape more than a simpler effect
     further_trials: ClassVar[int] = 1
+    # reason why a model of the arm does not hold it
     no_counterpart: ClassVar[str] = "this effect has no counterpart there"
 
     @abstractmethod
@@ -163,12 +135,10 @@ class EffectType(ABC):
 
     @cached_property
     def turning(self) -> tuple[Parameter, ...]:
-        """Parameters at a revolute joint, or at none."""
         return self.parameters(False)
 
     @cached_property
     def sliding(self) -> tuple[Parameter, ...]:
-        """Parameters at a prismatic joint."""
         return self.parameters(True)
 
     @cached_property
@@ -249,14 +219,10 @@ class EffectType(ABC):
 
 
 class StructureEffect(EffectType):
-    """An effect on the links' poses: a moved joint frame, or a joint that yields under the arm's weight.
-
-    Attributes:
-        has_slack: True if `slack` gives a deflection.
-    """
+    """An effect on the links' poses: a moved joint frame, or a joint that yields under the arm's weight."""
 
     stage = "structure"
-    has_slack: ClassVar[bool] = False
+    has_slack: ClassVar[bool] = False  # True if `slack` gives a deflection
 
     def frame(self, values: FloatArray) -> FloatArray | None:
         """Return the pose (4, 4) of its joint's frame in the nominal frame; None if it does not move it."""
@@ -338,8 +304,7 @@ class TimeEffect(EffectType):
         return None
 
 
-# All effects by name, in order; `registry` enters them.
-EFFECT_TYPES: dict[str, EffectType] = {}
+EFFECT_TYPES: dict[str, EffectType] = {}  # all effects by name, in order; `registry` enters them
 
 
 @dataclass(frozen=True, eq=False)
@@ -394,7 +359,6 @@ class Effect:
 
     @property
     def name(self) -> str:
-        """Name of its type."""
         return self.kind.name
 
     @property
@@ -419,7 +383,6 @@ class Effect:
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Parameters of its values."""
         return self.kind.sliding if self.prismatic else self.kind.turning
 
     @cached_property
@@ -454,6 +417,12 @@ class Effect:
         # Several times as fast as `replace`.
         frozen = frozen_array(values)
         return Effect(self.kind, self.where, self.source, frozen, self.prismatic, self.ordinal, self.free)
+
+    def with_amounts(self, amounts: FloatArray | float) -> Effect:
+        """Return the same effect with other amounts (p,), or all alike."""
+        values = self.values.copy()
+        values[self.amounts] = amounts
+        return self.with_values(values)
 
     def freeing(self, free: tuple[int, ...] | None) -> Effect:
         """Return the same effect with these amounts free, all for None, and the others nominal."""

@@ -16,8 +16,7 @@ from .parameter import Place
 
 # Number of runs whose strains are kept: the diagnosis asks again for those of its candidates.
 STRAINS_KEPT = 256
-# Share of a past move below which it is ignored.
-_FORGOTTEN = 1e-17
+_FORGOTTEN = 1e-17  # share of a past move below which it is ignored
 
 
 class LiveError(Protocol):

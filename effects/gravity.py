@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from copy import copy
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -51,17 +51,17 @@ class GravityLoad:
     Args:
         robot: its links have the masses of the URDF; if it states none that a joint bears, each link weighs
             `ROD_KG_PER_M` along straight lines between its joints.
-
-    Attributes:
-        known: True if the URDF states a mass that a joint bears.
     """
 
     def __init__(self, robot: RobotDescription) -> None:
         self._robot = robot
         stated = _bodies(robot, robot.tree.masses)
+        # True if the URDF states a mass that a joint bears
         self.known = any(body.mass_kg > 0.0 for k, body in stated.items() if k is not None)
-        self._bodies = stated if self.known else _bodies(robot, _rods(robot))
-        self._outwards = [k for k in self._order() if k is not None]
+        # by the index in q of the joint that carries them; None is the base
+        self.bodies: Mapping[int | None, Body] = stated if self.known else _bodies(robot, _rods(robot))
+        # indices in q of the joints, each after the one that carries it
+        self.outwards = [k for k in self._order() if k is not None]
 
     def of_payload(self, mass_kg: float, moment: FloatArray) -> GravityLoad:
         """Return the load of a mass at the marker's link alone.
@@ -71,8 +71,8 @@ class GravityLoad:
         """
         carrier, T = self._marker
         load = copy(self)
-        load._bodies = {k: Body(body.joint, body.carrier, body.T_carrier_joint) for k, body in self._bodies.items()}
-        body = load._bodies[carrier]
+        load.bodies = {k: Body(body.joint, body.carrier, body.T_carrier_joint) for k, body in self.bodies.items()}
+        body = load.bodies[carrier]
         body.mass_kg, body.moment = mass_kg, mass_kg * T[:3, 3] + T[:3, :3] @ moment
         return load
 
@@ -81,16 +81,6 @@ class GravityLoad:
         """The joint that carries the marker's link, and the link's pose (4, 4), as in `carried`."""
         robot = self._robot
         return carried(robot.tree, robot.robot.marker_link, robot.joints, robot.robot.held_at)
-
-    @property
-    def bodies(self) -> Mapping[int | None, Body]:
-        """Bodies by the index in q of the joint that carries them; None is the base."""
-        return self._bodies
-
-    @property
-    def outwards(self) -> Sequence[int]:
-        """Indices in q of the joints, each after the one that carries it."""
-        return self._outwards
 
     def in_supports(self, k: int) -> list[FloatArray]:
         """Return poses (4, 4) of a joint's frame in the links that carry it as one: parent link first, farthest last.
@@ -109,7 +99,7 @@ class GravityLoad:
         """Return gravity's torque about each joint, positive in its direction [N·m, or N] (n, d), at q (n, d)."""
         torques = np.zeros_like(q)
         for k, mass, moment, down, _ in self._inwards(q):
-            body = self._bodies[k]
+            body = self.bodies[k]
             assert body.joint is not None
             if body.joint.kind in REVOLUTE:
                 torques[:, k] = np.einsum("in,in->n", body.across @ moment, down)
@@ -124,7 +114,7 @@ class GravityLoad:
         """
         moments, forces = np.zeros((2, *q.shape, 3))
         for k, mass, moment, down, turn in self._inwards(q):
-            to_joint = self._bodies[k].T_carrier_joint[:3, :3].T
+            to_joint = self.bodies[k].T_carrier_joint[:3, :3].T
             moments[:, k] = (to_joint @ turn.apply(_cross(moment, down))).T
             forces[:, k] = mass * (to_joint @ turn.apply(down)).T
         return moments, forces
@@ -135,15 +125,15 @@ class GravityLoad:
         Vectors (3, n) are in the frame of the joint's child link. They pass from frame to frame: gravity outwards, mass
         times centre of mass back.
         """
-        turns = {k: _Turn.of(body, q[:, k]) for k, body in self._bodies.items() if k is not None}
+        turns = {k: _Turn.of(body, q[:, k]) for k, body in self.bodies.items() if k is not None}
         # Components come first in memory, so that each operation covers all rows.
         down: dict[int | None, FloatArray] = {None: np.array([[0.0], [0.0], [-GRAVITY_M_S2]])}
-        for k in self._outwards:
-            down[k] = turns[k].inverse(down[self._bodies[k].carrier])
-        mass = {k: body.mass_kg for k, body in self._bodies.items()}
-        moment = {k: body.moment[:, None] for k, body in self._bodies.items()}
-        for k in reversed(self._outwards):
-            carrier, turn = self._bodies[k].carrier, turns[k]
+        for k in self.outwards:
+            down[k] = turns[k].inverse(down[self.bodies[k].carrier])
+        mass = {k: body.mass_kg for k, body in self.bodies.items()}
+        moment = {k: body.moment[:, None] for k, body in self.bodies.items()}
+        for k in reversed(self.outwards):
+            carrier, turn = self.bodies[k].carrier, turns[k]
             yield k, mass[k], moment[k], down[k], turn
             mass[carrier] += mass[k]
             moment[carrier] = moment[carrier] + turn.apply(moment[k]) + mass[k] * turn.origin
@@ -151,7 +141,7 @@ class GravityLoad:
     def _order(self) -> list[int | None]:
         order: list[int | None] = [None]
         for carrier in order:
-            order += [k for k, body in self._bodies.items() if k is not None and body.carrier == carrier]
+            order += [k for k, body in self.bodies.items() if k is not None and body.carrier == carrier]
         return order
 
 
@@ -223,7 +213,6 @@ class _Turn:
 
     @classmethod
     def of(cls, body: Body, q: FloatArray) -> _Turn:
-        """Build the motion at q (n,)."""
         assert body.joint is not None
         T = body.T_carrier_joint
         if body.joint.kind in REVOLUTE:
@@ -232,7 +221,6 @@ class _Turn:
         return cls(body.turns, np.zeros(1), np.ones(1), T[:3, 3:] + slid[:, None] * q)
 
     def apply(self, vectors: FloatArray) -> FloatArray:
-        """Return vectors (3, n) in the carrier's frame."""
         return self._mixed(self.turns, vectors)
 
     def inverse(self, vectors: FloatArray) -> FloatArray:
@@ -245,5 +233,4 @@ class _Turn:
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return a × b (3, n)."""
     return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])

@@ -97,7 +97,6 @@ class Motion:
 
     @cached_property
     def runs(self) -> list[tuple[int, int]]:
-        """First row of each run and the row after its last."""
         firsts = np.flatnonzero(self.begins)
         return list(zip(firsts.tolist(), [*firsts[1:].tolist(), len(self.q)], strict=True))
 
@@ -136,7 +135,6 @@ class Motion:
 
 @lru_cache(maxsize=_EARLIER_KEPT)
 def _earlier(motion: Motion, lag_s: float) -> Motion:
-    """Return the earlier readings; cached, since a search repeats the same lags."""
     assert motion.t is not None
     return _asked(motion, motion.t - lag_s)
 

@@ -22,7 +22,6 @@ class Optics:
     k2: float = 0.0
 
     def __add__(self, other: Optics) -> Optics:
-        """Return the sum of both differences."""
         return Optics(
             self.scale_error + other.scale_error,
             self.focal_error + other.focal_error,

@@ -24,8 +24,7 @@ class Parameter:
         return self.nominal is not None
 
 
-# The moment at which an effect begins [s], or the row where a recording has no times.
-T0 = Parameter("t0", 0.0, None)
+T0 = Parameter("t0", 0.0, None)  # the moment at which an effect begins [s], or the row where a recording has no times
 
 
 def shifts(usual_m: float) -> tuple[Parameter, ...]:

@@ -14,7 +14,6 @@ from .effect_type import EFFECT_TYPES, STAGES, EffectType
 
 
 def built_in() -> list[EffectType]:
-    """Return one of each class in `catalogue` that has a name."""
     modules = [import_module(f"{catalogue.__name__}.{found.name}") for found in iter_modules(catalogue.__path__)]
     members = [(module.__name__, member) for module in modules for member in vars(module).values()]
     classes = [m for place, m in members if isinstance(m, type) and issubclass(m, EffectType) and m.__module__ == place]
@@ -22,7 +21,6 @@ def built_in() -> list[EffectType]:
 
 
 def _of_plugins() -> Iterator[EffectType]:
-    """Yield the effects of other packages that load."""
     for entry in installed("bodyschema.effects"):
         try:
             effect = entry.load()()

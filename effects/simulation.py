@@ -38,10 +38,8 @@ from .motion import Motion
 from .optics import Optics
 from .parameter import Place
 
-# Relative step by a period or a time constant.
-_SHAPE_STEP = 1e-3
-# A spring's deflection changes its own load; each round adds the next order.
-SPRING_ROUNDS = 3
+_SHAPE_STEP = 1e-3  # relative step by a period or a time constant
+SPRING_ROUNDS = 3  # a spring's deflection changes its own load; each round adds the next order
 # Corrections (n,) of readings by the encoder effects that were evaluated there, as long as both live.
 _CORRECTIONS: WeakKeyDictionary[Motion, WeakKeyDictionary[Effect, FloatArray]] = WeakKeyDictionary()
 # Predictions (n, 3) of residuals, which no effect changes, as long as both live.
@@ -76,12 +74,10 @@ class Simulation:
 
     @cached_property
     def all_effects(self) -> tuple[Effect, ...]:
-        """The background, then the effects."""
         return (*self.background, *self.effects)
 
     @cached_property
     def gravity(self) -> GravityLoad:
-        """Torques of gravity about the joints."""
         return GravityLoad(self.robot)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -89,13 +85,11 @@ class Simulation:
         return {name: value for name, value in self.__dict__.items() if name != "_beneath"}
 
     def with_effects(self, effects: Sequence[Effect]) -> Simulation:
-        """Return the same robot and residual with other effects."""
         changed = replace(self, effects=tuple(effects))
         changed.__dict__.update(gravity=self.gravity, _beneath=self._beneath)
         return changed
 
     def with_background(self, background: Sequence[Effect]) -> Simulation:
-        """Return the same simulation with another background."""
         changed = replace(self, background=tuple(background))
         changed.__dict__["gravity"] = self.gravity
         return changed
@@ -232,7 +226,6 @@ class Simulation:
 
     @cached_property
     def optics(self) -> Optics:
-        """Errors of the cameras."""
         parts = [kind.optics(effect.values) for effect, kind in self._of(CameraEffect)]
         return sum((part for part in parts if part is not None), Optics())
 
@@ -242,7 +235,6 @@ class Simulation:
         return sum(kind.delay_s(effect.values) for effect, kind in self._of(TimeEffect))
 
     def _of(self, stage: type[Staged]) -> list[tuple[Effect, Staged]]:
-        """Return the effects of a stage, each with its type."""
         return [(effect, effect.kind) for effect in self._staged[stage.stage] if isinstance(effect.kind, stage)]
 
     @cached_property
@@ -299,7 +291,6 @@ class Simulation:
 
     @cached_property
     def payloads(self) -> list[GravityLoad]:
-        """Loads of masses that the URDF does not state."""
         loads = [kind.load(self.gravity, effect.values) for effect, kind in self._of(StructureEffect)]
         return [load for load in loads if load is not None]
 
@@ -325,7 +316,6 @@ class Simulation:
         return transforms(np.concatenate([along, none] if chain.prismatic[joint] else [none, along])[None])[0]
 
     def _chain(self) -> RigidChain:
-        """Return the chain with corrected links."""
         return self._bent(self._beneath.chain, self.effects)
 
     def _bent(self, chain: RigidChain, effects: Sequence[Effect]) -> RigidChain:
@@ -501,7 +491,6 @@ class Simulated:
 
     @cached_property
     def _by_point(self) -> FloatArray:
-        """Derivatives (n, 3, 3) of the reported position by the point."""
         reported = self.simulation.reported
         changes = [
             reported(self.x_camera + step, self.motion) - reported(self.x_camera - step, self.motion)

@@ -19,12 +19,10 @@ from kbmaps import JointBasis, KBMap
 from .unexplained import PLACE, Unexplained
 
 Shift = Callable[[FloatArray], FloatArray]
-# Maximum of harmonics, and of control points of a net.
-_MOST_HARMONICS, _LARGEST_NET = 15, 3**12
+_MOST_HARMONICS, _LARGEST_NET = 15, 3**12  # maximum of harmonics, and of control points of a net
 # Points along an axis and lines on which harmonics are sought; rows per batch.
 _POINTS, _LINES, _ROWS = 64, 12, 4096
-# Maximum of grid points.
-_LARGEST_GRID = 400_000
+_LARGEST_GRID = 400_000  # maximum of grid points
 
 
 @dataclass(frozen=True)
@@ -39,7 +37,6 @@ class _Axis:
 
     @property
     def scale(self) -> float:
-        """Factor from readings to angles."""
         return np.pi / (self.high - self.low) if self.slides else 1.0
 
     def spread(self, count: int) -> FloatArray:
@@ -67,7 +64,6 @@ class _Axis:
 
     @property
     def last(self) -> int:
-        """Number of functions of the highest harmonic."""
         return 4 if self.slides else 2
 
     @property
@@ -78,7 +74,6 @@ class _Axis:
 
     @property
     def bases(self) -> list[JointBasis]:
-        """Bases of these columns."""
         waves = [JointBasis.trigonometric()] * int(self.harmonics).bit_length()
         return [JointBasis.prismatic(self.low, self.high), *waves] if self.slides else waves
 

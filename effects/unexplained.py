@@ -15,25 +15,20 @@ from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.suggest import did_you_mean
 from kbmaps import KBMap, KBMapsError, KernelLearner, ModelFormatError, ResidualModel, TensorTrain
 
-# Coordinates of the marker, in place of a joint.
-PLACE = ("marker.x", "marker.y", "marker.z")
+PLACE = ("marker.x", "marker.y", "marker.z")  # coordinates of the marker, in place of a joint
 
 
 class StoredModel(Protocol):
     """A KB-Map that predicts and can be stored."""
 
     @property
-    def joints(self) -> int:
-        """Number of joints d."""
-        ...
+    def joints(self) -> int: ...
 
     def predict(self, q: ArrayLike) -> FloatArray:
         """Return outputs (n, 3) at q (n, d)."""
         ...
 
-    def to_bytes(self) -> bytes:
-        """Return the map as one self-describing byte string."""
-        ...
+    def to_bytes(self) -> bytes: ...
 
 
 _READERS: tuple[Callable[[bytes], StoredModel], ...] = (

@@ -29,8 +29,7 @@ from bodyschema.learning.status import ChainCalibration
 
 class _Settings:
     poses: int = 400
-    # With two robots, an outlier cannot be attributed to either.
-    fewest_to_judge: int = 3
+    fewest_to_judge: int = 3  # with two robots, an outlier cannot be attributed to either
     # A robot is off if one of its figures stands out, or if its model's distance from the median exceeds this multiple
     # of both the models' predicted errors and the robots' median distance.
     far: float = 3.0
@@ -39,8 +38,7 @@ class _Settings:
     rounds: int = 20
 
 
-# Standard error of a median of normal numbers, over that of their mean.
-MEDIAN_COSTS = math.sqrt(math.pi / 2.0)
+MEDIAN_COSTS = math.sqrt(math.pi / 2.0)  # standard error of a median of normal numbers, over that of their mean
 
 _quantile = NormalDist().inv_cdf
 
@@ -181,7 +179,6 @@ def _figures(models: Sequence[Model]) -> list[_Figure]:
 
 
 def _odd(robot: int, figures: Sequence[_Figure]) -> tuple[Odd, ...]:
-    """Return the figures of the robot that stand out."""
     tried = sum(int(np.isfinite(figure.values).sum()) for figure in figures)
     found: list[tuple[float, Odd]] = []
     for figure in figures:
@@ -202,7 +199,6 @@ def _spread(values: FloatArray) -> float:
 
 
 def _camera_moved(found: ChainCalibration | None) -> tuple[float, float] | tuple[None, None]:
-    """Return the distance [mm] and the turn [°] from the camera pose in robot.toml."""
     if found is None:
         return None, None
     moved = math.dist([each.drawn for each in found.camera_xyz], [each.learnt for each in found.camera_xyz])
@@ -264,7 +260,6 @@ def _model(fleet: Fleet, robot: Member, q: FloatArray) -> Model:
 
 
 def view(comparisons: Sequence[TypeComparison], left_out: Sequence[str]) -> RenderableType:
-    """Return a table for each type, then who was left out."""
     parts: list[RenderableType] = []
     for comparison in comparisons:
         parts += [*map(Text, sentences(comparison)), Padding(_table(comparison.units), (1, 0, 1, 0))]
@@ -273,7 +268,6 @@ def view(comparisons: Sequence[TypeComparison], left_out: Sequence[str]) -> Rend
 
 
 def sentences(comparison: TypeComparison) -> list[str]:
-    """Return sentences on the compared robots and the outliers."""
     units = comparison.units
     said = [
         f"{len(units)} robots with the joints {', '.join(comparison.joints)}, at {comparison.poses} common poses, each "

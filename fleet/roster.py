@@ -67,7 +67,6 @@ class Member:
 
     @property
     def health(self) -> list[str]:
-        """Problems, as sentences; empty if all is well."""
         said = [sentence for status in (self.sampler, self.learner) if status is not None for sentence in status.health]
         if not self.alive:
             return ["neither its sampler nor its learner is alive"]
@@ -133,7 +132,6 @@ class Fleet:
         return [members[name] for name in sorted(members)]
 
     def bus(self, route: Route) -> ZenohSession:
-        """Return the session of a route; BusError if no process answers there."""
         if route not in self._sessions:
             self._sessions[route] = self._open.enter_context(ZenohSession(connect=route, client=True))
         return self._sessions[route]
@@ -185,7 +183,6 @@ def as_json(members: Sequence[Member]) -> str:
 
 
 def screen(members: Sequence[Member], unreached: Sequence[str]) -> RenderableType:
-    """Return a table with one row per robot, then the problems."""
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False)
     table.add_column("robot", overflow="fold")
     table.add_column("state", no_wrap=True)

@@ -1,9 +1,9 @@
 # All public names of kbmaps, and their modules: type checkers read this file, and `__init__.py` at run time.
 from kbmaps.chains.align import Alignment as Alignment
 from kbmaps.chains.align import align as align
+from kbmaps.chains.align import with_refitted_tool as with_refitted_tool
 from kbmaps.chains.belief import ChainBelief as ChainBelief
 from kbmaps.chains.chain import RigidChain as RigidChain
-from kbmaps.chains.moved_tool import with_refitted_tool as with_refitted_tool
 from kbmaps.chains.oriented import OrientedChain as OrientedChain
 from kbmaps.chains.oriented import fitted_orientation as fitted_orientation
 from kbmaps.chains.parameters import ChainParameters as ChainParameters
@@ -16,10 +16,10 @@ from kbmaps.chains.search import find_chain as find_chain
 from kbmaps.changes.detector import ChangeDetector as ChangeDetector
 from kbmaps.changes.detector import ChangeScore as ChangeScore
 from kbmaps.changes.kinds import ChangeKind as ChangeKind
+from kbmaps.changes.kinds import Explanation as Explanation
 from kbmaps.changes.kinds import any_change as any_change
 from kbmaps.changes.kinds import change_kinds as change_kinds
-from kbmaps.changes.naming import Explanation as Explanation
-from kbmaps.changes.naming import explanations as explanations
+from kbmaps.changes.kinds import explanations as explanations
 from kbmaps.changes.white_noise import SharedNoise as SharedNoise
 from kbmaps.changes.white_noise import WhiteNoise as WhiteNoise
 from kbmaps.contest import PrequentialComparison as PrequentialComparison
@@ -58,15 +58,15 @@ from kbmaps.model import Estimate as Estimate
 from kbmaps.model import Model as Model
 from kbmaps.model import PoseModel as PoseModel
 from kbmaps.model import PositionModel as PositionModel
+from kbmaps.planning.design import ChainPosterior as ChainPosterior
 from kbmaps.planning.design import ExperimentDesign as ExperimentDesign
+from kbmaps.planning.design import Posterior as Posterior
 from kbmaps.planning.design import next_pose as next_pose
 from kbmaps.planning.design import next_poses as next_poses
 from kbmaps.planning.expected_gain import ExpectedError as ExpectedError
 from kbmaps.planning.expected_gain import Forecast as Forecast
 from kbmaps.planning.expected_gain import candidate_motions as candidate_motions
 from kbmaps.planning.expected_gain import expected_gain as expected_gain
-from kbmaps.planning.posterior import ChainPosterior as ChainPosterior
-from kbmaps.planning.posterior import Posterior as Posterior
 from kbmaps.residual.learner import ResidualLearner as ResidualLearner
 from kbmaps.residual.model import ResidualModel as ResidualModel
 from kbmaps.robust import unexplained_variance as unexplained_variance

@@ -16,8 +16,7 @@ from kbmaps.errors import ShapeError
 class _Settings:
     # Over longer lags than this share of the series, the sum would be dominated by noise.
     longest_lag_share: float = 0.25
-    # Minimum number of pairs predicted by both models for a comparison.
-    fewest: int = 3
+    fewest: int = 3  # minimum number of pairs predicted by both models for a comparison
     # A model whose mean error on the last so many pairs is so many times another one's does not answer: what fitted
     # most of the pairs may fail where the arm has just come to, and the cap below hides by how much. A share of 1.2 is
     # what answers are promised to stay within; fewer than 50 pairs scatter by about as much. Sensitivity, mean error on
@@ -25,12 +24,10 @@ class _Settings:
     # pairs change it by up to 1 %, 0.3 to 3 times the margin above 1 by -3 to +12 %.
     lately: int = 50
     worse: float = 1.2
-    # A difference too small for any camera [m].
-    least_m: float = 1e-6
+    least_m: float = 1e-6  # a difference too small for any camera [m]
     # A squared error is capped at this multiple of the better model's median: an outlier says nothing about either.
     cap: float = 9.0
-    # Lower bound of the median [m²]: where a model is exact, another one that errs still loses.
-    least: float = 1e-30
+    least: float = 1e-30  # Lower bound of the median [m²]: where a model is exact, another one that errs still loses
 
 
 def shared_by(residuals: FloatArray) -> float:
@@ -59,8 +56,7 @@ def shared_by(residuals: FloatArray) -> float:
 SHORTEST, SHARE, LONGEST = 100, 0.5, 1000
 # A model is worse than another when the difference of their squared errors is this many standard errors.
 CLEARLY = 2.0
-# A model is listed next to the answering one if it has predicted this many of the last pairs.
-LISTED = 10
+LISTED = 10  # a model is listed next to the answering one if it has predicted this many of the last pairs
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,7 @@ KBMapsError
 
 from __future__ import annotations
 
-# Control points, 3^13: 38 MB for positions, 153 MB with orientations.
-LARGEST_NET = 3**13
+LARGEST_NET = 3**13  # Control points, 3^13: 38 MB for positions, 153 MB with orientations
 
 
 class KBMapsError(Exception):

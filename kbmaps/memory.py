@@ -12,8 +12,7 @@ from kbmaps.arrays import FloatArray
 from kbmaps.errors import SettingError
 from kbmaps.packed import count, named, number
 
-# A smaller weight next to that of a new pair has no effect on a float64 sum.
-_NOTHING = float(np.finfo(np.float64).eps)
+_NOTHING = float(np.finfo(np.float64).eps)  # a smaller weight next to that of a new pair has no effect on a float64 sum
 
 
 @dataclass(frozen=True)

@@ -156,7 +156,10 @@ def _arrays(shapes: dict[str, Any], payload: memoryview) -> dict[str, FloatArray
     arrays: dict[str, FloatArray] = {}
     begin = 0
     for name, entry in shapes.items():
-        shape = _shape(entry)
+        sizes = cast(list[Any], entry) if isinstance(entry, list) else []
+        if not 1 <= len(sizes) <= _MAX_DIMENSIONS or not all(type(size) is int and size >= 0 for size in sizes):
+            raise ModelFormatError("an array has an impossible shape")
+        shape = cast(list[int], sizes)
         end = begin + 8 * math.prod(shape)
         if end > len(payload):
             raise ModelFormatError("the header announces more numbers than there are")
@@ -174,13 +177,6 @@ def _finite(text: str) -> float:
     if not math.isfinite(value):
         raise ValueError(f"{text} is not a finite number")
     return value
-
-
-def _shape(entry: Any) -> list[int]:
-    sizes = cast(list[Any], entry) if isinstance(entry, list) else []
-    if not 1 <= len(sizes) <= _MAX_DIMENSIONS or not all(type(size) is int and size >= 0 for size in sizes):
-        raise ModelFormatError("an array has an impossible shape")
-    return cast(list[int], sizes)
 
 
 def _checksum(body: bytes | memoryview) -> bytes:

@@ -11,18 +11,26 @@ from kbmaps.pairs import Pairs
 
 # The norm of a residual with noise σ per axis has the median 1.538 σ in three dimensions (√ of χ²₃'s median).
 MEDIAN_NORM = 1.538
-# Residuals below a nanometre are rounding, even on noise-free data.
-ROUNDING_M = 1e-9
-# Variances [m² or rad²] below that of (1 pm)² are rounding.
-VARIANCE_FLOOR = 1e-24
+ROUNDING_M = 1e-9  # residuals below a nanometre are rounding, even on noise-free data
+VARIANCE_FLOOR = 1e-24  # variances [m² or rad²] below that of (1 pm)² are rounding
 # A pair this many sigma from its prediction by the others is an outlier: 3 in 100,000 good ones are farther out (chi,
 # three dimensions).
 OUTLIER_SIGMAS = 4.8
-# An arm that is not calibrated has errors with long tails, which must not be rejected.
-UNCALIBRATED_SIGMAS = 15.0
+UNCALIBRATED_SIGMAS = 15.0  # an arm that is not calibrated has errors with long tails, which must not be rejected
 # Where single pairs are weighed, none counts for more than one this many sigmas away: it may be an outlier.
 CLIPPED_SIGMAS = 4.0
 _ONE_SIGMA = 0.841344746
+
+
+def middle_sigma(norms: FloatArray, rank: float) -> float:
+    """Return the 1-sigma of a coordinate from the middle one of residuals' norms (n,), the one of this rank.
+
+    The rank lies above the median by the number of pairs that the fitted parameters can always explain (Rousseeuw and
+    Leroy 1987, least median of squares). Otherwise a few pairs would fit perfectly and the others would count as
+    outliers.
+    """
+    middle = min(int(rank), len(norms) - 1)
+    return float(np.partition(norms, middle)[middle]) / MEDIAN_NORM
 
 
 def student(freedom: float) -> float:

@@ -7,17 +7,14 @@ import numpy as np
 from kbmaps.arrays import FloatArray, evenly_spread
 from kbmaps.robust import CLIPPED_SIGMAS, ROUNDING_M
 
-# Number of steps towards the maximum likelihood; each increases it.
-_STEPS = 60
-# Lower bound of a variance as a share of all: it would vanish in rounding.
-_LEAST = 1e-9
+_STEPS = 60  # number of steps towards the maximum likelihood; each increases it
+_LEAST = 1e-9  # Lower bound of a variance as a share of all: it would vanish in rounding
 # Positions of the six numbers of a symmetric matrix: xx, yy, zz, yz, xz, xy.
 _ROWS, _COLUMNS = [0, 1, 2, 1, 0, 0], [0, 1, 2, 2, 2, 1]
 # Errors that the shares are estimated from, evenly spread: they determine four numbers to a few percent, and weights
 # that are wrong by so much cost a thousandth.
 _MOST_ERRORS = 500
-# Variances of a covariance that differ by less than this share are the same.
-_ALIKE = 1e-6
+_ALIKE = 1e-6  # variances of a covariance that differ by less than this share are the same
 
 
 def tells_directions(stated: FloatArray) -> bool:
@@ -103,7 +100,6 @@ def _inverse_root(covariances: FloatArray) -> FloatArray:
 
 
 def _turned(root: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Return lower triangles (6, n) times vectors (3, n)."""
     (a, b, c, d, e, f), (x, y, z) = root, vectors
     return np.stack([a * x, b * x + c * y, d * x + e * y + f * z])
 

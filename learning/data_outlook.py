@@ -24,10 +24,8 @@ class _Settings:
     # Number of poses of a motion, and of the region where the arm is used. More would not make the figures steadier
     # than the posterior is.
     poses: int = 100
-    # A motion that gains this little more than continuing as so far is not reported.
-    worth: float = 0.05
-    # A gain below this share of the noise of a single measurement is not noticeable.
-    noticed: float = 0.1
+    worth: float = 0.05  # a motion that gains this little more than continuing as so far is not reported
+    noticed: float = 0.1  # a gain below this share of the noise of a single measurement is not noticeable
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +96,9 @@ def forecast(known: LearnerEvidence, scatter: Scatter, joints: tuple[str, ...]) 
         anywhere_m=_mean_error_m(claim, rng.uniform(lower, upper, (_Settings.poses, nominal.joints))),
         further_pairs=list(_Settings.further),
         like_so_far_m=[scale * error for error in by_motion[SAME]],
-        best_motion=_in_words(best),
+        best_motion={SAME: "moving as so far", ALL: "moving all joints over their ranges"}.get(
+            best, f"moving {best} over its range"
+        ),
         best_motion_m=[scale * error for error in by_motion[best]],
         enough=forecast.is_enough() or gain < _Settings.noticed * scatter.noise_m,
     )
@@ -107,9 +107,3 @@ def forecast(known: LearnerEvidence, scatter: Scatter, joints: tuple[str, ...]) 
 def _mean_error_m(claim: PredictiveUncertainty, q: FloatArray) -> float:
     """Return the expected mean distance to the truth [m] at q (n, d) [rad]."""
     return MEAN_OVER_RMS * float(np.sqrt(claim.variance(q).sum(axis=1)).mean())
-
-
-def _in_words(motion: str) -> str:
-    return {SAME: "moving as so far", ALL: "moving all joints over their ranges"}.get(
-        motion, f"moving {motion} over its range"
-    )

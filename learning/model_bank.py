@@ -15,13 +15,9 @@ class LearntModel(PositionModel, Protocol):
     """Map from joint angles to positions that later learning does not change."""
 
     @property
-    def digest(self) -> str:
-        """Hash that identifies the model."""
-        ...
+    def digest(self) -> str: ...
 
-    def to_bytes(self) -> bytes:
-        """Return the model as one self-describing byte string."""
-        ...
+    def to_bytes(self) -> bytes: ...
 
 
 PRIOR, INSTANT, RIGID, RESIDUAL, EXACT = "prior", "nlms", "rigid", "residual", "exact"
@@ -39,9 +35,6 @@ class ModelBank:
     Between two solutions, the solved models stay as they are. Instant steps on top of them would follow the newest
     pairs, and spoil them away from their path: measured, the error a few degrees away grew from 7 to 10 mm within 20
     pairs.
-
-    Attributes:
-        delayed: map of the instant learner when the current solutions were requested; None before any.
     """
 
     def __init__(self, prior: KBMap) -> None:
@@ -50,6 +43,7 @@ class ModelBank:
         self._instant = NLMS(prior)
         self._instant_map: KBMap | None = prior
         self._asked: KBMap | None = None
+        # map of the instant learner when the current solutions were requested; None before any
         self.delayed: KBMap | None = None
 
     @property
@@ -63,11 +57,9 @@ class ModelBank:
 
     @property
     def prior(self) -> KBMap:
-        """Prior map, where learning started."""
         return self._fixed[PRIOR]
 
     def model(self, name: str) -> LearntModel:
-        """Return one of the current models; later learning does not change it."""
         return self._residual if name == RESIDUAL and self._residual is not None else self.map(name)
 
     def map(self, name: str) -> KBMap:
@@ -104,11 +96,9 @@ class ModelBank:
         self._instant_map = None
 
     def ask(self) -> None:
-        """Record that the solver works on all pairs so far."""
         self._asked = self.map(INSTANT)
 
     def take(self, name: str, solution: LearntModel) -> None:
-        """Store the solver's solution for one of the models."""
         if isinstance(solution, KBMap):
             self._fixed[name] = solution
         else:

@@ -30,10 +30,8 @@ from kbmaps.arrays import evenly_spread
 
 # Number of pairs after a tool change at which the tool is first fitted; later fits follow at doubled numbers.
 PAIRS_TO_REFIT = 5
-# A narrower stroke would make the basis needlessly stiff, and equal limits impossible.
-NARROWEST_STROKE_M = 0.1
-# Maximum number of postures at which an extended simulation is evaluated for a prior.
-LARGEST_GRID = 20_000
+NARROWEST_STROKE_M = 0.1  # a narrower stroke would make the basis needlessly stiff, and equal limits impossible
+LARGEST_GRID = 20_000  # maximum number of postures at which an extended simulation is evaluated for a prior
 
 
 @dataclass(frozen=True)
@@ -78,7 +76,6 @@ class NominalModel:
 
     @property
     def joints(self) -> int:
-        """Number of joints d."""
         return self.chain.joints
 
     @property
@@ -108,15 +105,12 @@ class NominalModel:
 
     def fingerprint(self, tolerances: ChainTolerances) -> str:
         """Return a hash of this nominal model with these tolerances; a state only fits the ones it came from."""
-        said = f"{self.pose_known} {self.marker_known} {tolerances} {self.prior().digest}"
+        said = f"{self.pose_known} {self.marker_known} {tolerances} {self.prior.digest}"
         return hashlib.blake2b(said.encode(), digest_size=8).hexdigest()
 
-    def prior(self) -> KBMap:
-        """Return the chain as a map in the learning bases, with the bends of the extended simulation."""
-        return self._prior
-
     @cached_property
-    def _prior(self) -> KBMap:
+    def prior(self) -> KBMap:
+        """Chain as a map in the learning bases, with the bends of the extended simulation."""
         prior = self.chain.to_kbmap(self.bases)
         if self.extended is None or (nodes := self._nodes()) is None:
             return prior
@@ -150,7 +144,6 @@ class NominalModel:
         return ChainBelief.from_tolerances(ChainParameters(chain), self.tolerances(tolerances))
 
     def tolerances(self, known: ChainTolerances) -> ChainTolerances:
-        """Return the tolerances of the nominal chain, given those of one whose frame and marker are known."""
         if not self.pose_known:
             known = replace(known, base_rotation=math.inf, base_translation=math.inf)
         if not self.marker_known:
@@ -175,9 +168,6 @@ class NominalModel:
         Args:
             kbmap: the learnt map.
             chain: the nominal chain in the frame that the map was learnt in; it gives the hand's orientation.
-            q: joint values since the tool change.
-            x: positions since the tool change.
-
         Raises:
             DegenerateDataError: there are no pairs.
         """

@@ -15,7 +15,6 @@ import numpy as np
 
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import FARTHEST_M, LARGEST_Q, FloatArray, Pair
-from bodyschema.learning.changes.record import ChangeRecord
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.data_outlook import LearnerEvidence
 from bodyschema.learning.model_bank import PRIOR, SOLVED
@@ -25,7 +24,7 @@ from bodyschema.learning.regimes import Regimes
 from bodyschema.learning.snapshot import Snapshot
 from bodyschema.learning.solvers.solver import Solver, SolverClient
 from bodyschema.learning.state import Counters, Curve, LearningState
-from bodyschema.learning.status import CurvePoint, OrientationStatus
+from bodyschema.learning.status import ChangeRecord, CurvePoint, OrientationStatus
 from bodyschema.learning.uncertainty import WARM
 from kbmaps import ChainBelief, Recent
 
@@ -72,7 +71,6 @@ class OnlineLearner:
 
     @property
     def snapshot(self) -> Snapshot:
-        """Snapshot of the answering model."""
         return self._snapshot
 
     @property
@@ -99,7 +97,6 @@ class OnlineLearner:
 
     @property
     def counters(self) -> Counters:
-        """Copy of all counters."""
         with self._lock:
             return copy.copy(self._counters)
 
@@ -237,7 +234,6 @@ class OnlineLearner:
                 self._publish()
 
     def refuse(self) -> None:
-        """Count a pair that could not be accepted."""
         with self._lock:
             self._counters.refused += 1
 
@@ -247,7 +243,6 @@ class OnlineLearner:
             self._counters.gaps_recovered += pairs
 
     def missed(self, pairs: int) -> None:
-        """Count pairs that are lost."""
         with self._lock:
             self._counters.missed += pairs
 
@@ -442,7 +437,7 @@ class OnlineLearner:
             if solved.model is not None:
                 regime.take(solved, solved.model, self._solving.fed)
             if solved.orientation is not None:
-                regime.take_orientation(solved.orientation)
+                regime.orientations.take(solved.orientation)
             self._publish()
         return True
 

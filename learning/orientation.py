@@ -28,14 +28,11 @@ from kbmaps import (
     rotation_vectors,
 )
 
-# Order of trust while errors do not decide.
-TRUSTED = (RIGID, EXACT, PRIOR)
+TRUSTED = (RIGID, EXACT, PRIOR)  # order of trust while errors do not decide
 # The marker's rotation on the nominal chain's hand is fitted to at most this many first pairs, whenever they double.
 FIRST = 64
-# Minimum number of pairs to trust the solved chain before it has predicted any.
-FEWEST_TO_BELIEVE = 3
-# Mean length of a Gaussian turn over its RMS length, three equal axes.
-MEAN_OVER_RMS = 0.9213
+FEWEST_TO_BELIEVE = 3  # minimum number of pairs to trust the solved chain before it has predicted any
+MEAN_OVER_RMS = 0.9213  # mean length of a Gaussian turn over its RMS length, three equal axes
 
 
 class AngleMemory(msgspec.Struct):
@@ -60,11 +57,6 @@ class AngleMemory(msgspec.Struct):
         self.square = DISCOUNT * self.square + angle**2
         self.noise = DISCOUNT * self.noise + noise
         self.ratio = DISCOUNT * self.ratio + angle**2 / max(claimed, 1e-18)
-
-    @property
-    def mean_rad(self) -> float:
-        """Mean angle between prediction and measurement [rad]."""
-        return self.angle / max(self.weight, 1.0)
 
     @property
     def surprise(self) -> float:
@@ -147,7 +139,7 @@ class Orientations:
 
     def prequential_rad(self) -> dict[str, float]:
         """Return the recent mean angle between prediction and measurement, before learning [rad], by model."""
-        return {name: memory.mean_rad for name, memory in self.errors.items() if memory.weight}
+        return {name: memory.angle / max(memory.weight, 1.0) for name, memory in self.errors.items() if memory.weight}
 
     def learn(self, q: FloatArray, turn: FloatArray, cov: FloatArray | None, support: SupportSet | None) -> None:
         """Learn one pair: its orientation is predicted before it is learnt.
@@ -181,7 +173,6 @@ class Orientations:
         self._choose()
 
     def state(self) -> OrientationState:
-        """Return everything that `restore` needs."""
         packed = {name: chain.to_bytes() for name, chain in self._chains.items()}
         return OrientationState(
             pairs=self.pairs,

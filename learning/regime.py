@@ -17,23 +17,20 @@ from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.model_bank import EXACT, INSTANT, PRIOR, RESIDUAL, RIGID, LearntModel, ModelBank
 from bodyschema.learning.orientation import FEWEST_TO_BELIEVE, OrientationModel, Orientations
 from bodyschema.learning.replay_memory import PairMemory, Permutations
-from bodyschema.learning.solvers.orientation import OrientationSolution
 from bodyschema.learning.solvers.solver import Solved, Task
 from bodyschema.learning.state import NET, LearningHeader
 from bodyschema.learning.uncertainty import UncertaintyTracker
 from bodyschema.learning.variance_terms import QueryPoints
 from kbmaps import ChainBelief, KBMap, Recent, follow_a_path
 
-# Number of learnt pairs on which a model's fit is assessed.
-LOOKED_BACK = 500
+LOOKED_BACK = 500  # number of learnt pairs on which a model's fit is assessed
 
 
 class _Settings:
     # Number of pairs that determine the errors of a refitted prior, and that are replayed on top of it.
     recent: int = 200
     replay_steps: int = 64
-    # Maximum number of pairs received during a solve that judge its solution.
-    judged_late: int = 100
+    judged_late: int = 100  # maximum number of pairs received during a solve that judge its solution
     # With this share of new pairs, the last solution no longer applies: the new one is judged by these pairs alone.
     judged_anew: float = 0.25
     looked_back_in_replay: int = 4
@@ -48,40 +45,23 @@ class Regime:
     """Learns the models of one tool side by side, and chooses the one that answers.
 
     It has no lock of its own. The results of earlier regimes come as `prior`, `arm` and `claims`.
-
-    Args:
-        prior: the map to learn on top of.
-        arm: prior of the arm before the first pair.
-        claims: uncertainties of the models; updated here while the regime lasts.
-        settings: of the learner.
-        task_numbers: numbers for the solver's tasks that no other regime has.
-
-    Attributes:
-        models: learnt side by side.
-        memory: the pairs with this tool.
-        gate: the outlier gate.
-        orientations: models of the marker's orientation, where pairs have one.
-        monitor: the change monitor.
-        arm: as given, or with the last solutions if these stand for pairs that are no longer kept.
-        answering: the model that answers.
-        task_number: of the solver's current task.
     """
 
     def __init__(
         self,
-        prior: KBMap,
-        arm: KnownArm,
-        claims: UncertaintyTracker,
+        prior: KBMap,  # the map to learn on top of
+        arm: KnownArm,  # prior of the arm before the first pair
+        claims: UncertaintyTracker,  # uncertainties of the models; updated here while the regime lasts
         settings: LearnerConfig,
-        task_numbers: Iterator[int],
+        task_numbers: Iterator[int],  # numbers for the solver's tasks that no other regime has
     ) -> None:
         self.models = ModelBank(prior)
-        self.memory = PairMemory(prior.joints, settings.replay_capacity)
+        self.memory = PairMemory(prior.joints, settings.replay_capacity)  # the pairs with this tool
         self.gate = OutlierGate(prior.joints)
-        self.orientations = Orientations(arm.chain.chain)
+        self.orientations = Orientations(arm.chain.chain)  # models of the marker's orientation, where pairs have one
         self.monitor = ChangeMonitor()
-        self.arm = arm
-        self.answering = self._answering_map = PRIOR
+        self.arm = arm  # or with the last solutions if these stand for pairs that are no longer kept
+        self.answering = self._answering_map = PRIOR  # the model that answers
         self._claims, self._replays_per_pair = claims, settings.replays_per_pair
         claims.expect(arm.chain)
         self._met: list[tuple[Pair, FloatArray]] = []
@@ -90,7 +70,7 @@ class Regime:
         self._replays_due = 0.0
         self._solver_prior: KBMap | None = None
         self._task_numbers = task_numbers
-        self.task_number = next(task_numbers)
+        self.task_number = next(task_numbers)  # of the solver's current task
 
     @property
     def model(self) -> LearntModel:
@@ -103,7 +83,6 @@ class Regime:
 
     @property
     def task(self) -> Task:
-        """Current task of the solver."""
         known = self._solver_prior
         prior = known or self.models.prior
         return Task(
@@ -117,7 +96,6 @@ class Regime:
 
     @property
     def owes_replays(self) -> bool:
-        """True if replay steps are due."""
         return self._replays_due >= 1.0 and len(self.memory) > 0
 
     @property
@@ -217,10 +195,7 @@ class Regime:
         """Learn pairs, q (n, d) and x (n, 3), that waited for the prior: each once, in their order.
 
         Args:
-            q: joint values (n, d).
-            x: positions (n, 3).
-            cov: their covariances (n, 3, 3) [m²], NaN where a pair has none.
-            turns: their orientations, quaternions (n, 4), NaN where a pair has none.
+            cov, turns: as `PairMemory.append` takes them.
             belief: posterior of the chain from them.
         """
         self._claims.fitted(belief)
@@ -277,7 +252,6 @@ class Regime:
         self._replays_due += self._replays_per_pair * min(len(q), _Settings.recent)
 
     def ask(self) -> None:
-        """Record that the solver works on all pairs so far."""
         self._claims.solution_asked()
         self.models.ask()
         self.monitor.asked()
@@ -306,10 +280,6 @@ class Regime:
         variance = self._claims.errors[PRIOR].noise_variance
         residual = self._claims.residual
         self.monitor.offer(Reference(self.model, self.map, belief, wide, residual, claim, known, q, x, variance))
-
-    def take_orientation(self, solution: OrientationSolution) -> None:
-        """Store a solution of this regime's task for the orientations."""
-        self.orientations.take(solution)
 
     @property
     def orientation(self) -> OrientationModel | None:

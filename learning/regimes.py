@@ -14,7 +14,6 @@ from bodyschema.interfaces.records import FloatArray, Pair
 from bodyschema.learning.changes.known_arm import Adapted, KnownArm, Origin
 from bodyschema.learning.changes.monitor import LOOK_AGAIN, DetectedChange
 from bodyschema.learning.changes.outlier_gate import DOUBT, FEWEST_FOR_CHANGE, explained, sound
-from bodyschema.learning.changes.record import NAMED_WITHIN, ChangeRecord, KindOfChange
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.model_bank import PRIOR
 from bodyschema.learning.nominal import PAIRS_TO_REFIT, NominalModel, chain_tolerances
@@ -22,6 +21,7 @@ from bodyschema.learning.regime import Regime
 from bodyschema.learning.replay_memory import PairMemory
 from bodyschema.learning.solvers.solver import fitted_belief
 from bodyschema.learning.state import NET, PAIRS, Counters, Curve, LearningHeader, LearningState, StateError
+from bodyschema.learning.status import NAMED_WITHIN, ChangeRecord, KindOfChange
 from bodyschema.learning.uncertainty import UncertaintyTracker
 from kbmaps import ChainBelief, ChainTolerances, DegenerateDataError, Explanation, KBMap, RigidChain
 
@@ -37,23 +37,18 @@ class Fit:
 
 
 class Fitting:
-    """Schedules and makes the fits: at first after few pairs, then whenever they have doubled.
-
-    Attributes:
-        due_at: number of pairs at the next fit; None if nothing is to be fitted.
-        is_first: true if nothing has been fitted yet.
-        chain: nominal chain, placed; after a tool change, the chain that gives the orientation of the hand.
-    """
+    """Schedules and makes the fits: at first after few pairs, then whenever they have doubled."""
 
     def __init__(self, nominal: NominalModel, tolerances: ChainTolerances) -> None:
         self._nominal, self._tolerances = nominal, tolerances
+        # nominal chain, placed; after a tool change, the chain that gives the orientation of the hand
         self.chain = nominal.chain
         self._before: KBMap | None = None
+        # number of pairs at the next fit; None if nothing is to be fitted
         self.due_at = None if nominal.frame_known else nominal.pairs_to_align
-        self.is_first = True
+        self.is_first = True  # true if nothing has been fitted yet
 
     def due(self, pairs: int) -> bool:
-        """Return True if it is time to fit."""
         return self.due_at is not None and pairs >= self.due_at
 
     def change_tool(self, before: KBMap, hand: RigidChain, first_at: int = PAIRS_TO_REFIT) -> None:
@@ -86,7 +81,6 @@ class Fitting:
         return Fit(belief.chain.to_kbmap(self._nominal.bases), placed, belief)
 
     def done(self, pairs: int, fit: Fit | None) -> None:
-        """Record a fit to this many pairs."""
         if fit is None:
             self.due_at = pairs + max(self._nominal.pairs_to_align, PAIRS_TO_REFIT)
         else:
@@ -98,7 +92,6 @@ class Fitting:
         return kept if self._before is None else kept | {"before_change": self._before.net}
 
     def restore(self, due_at: int | None, is_first: bool, arrays: Mapping[str, FloatArray]) -> None:
-        """Resume from these and from `arrays`."""
         nominal = self._nominal.chain
         self.due_at, self.is_first = due_at, is_first
         self.chain = RigidChain(arrays["chain_fixed"], nominal.axes, nominal.prismatic)
@@ -106,8 +99,7 @@ class Fitting:
             self._before = KBMap(self._nominal.bases, arrays["before_change"])
 
 
-# Ordinary RMS distance between a nominal model and reality [m].
-EXPECTED_M = 0.1
+EXPECTED_M = 0.1  # ordinary RMS distance between a nominal model and reality [m]
 
 
 class Regimes:
@@ -117,23 +109,17 @@ class Regimes:
         nominal: the nominal model, where learning starts.
         settings: of the learner.
         task_numbers: numbers for the solver's tasks that were never used.
-
-    Attributes:
-        present: the current regime; None before the frame is known.
-        claims: uncertainties of its models, including experience from earlier regimes.
-        fitting: fits of the frame or the tool as a whole.
-        waiting: the pairs that wait for the first regime.
-        change: the last change; None: there was none.
     """
 
     def __init__(self, nominal: NominalModel, settings: LearnerConfig, task_numbers: Iterator[int]) -> None:
         self._nominal, self._settings, self._task_numbers = nominal, settings, task_numbers
         self._fingerprint = nominal.fingerprint(chain_tolerances(settings))
+        # uncertainties of its models, including experience from earlier regimes
         self.claims = UncertaintyTracker(nominal.bases, EXPECTED_M)
-        self.fitting = Fitting(nominal, chain_tolerances(settings))
-        self.waiting = PairMemory(nominal.joints, settings.replay_capacity)
-        self.present: Regime | None = None
-        self.change: ChangeRecord | None = None
+        self.fitting = Fitting(nominal, chain_tolerances(settings))  # fits of the frame or the tool as a whole
+        self.waiting = PairMemory(nominal.joints, settings.replay_capacity)  # the pairs that wait for the first regime
+        self.present: Regime | None = None  # the current regime; None before the frame is known
+        self.change: ChangeRecord | None = None  # the last change; None: there was none
         self._origin: Origin | None = None
         self._look_at = 0
 
@@ -142,7 +128,7 @@ class Regimes:
         """Return the state before any pair."""
         regimes = cls(nominal, settings, task_numbers)
         if nominal.frame_known:
-            regimes.present = regimes._regime(nominal.prior(), regimes._drawn(nominal.chain))
+            regimes.present = regimes._regime(nominal.prior, regimes._drawn(nominal.chain))
         return regimes
 
     @classmethod
@@ -197,7 +183,6 @@ class Regimes:
 
     @property
     def memory(self) -> PairMemory:
-        """Pairs with the current tool."""
         return self.waiting if self.present is None else self.present.memory
 
     def state_before(self, first: int, counters: Counters, curve: Curve) -> LearningState:

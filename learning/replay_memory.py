@@ -9,24 +9,18 @@ from bodyschema.interfaces.records import FloatArray
 
 IntArray = NDArray[np.intp]
 
-# Number of neighbours that are sampled together.
-RUN = 20
+RUN = 20  # number of neighbours that are sampled together
 
 
 class PairMemory:
-    """Newest `capacity` pairs, in arrays. Pairs are counted from the last `clear`."""
+    """Newest `capacity` pairs, in arrays. Pairs are counted from the last `clear`, kept or not: `count`."""
 
     def __init__(self, joints: int, capacity: int) -> None:
         self._q = np.empty((capacity, joints))
         self._x = np.empty((capacity, 3))
         self._cov = np.full((capacity, 3, 3), np.nan)
         self._turns = np.full((capacity, 4), np.nan)
-        self._count = self._first = 0
-
-    @property
-    def count(self) -> int:
-        """Number of pairs added since the last `clear`, kept or not."""
-        return self._count
+        self.count = self._first = 0
 
     @property
     def complete(self) -> bool:
@@ -34,7 +28,7 @@ class PairMemory:
         return self._oldest == 0
 
     def __len__(self) -> int:
-        return self._count - self._oldest
+        return self.count - self._oldest
 
     def append(
         self, q: FloatArray, x: FloatArray, cov: FloatArray | None = None, turns: FloatArray | None = None
@@ -42,19 +36,17 @@ class PairMemory:
         """Keep pairs, q (n, d) and x (n, 3); drop the oldest to make room.
 
         Args:
-            q: joint values (n, d).
-            x: positions (n, 3).
             cov: their covariances (n, 3, 3) [m²], NaN where a pair has none; None: none has any.
             turns: their orientations, quaternions (n, 4), likewise.
         """
-        places = np.arange(self._count, self._count + len(q)) % len(self._q)
+        places = np.arange(self.count, self.count + len(q)) % len(self._q)
         self._q[places], self._x[places] = q, x
         self._cov[places] = np.nan if cov is None else cov
         self._turns[places] = np.nan if turns is None else turns
-        self._count += len(q)
+        self.count += len(q)
 
     def clear(self) -> None:
-        self._count = self._first = 0
+        self.count = self._first = 0
 
     def place_of(self, count: int) -> int:
         """Return the number of kept pairs older than the one numbered `count` (from 0)."""
@@ -63,15 +55,13 @@ class PairMemory:
     def restore(
         self, q: FloatArray, x: FloatArray, count: int, cov: FloatArray | None = None, turns: FloatArray | None = None
     ) -> None:
-        """Hold the newest of `count` pairs, as `append` takes them."""
-        self._count = self._first = count - len(q)
+        self.count = self._first = count - len(q)
         self.append(q, x, cov, turns)
 
     def since(self, count: int, limit: int | None = None) -> tuple[FloatArray, FloatArray, int]:
         """Return the kept pairs from number `count` (from 0) on: q (n, d), x (n, 3), and the count after them."""
-        begin = max(count, self._oldest)
-        end = self._count if limit is None else min(self._count, begin + limit)
-        return *self._numbered(np.arange(begin, end)), end
+        places = self._places_since(count, limit)
+        return self._q[places], self._x[places], max(count, self._oldest) + len(places)
 
     def cov_since(self, count: int, limit: int | None = None) -> FloatArray:
         """Return covariances (n, 3, 3) [m²] of the pairs of `since`: NaN where a pair has none."""
@@ -83,8 +73,7 @@ class PairMemory:
 
     def _places_since(self, count: int, limit: int | None) -> IntArray:
         begin = max(count, self._oldest)
-        end = self._count if limit is None else min(self._count, begin + limit)
-        return np.arange(begin, end) % len(self._q)
+        return np.arange(begin, self.count if limit is None else min(self.count, begin + limit)) % len(self._q)
 
     def all(self) -> tuple[FloatArray, FloatArray]:
         """Return all kept pairs in order: q (n, d), x (n, 3)."""
@@ -108,7 +97,7 @@ class PairMemory:
 
     @property
     def _oldest(self) -> int:
-        return max(self._first, self._count - len(self._q))
+        return max(self._first, self.count - len(self._q))
 
     def _numbered(self, numbers: IntArray) -> tuple[FloatArray, FloatArray]:
         places = numbers % len(self._q)

@@ -18,8 +18,7 @@ from bodyschema.learning.uncertainty import PredictiveUncertainty
 from bodyschema.learning.variance_terms import unexplained
 from kbmaps import KBMap, SupportSet, quaternions
 
-# With a larger share of the prior's variance remaining, joint angles are not in the data's support.
-IN_SUPPORT = 0.25
+IN_SUPPORT = 0.25  # with a larger share of the prior's variance remaining, joint angles are not in the data's support
 
 
 class NoFrameError(RequestError):

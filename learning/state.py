@@ -10,22 +10,17 @@ import numpy as np
 
 from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.records import FARTHEST_M, LARGEST_Q, FloatArray
-from bodyschema.learning.changes.record import ChangeRecord
 from bodyschema.learning.model_bank import PRIOR
 from bodyschema.learning.orientation import OrientationState
-from bodyschema.learning.status import CurvePoint
+from bodyschema.learning.status import ChangeRecord, CurvePoint
 from bodyschema.learning.uncertainty import UncertaintyState
 
-# Prefix of the arrays of the state before a change.
-BEFORE = "before/"
-# Prefix of stored nets.
-NET = "net_"
-# Arrays with a row for each kept pair.
-PAIRS = ("q", "x", "cov", "turns")
+BEFORE = "before/"  # prefix of the arrays of the state before a change
+NET = "net_"  # prefix of stored nets
+PAIRS = ("q", "x", "cov", "turns")  # arrays with a row for each kept pair
 
 
-# of the learning curve
-MOST_POINTS = 400
+MOST_POINTS = 400  # of the learning curve
 
 
 class StateError(BodyschemaError):
@@ -87,7 +82,6 @@ class LearningState:
 
     @property
     def before(self) -> LearningState | None:
-        """State before the last change; None if there is none."""
         if self.header.before is None:
             return None
         arrays = {name.removeprefix(BEFORE): each for name, each in self.arrays.items() if name.startswith(BEFORE)}
@@ -119,7 +113,6 @@ class Curve:
 
     @property
     def points(self) -> list[CurvePoint]:
-        """Copy of the curve so far."""
         return list(self._points)
 
     def add(self, pairs: int, error_m: float) -> None:

@@ -24,8 +24,7 @@ from kbmaps import ChainBelief, JointBasis, PrequentialComparison, Recent, Resid
 from kbmaps.contest import CLEARLY
 from kbmaps.robust import OUTLIER_SIGMAS
 
-# Weight of the error one pair back: the memory is about 50 pairs long.
-DISCOUNT = 0.98
+DISCOUNT = 0.98  # Weight of the error one pair back: the memory is about 50 pairs long
 
 
 class ErrorMemory(msgspec.Struct):
@@ -66,7 +65,7 @@ class ErrorMemory(msgspec.Struct):
         missing = max(WARM - self.weight, 0.0)
         square = (np.array(self.square) + missing * self.expected_m**2 / 3.0) / max(self.weight, WARM)
         noise = self.noise_variance
-        return np.sqrt(np.maximum(square - noise, noise * _resolution(self.weight)))
+        return np.sqrt(np.maximum(square - noise, noise * math.sqrt(2.0 / max(self.weight, 2.0))))
 
     @property
     def noise_variance(self) -> FloatArray:
@@ -78,11 +77,6 @@ class ErrorMemory(msgspec.Struct):
         """Ratio of the errors to the predicted ones, at least 1."""
         missing = max(WARM - self.weight, 0.0)
         return math.sqrt(max((self.ratio + missing) / max(self.weight, WARM), 1.0))
-
-
-def _resolution(samples: float) -> float:
-    """Return the relative standard deviation of a variance that was estimated from this many samples."""
-    return math.sqrt(2.0 / max(samples, 2.0))
 
 
 # Below this number of pairs the prior expectation, or the discrepancy with the last tool, counts too.
@@ -241,7 +235,6 @@ class UncertaintyTracker:
         self._residuals.add(errors, self.errors[PRIOR].noise_variance)
 
     def solution_asked(self) -> None:
-        """Record that the solver works on all pairs so far."""
         self._asked = self._support.view
 
     def solution_taken(

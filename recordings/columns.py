@@ -80,7 +80,6 @@ class Table:
 
 
 def extra_columns(joints: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the names of the optional columns of each joint."""
     return tuple(prefix + joint for prefix in EXTRA_PREFIXES for joint in joints)
 
 

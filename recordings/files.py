@@ -63,7 +63,6 @@ class StoredPairs:
 
 
 def from_store(file: Path) -> Recording:
-    """Return all pairs of a store, as `stored_pairs` does."""
     return stored_pairs(file).recording
 
 

@@ -15,17 +15,17 @@ import msgspec
 import numpy as np
 
 from bodyschema.interfaces.errors import RecordingError
-from bodyschema.interfaces.extras import install_command
 from bodyschema.robot.lerobot import Calibrations, JointServo, Unit
 from bodyschema.robot.limited import MOST_MEMORY_BYTES, bounded_memory, opened, read_at_most
 
 from .columns import MOST_NUMBERS
-from .parquet_file import MOST_BYTES
+from .parquet_file import MOST_BYTES, arrow_modules
 from .recording import Recording
 from .tracks import JointTrack, MarkerTrack, joined
 
 INFO = Path("meta") / "info.json"
 STATE = "observation.state"
+_WHAT = "a LeRobotDataset"
 _COLUMNS = (STATE, "timestamp", "episode_index")
 # Robots of LeRobot from version 0.3 on are called so; before, angles were counted from another pose.
 _NEW = ("_follower", "_leader")
@@ -128,7 +128,7 @@ def video_parts(source: Path, camera: str) -> list[VideoPart]:
 
 def _table(folder: Path, columns: Sequence[str]) -> list[tuple[float, ...]]:
     """Return the rows of these columns of all Parquet files in a folder."""
-    pyarrow, rows = _pyarrow(folder), list[tuple[float, ...]]()
+    (pyarrow, _), rows = arrow_modules(folder, _WHAT), list[tuple[float, ...]]()
     for file in sorted(folder.rglob("*.parquet")):
         try:
             with bounded_memory(MOST_MEMORY_BYTES), opened(file, MOST_BYTES) as stream:
@@ -140,16 +140,6 @@ def _table(folder: Path, columns: Sequence[str]) -> list[tuple[float, ...]]:
             raise RecordingError(f"is no list of episodes: {error}", file=file) from error
         rows += [tuple(row) for row in numbers.tolist()]
     return rows
-
-
-def _pyarrow(source: Path) -> Any:
-    try:
-        import pyarrow.parquet
-    except ImportError as error:
-        raise RecordingError(
-            "a LeRobotDataset needs the extra `export`", file=source, remedy=f"Type: {install_command('export')}"
-        ) from error
-    return pyarrow
 
 
 def _info(source: Path) -> _Info:
@@ -186,7 +176,7 @@ def _motor_names(info: _Info, source: Path) -> list[str]:
 
 def _rows(source: Path, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return states (n, k), times (n,) [s] and episodes (n,) of all files, in their order."""
-    pyarrow = _pyarrow(source)
+    pyarrow, _ = arrow_modules(source, _WHAT)
     files = sorted((source / "data").rglob("*.parquet"))
     if not files:
         raise RecordingError("the dataset has no data/**/*.parquet", file=source, remedy="Download it whole")

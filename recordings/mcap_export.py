@@ -19,8 +19,8 @@ import msgspec
 import numpy as np
 
 from bodyschema.interfaces.errors import RecordingError
-from bodyschema.interfaces.extras import install_command
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.recordings.parquet_file import imported
 from bodyschema.recordings.recording import Recording
 
 from .store.store import Devices
@@ -57,7 +57,7 @@ def write_mcap(recording: Recording, file: Path, devices: Sequence[Devices] = ()
         RecordingError: the extra `export` is not installed, or a time does not fit nanoseconds.
         OSError: the file cannot be written.
     """
-    writer_type = _writer_type(file)
+    writer_type = imported("mcap.writer", "export", "MCAP, unlike CSV,", file).Writer
     times_ns = _nanoseconds(recording, file)
     with file.open("wb") as stream:
         writer = writer_type(stream)
@@ -121,15 +121,3 @@ def _named(names: str, values: Any) -> dict[str, float]:
 
 def _json(message: object) -> bytes:
     return msgspec.json.encode(message)
-
-
-def _writer_type(file: Path) -> Any:
-    try:
-        from mcap.writer import Writer
-    except ImportError as error:
-        raise RecordingError(
-            "MCAP needs the extra `export`",
-            file=file,
-            remedy=f"Install it with `{install_command('export')}`, or use CSV",
-        ) from error
-    return Writer

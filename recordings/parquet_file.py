@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,12 +28,14 @@ def read_parquet_table(file: Path, joints: tuple[str, ...]) -> Table:
         Fault: something is wrong with the file.
         OSError: the file cannot be read.
     """
-    arrow, _ = _modules(file)
+    arrow, _ = arrow_modules(file, "Parquet, unlike CSV,")
     with _opened(file) as parquet:
         names = tuple(parquet.schema_arrow.names)
         check_header(names, joints)
         for name in names:
-            _check_kind(arrow, name, parquet.schema_arrow.field(name).type)
+            kind = parquet.schema_arrow.field(name).type
+            if not (arrow.types.is_floating(kind) or arrow.types.is_integer(kind)):
+                raise Fault(f"the column holds {kind}, not numbers", column=name, remedy="Write it as double")
         content = _read(arrow, parquet)
     if content.num_rows == 0:
         raise Fault("there are no rows", remedy="Record at least one pair")
@@ -73,7 +76,7 @@ def _check_rows(rows: int, most: int) -> None:
 @contextmanager
 def _opened(file: Path) -> Iterator[Any]:
     """Open the Parquet file. Raise Fault where the content read inside the with block is damaged."""
-    arrow, parquet = _modules(file)
+    arrow, parquet = arrow_modules(file, "Parquet, unlike CSV,")
     with bounded_memory(MOST_MEMORY_BYTES), opened(file, MOST_BYTES) as stream:
         try:
             yield parquet.ParquetFile(stream)
@@ -91,18 +94,13 @@ def write_parquet_table(file: Path, table: Table) -> None:
         RecordingError: the extra `export` is not installed.
         OSError: the file cannot be written.
     """
-    arrow, parquet = _modules(file)
+    arrow, parquet = arrow_modules(file, "Parquet, unlike CSV,")
     columns = {
         name: arrow.array(column.astype(np.int64) if name in INTEGER_COLUMNS else column)
         for name, column in zip(table.names, table.values.T, strict=True)
     }
     with file.open("wb") as stream:
         parquet.write_table(arrow.table(columns), stream)
-
-
-def _check_kind(arrow: Any, name: str, kind: Any) -> None:
-    if not (arrow.types.is_floating(kind) or arrow.types.is_integer(kind)):
-        raise Fault(f"the column holds {kind}, not numbers", column=name, remedy="Write it as double")
 
 
 def _column(name: str, column: Any) -> np.ndarray:
@@ -112,17 +110,18 @@ def _column(name: str, column: Any) -> np.ndarray:
     return column.to_numpy().astype(np.float64)
 
 
-def _modules(file: Path) -> tuple[Any, Any]:
+def arrow_modules(file: Path, what: str) -> tuple[Any, Any]:
+    """Return pyarrow and pyarrow.parquet, which `what` needs. RecordingError if they are not installed."""
+    return imported("pyarrow", "export", what, file), imported("pyarrow.parquet", "export", what, file)
+
+
+def imported(module: str, extra: str, what: str, file: Path) -> Any:
+    """Return a module of an optional package, which `what` needs. RecordingError if it is not installed."""
     try:
-        import pyarrow
-        import pyarrow.parquet
+        return importlib.import_module(module)
     except ImportError as error:
-        raise RecordingError(
-            "Parquet needs the extra `export`",
-            file=file,
-            remedy=f"Install it with `{install_command('export')}`, or use CSV",
-        ) from error
-    return pyarrow, pyarrow.parquet
+        remedy = f"Type: {install_command(extra)}"
+        raise RecordingError(f"{what} needs the extra `{extra}`", file=file, remedy=remedy) from error
 
 
 def _first_line(error: BaseException) -> str:

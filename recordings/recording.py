@@ -74,7 +74,10 @@ class Recording:
         object.__setattr__(self, "extra", MappingProxyType(extra))
         self._check_shapes()
         try:
-            self._check_values()
+            table = self.to_table()
+            check_header(table.names, self.joints)
+            check_finite(table)
+            check_values(table)
         except Fault as fault:
             raise _located(fault, self.file) from None
 
@@ -113,8 +116,6 @@ class Recording:
 
     @classmethod
     def from_table(cls, table: Table, joints: tuple[str, ...], file: Path | None = None) -> Self:
-        """Build the recording from a table with a checked header."""
-
         def optional(names: tuple[str, ...]) -> FloatArray | None:
             return table.columns(names) if table.has(names) else None
 
@@ -214,12 +215,6 @@ class Recording:
         if self.cov is not None and not (self.cov == np.swapaxes(self.cov, 1, 2)).all():
             raise ValueError("cov is not symmetric")
 
-    def _check_values(self) -> None:
-        table = self.to_table()
-        check_header(table.names, self.joints)
-        check_finite(table)
-        check_values(table)
-
 
 def read_table(file: Path, joints: tuple[str, ...]) -> Table:
     """Return the checked columns of a recording of `joints` in `file`, CSV or Parquet by its ending.
@@ -250,7 +245,6 @@ def joints_in(file: Path) -> tuple[str, ...]:
 
 @contextmanager
 def _explained(file: Path) -> Iterator[None]:
-    """Convert errors of reading `file` to RecordingError, after a look at its ending."""
     try:
         if file.suffix.lower() not in (CSV, PARQUET):
             file.stat()  # a wrong path is the likelier mistake

@@ -26,8 +26,8 @@ from typing import Any
 import numpy as np
 
 from bodyschema.interfaces.errors import RecordingError
-from bodyschema.interfaces.extras import install_command
 from bodyschema.interfaces.records import FloatArray
+from bodyschema.recordings.parquet_file import imported
 from bodyschema.recordings.recording import Recording
 from bodyschema.robot.description import RobotDescription, link_poses
 from kbmaps.rotations import quaternions
@@ -62,7 +62,7 @@ def write_rerun(recording: Recording, file: Path, scene: Scene | None = None) ->
     Raises:
         RecordingError: the extra `rerun` is not installed, or the file cannot be written.
     """
-    rr = _rerun(file)
+    rr = imported("rerun", "rerun", "a Rerun file, unlike CSV,", file)
     try:
         file.touch()  # this error names the file; rerun's does not
         stream = rr.RecordingStream("bodyschema")
@@ -157,14 +157,3 @@ def runs(recording: Recording) -> list[FloatArray]:
     if recording.segment is None:
         return [recording.x]
     return np.split(recording.x, np.flatnonzero(np.diff(recording.segment)) + 1)
-
-
-def _rerun(file: Path) -> Any:
-    try:
-        return importlib.import_module("rerun")
-    except ImportError as error:
-        raise RecordingError(
-            "Rerun files need the extra `rerun`",
-            file=file,
-            remedy=f"Install it with `{install_command('rerun')}`, or use CSV",
-        ) from error

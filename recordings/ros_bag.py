@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from bodyschema.interfaces.errors import RecordingError
-from bodyschema.interfaces.extras import install_command
 from bodyschema.robot.limited import MOST_MEMORY_BYTES, bounded_memory, check_regular, read_at_most
 from bodyschema.robot.suggest import did_you_mean
 
+from .parquet_file import imported
 from .recording import Recording
 from .tracks import JointTrack, MarkerTrack, joined
 
@@ -43,8 +43,7 @@ _NANO = 1_000_000_000
 # Of metadata.yaml, which is parsed at some 100 kB/s; a topic or a part of the bag takes 1 kB.
 MOST_METADATA_BYTES = 2**20
 MOST_SAID = 200  # characters of another library's message, which may quote the file
-# Messages that are looked at to learn which joints or frames a topic has.
-_FEW = 200
+_FEW = 200  # messages that are looked at to learn which joints or frames a topic has
 
 
 @dataclass(frozen=True)
@@ -99,12 +98,10 @@ class _Bag:
 
     @property
     def types(self) -> dict[str, str]:
-        """The type of each topic."""
         return {connection.topic: connection.msgtype for connection in self.reader.connections}
 
     @property
     def counts(self) -> Counter[str]:
-        """Number of messages of each topic."""
         counts: Counter[str] = Counter()
         for connection in self.reader.connections:
             counts[connection.topic] += connection.msgcount
@@ -117,12 +114,10 @@ class _Bag:
             yield received_ns / _NANO, self.reader.deserialize(data, connection.msgtype)
 
     def some(self, topic: str) -> Iterator[Any]:
-        """Yield a topic's first messages."""
         for _, (_, message) in zip(range(_FEW), self.messages(topic), strict=False):
             yield message
 
     def wrong(self, what: str, remedy: str) -> RecordingError:
-        """Return an error that lists what the bag has."""
         counts = self.counts
         listed = ", ".join(f"{topic} ({kind}, {counts[topic]})" for topic, kind in sorted(self.types.items()))
         ended = remedy if remedy.endswith(("?", ".")) else f"{remedy}."
@@ -131,19 +126,13 @@ class _Bag:
 
 @contextmanager
 def _opened(source: Path) -> Iterator[_Bag]:
-    try:
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise RecordingError(
-            "reading a ROS bag needs the extra `bags`", file=source, remedy=f"Type: {install_command('bags')}"
-        ) from error
+    highlevel, typesys = (imported(f"rosbags.{name}", "bags", "a ROS bag", source) for name in ("highlevel", "typesys"))
     if not source.exists():
         raise RecordingError("there is no such file", file=source, remedy="Name a bag that is there")
     try:
         _check_files(source)
-        store = get_typestore(Stores.ROS2_JAZZY)
-        with bounded_memory(MOST_MEMORY_BYTES), AnyReader([source], default_typestore=store) as reader:
+        store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
+        with bounded_memory(MOST_MEMORY_BYTES), highlevel.AnyReader([source], default_typestore=store) as reader:
             yield _Bag(source, reader)
     except RecordingError:
         raise

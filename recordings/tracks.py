@@ -18,8 +18,7 @@ log = logging.getLogger(__name__)
 
 
 class _Settings:
-    # Between joint readings farther apart than this nothing is interpolated, as in the sampler.
-    max_gap_s: float = 0.1
+    max_gap_s: float = 0.1  # between joint readings farther apart than this nothing is interpolated, as in the sampler
     # A pause between marker positions longer than this begins another segment, as in the sampler.
     segment_gap_s: float = 1.0
     # Rows whose interpolated joints are less sure than this are left out [rad, m]: the sampler's limit for late joints.
@@ -79,6 +78,7 @@ def joined(names: tuple[str, ...], joints: JointTrack, marker: MarkerTrack, file
         )
     _tell(len(marker.t), len(rows), sure, sigma, file)
     rows, q = rows[sure], q[sure]
+    begins = (np.diff(marker.run[rows]) != 0) | (np.diff(marker.t[rows]) > _Settings.segment_gap_s)
     return Recording(
         joints=names,
         q=q,
@@ -86,7 +86,7 @@ def joined(names: tuple[str, ...], joints: JointTrack, marker: MarkerTrack, file
         t=marker.t[rows],
         cov=None if marker.cov is None else marker.cov[rows],
         orientation=None if marker.orientation is None else marker.orientation[rows],
-        segment=_segments(marker.t[rows], marker.run[rows]),
+        segment=np.concatenate([[0], np.cumsum(begins)]).astype(np.int64),
         file=file,
     )
 
@@ -122,11 +122,6 @@ def _bend(t: FloatArray, q: FloatArray) -> FloatArray:
         share = ((t[1:-1] - t[:-2]) / (t[2:] - t[:-2]))[:, None]
         bend[1:-1] = _Settings.chord * np.abs(q[:-2] + share * (q[2:] - q[:-2]) - q[1:-1]).max(axis=1)
     return bend
-
-
-def _segments(t: FloatArray, run: NDArray[np.int64]) -> NDArray[np.int64]:
-    begins = (np.diff(run) != 0) | (np.diff(t) > _Settings.segment_gap_s)
-    return np.concatenate([[0], np.cumsum(begins)]).astype(np.int64)
 
 
 def _tell(positions: int, between: int, sure: NDArray[np.bool_], sigma: FloatArray, file: Path) -> None:

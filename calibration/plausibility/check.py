@@ -15,9 +15,9 @@ import numpy as np
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.recordings.recording import Recording
 from bodyschema.robot.description import RobotDescription
-from kbmaps import RigidChain
+from kbmaps import RigidChain, align, rotation_matrices
+from kbmaps.rotations import rotation_vector
 
-from .frames import order_of_axes, reordered_quaternions, turned_frame
 from .limits import place_an_arm, reach_m, spread_m
 from .markers import several_markers
 from .reading import Reading
@@ -33,12 +33,9 @@ class _Settings:
     # A fit with residuals above these shares of the positions' spread and of the arm's reach is not of this arm.
     unexplained: float = 0.25
     of_reach: float = 0.02
-    # ... and above this multiple of the known noise.
-    noises: float = 5.0
-    # Several markers are looked for from this share of the spread on.
-    of_one_marker: float = 0.01
-    # Distances below this share of the reach are not distinguished.
-    exact: float = 1e-5
+    noises: float = 5.0  # ... and above this multiple of the known noise.
+    of_one_marker: float = 0.01  # several markers are looked for from this share of the spread on
+    exact: float = 1e-5  # distances below this share of the reach are not distinguished
 
 
 def told_sigma(recording: Recording) -> float | None:
@@ -61,8 +58,6 @@ def plausibility(
     """Check pairs q (n, d) [rad, m] and x (n, 3) [m] before a fit to them is trusted.
 
     Args:
-        q: joint values (n, d) [rad, m].
-        x: positions (n, 3) [m].
         t: times (n,) [s] if known.
         chain: the nominal chain if it is not the robot's.
         sigma_m: 1-sigma of a coordinate [m] if known.
@@ -143,7 +138,6 @@ class _Check:
 
     @property
     def _before(self) -> float:
-        """Distance of the pairs as they are [m]."""
         return self.search.fits[self.as_it_is].error
 
     @property
@@ -154,7 +148,6 @@ class _Check:
         return nameable(reading, self.search.fits[reading], self.spread)
 
     def _of_no_reading(self, nearest: Reading, fit: ReadingFit, after: float) -> Plausibility:
-        """Return the refusal of a recording that no reading explains."""
         doubted = ""
         if nearest != self.as_it_is:
             looks = nearest.looks(self.robot.joints, fit.zeros)
@@ -210,7 +203,6 @@ class _Check:
         return replace(found, warnings=(*found.warnings, perhaps))
 
     def _warnings(self, fit: ReadingFit) -> Plausibility:
-        """Return warnings of far joint offsets and of a poor fit."""
         names = self.robot.joints
         warnings = [
             f"with the nominal links, the zero of {name} comes out {math.degrees(zero):+.0f}°: it is wrong, or the "
@@ -242,3 +234,68 @@ def _marker_then(then_m: float, now_m: float) -> str:
         f"the marker then comes out {mm(then_m)} from its place in [robot] of robot.toml, and as the columns are "
         f"{mm(now_m)} from it"
     )
+
+
+# Orders of a quaternion in the columns qx, qy, qz, qw.
+_AS_IT_IS = ""
+_W_FIRST = "hold a quaternion with w first"
+_CONJUGATE = "hold the conjugate of the marker's orientation, that of the measurement frame in the marker"
+_REORDER = "name the columns qw, qx, qy, qz"
+_NEGATE = "multiply qx, qy and qz by -1"
+_REMEDIES = {_W_FIRST: _REORDER, _CONJUGATE: _NEGATE, f"{_W_FIRST}, and {_CONJUGATE}": f"{_REORDER}, and {_NEGATE}"}
+
+
+def turned_frame(chain: RigidChain, q: FloatArray, x: FloatArray, fit: ReadingFit) -> Plausibility | None:
+    """Return a refusal if the measurement frame is turned against a pose that robot.toml declares known; else None."""
+    angle = float(np.linalg.norm(rotation_vector(fit.rotation)))
+    if angle < THRESHOLDS.turned_rad:
+        return None
+    told, free = (align(chain, q, x, pose_known=known, marker_known=False).rms for known in (True, False))
+    if told < THRESHOLDS.much_better * free:
+        return None
+    return Plausibility(
+        f"it seems that the measurement frame is turned by {math.degrees(angle):.0f}° against [camera] of robot.toml"
+        f"{order_of_axes(fit.rotation, mirrored=False)}: the pairs then fit to {mm(free)}, and as they are to "
+        f"{mm(told)}",
+        "Correct the columns x, y, z, the pose of the camera or the zero of the first joint; or set pose_known = false",
+        misread=True,
+    )
+
+
+def order_of_axes(rotation: FloatArray, *, mirrored: bool) -> str:
+    """Return the order and signs in which x, y, z are given, if they are axes of the frame in robot.toml; else ""."""
+    given = np.diag([-1.0 if mirrored else 1.0, 1.0, 1.0]) @ rotation
+    which = np.abs(given).argmax(axis=1)
+    along = np.abs(given).max(axis=1)
+    if len(set(which.tolist())) < 3 or along.min() < math.cos(THRESHOLDS.turned_rad):
+        return ""
+    order = ", ".join(f"{'-' if given[k, axis] < 0.0 else ''}{'xyz'[axis]}" for k, axis in enumerate(which))
+    return f" (the columns x, y, z hold {order})"
+
+
+def reordered_quaternions(
+    chain: RigidChain, q: FloatArray, orientation: FloatArray, fit: ReadingFit
+) -> Plausibility | None:
+    """Return a refusal if the quaternions fit far better in another order, or inverted; else None."""
+    plain, first, conjugate = orientation, np.roll(orientation, -1, axis=1), np.array([-1.0, -1.0, -1.0, 1.0])
+    readings = zip((_AS_IT_IS, *_REMEDIES), (plain, first, plain * conjugate, first * conjugate), strict=True)
+    hand = fit.rotation @ chain.orientation(q)
+    errors = {name: _scatter(hand.swapaxes(1, 2) @ rotation_matrices("orientation", read)) for name, read in readings}
+    before, best = errors.pop(_AS_IT_IS), min(errors, key=errors.__getitem__)
+    after = errors[best]
+    better = before / max(after, THRESHOLDS.oriented_rad)
+    if better <= THRESHOLDS.much_better:
+        return None
+    return Plausibility(
+        f"it seems that the columns qx, qy, qz, qw {best}: the orientations then fit to {math.degrees(after):.1f}°, "
+        f"and as they are to {math.degrees(before):.1f}°",
+        f"In the recording, {_REMEDIES[best]}",
+        misread=True,
+        better=better,
+    )
+
+
+def _scatter(turns: FloatArray) -> float:
+    """Return the median angle [rad] of rotations (n, 3, 3) from the one among them that is nearest to the others."""
+    cosines = (np.einsum("aij,bij->ab", turns, turns) - 1.0) / 2.0
+    return math.acos(float(np.clip(np.median(cosines, axis=1).max(), -1.0, 1.0)))

@@ -23,8 +23,7 @@ class _Settings:
     farthest: float = 2.0
     # A joint of limited range is never this far beyond its limits [rad]: encoders wrap after a turn at the latest.
     beyond_limits_rad: float = 2.0 * math.pi
-    # A share of rows this large indicates wrong units, not single wrong readings.
-    many: float = 0.1
+    many: float = 0.1  # a share of rows this large indicates wrong units, not single wrong readings
     # Rows used to determine a unit of length; largest residual of a fit in it, as a share of the nominal positions'
     # spread.
     fitted_rows: int = 80
@@ -72,7 +71,6 @@ def beyond_limits(robot: RobotDescription, q: FloatArray, by: float = 0.0) -> Bo
 
 
 def limits_text(robot: RobotDescription, joint: int) -> str:
-    """Return a joint's limits for people, as in `-2.6 to 2.6 rad (-149° to 149°)`."""
     lower, upper = robot.lower[joint], robot.upper[joint]
     if robot.tree.joint(robot.joints[joint]).kind not in REVOLUTE:
         return f"{lower:.4g} to {upper:.4g} m"

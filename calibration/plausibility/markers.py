@@ -8,8 +8,7 @@ from scipy.cluster.hierarchy import fcluster, linkage
 
 from bodyschema.interfaces.records import FloatArray
 
-from .poses import Poses
-from .search import ReadingSearch
+from .search import Poses, ReadingSearch
 from .verdict import Plausibility, mm
 
 
@@ -18,8 +17,7 @@ class _Settings:
     # once in 140.
     chosen: int = 5
     tries: int = 400
-    # Places that are nearer are one: a marker that is loose moves less [m].
-    one_place_m: float = 0.01
+    one_place_m: float = 0.01  # Places that are nearer are one: a marker that is loose moves less [m]
     # Smallest share of the rows and number of poses at a place, and smallest share of the rows at all places together.
     share: float = 0.08
     fewest: int = 3

@@ -40,7 +40,6 @@ class Reading:
 
     @classmethod
     def plain(cls, joints: int) -> Reading:
-        """Return the columns as they are."""
         return cls(tuple(range(joints)), (1,) * joints, (0,) * joints)
 
     @property
@@ -133,12 +132,10 @@ class Reading:
         return _listed([looks for looks, _ in self._said(joints, zeros)])
 
     def remedy(self, joints: Sequence[str], zeros: FloatArray) -> str:
-        """Return what to do; arguments as in `looks`."""
         remedies = "; ".join(remedy for _, remedy in self._said(joints, zeros))
         return f"{remedies[0].upper()}{remedies[1:]}"
 
     def _with_sign(self, k: int) -> Reading:
-        """Return the reading with the sign of joint k reversed."""
         return replace(self, signs=_replaced(self.signs, {k: -self.signs[k]}))
 
     def _turnings(self, slides: Sequence[bool]) -> Iterator[Reading]:

@@ -17,8 +17,7 @@ from .verdict import FEWEST_ROWS, THRESHOLDS, Plausibility, mm
 
 
 class _Settings:
-    # A position belongs to the angles of a row this near at most.
-    near_rows: int = 3
+    near_rows: int = 3  # a position belongs to the angles of a row this near at most
     # Rows are shifted if this share of them fits so many times better with angles or positions of the row as far
     # away. Up to 0.09 do so in right recordings, 0.16 and more where a fifth of a real recording is shifted.
     shifted: float = 0.12

@@ -8,18 +8,56 @@ from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from bodyschema.interfaces.records import FloatArray
 from kbmaps import ChainParameters, DegenerateDataError, RigidChain, align
 from kbmaps.chains.placement import Placements, place
 from kbmaps.rotations import rotation_vectors
 
-from .limits import KNOWN_TOOL_M, MEASURED, SLIDES_M, TOOL_M, ZEROS_RAD, spread_m
-from .poses import Poses
+from .limits import A_RADIAN_M, KNOWN_TOOL_M, MEASURED, SLIDES_M, TOOL_M, ZEROS_RAD, spread_m
 from .reading import QUARTER, Reading
 from .size import evidences
 from .verdict import THRESHOLDS
+
+# Rows within this distance, of the joint that moved farthest, are of one pose: along a path the errors of links change
+# slowly.
+_APART_RAD = math.radians(10.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Poses:
+    """Poses that are far from each other, and the rows near each."""
+
+    rows: NDArray[np.intp]  # the row of each pose (k,)
+    of_rows: NDArray[np.intp]  # index of the nearest pose for each row (n,)
+
+    @classmethod
+    def of(cls, chain: RigidChain, q: FloatArray) -> Poses:
+        """Choose poses of rows q (n, d) [rad, m] that are apart in at least one joint."""
+        q = q / np.where(chain.prismatic, A_RADIAN_M, 1.0)
+        distances = np.abs(q[:, None] - q).max(axis=2)
+        kept: list[int] = []
+        for row, far in enumerate(distances > _APART_RAD):
+            if far[kept].all():
+                kept.append(row)
+        return cls(np.array(kept, dtype=np.intp), distances[:, kept].argmin(axis=1))
+
+    def mean(self, values: ArrayLike) -> float:
+        """Return the mean of values (n,) of the rows, each pose counted once."""
+        return float((np.bincount(self.of_rows, values) / np.bincount(self.of_rows)).mean())
+
+    def nats(self, gain: float, joints: int, share: float = 1.0) -> float:
+        """Return the evidence for a reading over another one, each placed by these rows [nats].
+
+        Any reading fits as many coordinates as there are offsets of joints, camera and marker.
+
+        Args:
+            gain: logarithm of the ratio of their distances.
+            share: of the rows, by which the distances are measured.
+        """
+        return gain * max(3.0 * share * len(self.rows) - joints - 9.0, 0.0)
+
 
 # Number of rows to be read in other ways, evenly spread. Twice as many cost twice the time and change no verdict of the
 # tests.
@@ -41,20 +79,16 @@ class _Settings:
     a_change: float = 3.0
     # A joint offset above this is mentioned: that of one in 300 generated arms with offsets of up to 10°.
     far_zero_rad: float = math.radians(20.0)
-    # ... unless the pairs fit about as well with half of it.
-    near_zero_rad: float = far_zero_rad / 2.0
-    # Share of its tolerance that is left to a joint offset that is held.
-    held: float = 1e-3
+    near_zero_rad: float = far_zero_rad / 2.0  # ... unless the pairs fit about as well with half of it.
+    held: float = 1e-3  # share of its tolerance that is left to a joint offset that is held
     # A zero of the last joint this far off is not fitted where the marker is known: its quarter turns are tried
     # instead.
     last_zero_rad: float = math.radians(3.0)
     # ... and named where the known marker comes out so many times nearer to its place: with 3, 2 of 32 markers that
     # were 50 mm off in each direction (1-sigma) came out so by chance.
     nearer: float = 5.0
-    # Axes are parallel if the cosine between them is above this: 2.6°.
-    parallel: float = 0.999
-    # Maximum number of other, equally good readings that are listed.
-    listed: int = 2
+    parallel: float = 0.999  # Axes are parallel if the cosine between them is above this: 2.6°
+    listed: int = 2  # maximum number of other, equally good readings that are listed
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,12 +275,10 @@ class ReadingSearch:
         return tuple(name for name, error in zip(names, others, strict=True) if error < THRESHOLDS.much_better * own)
 
     def _whole_error(self, reading: Reading) -> float:
-        """Return the RMS distance [m] of all rows, outliers included."""
         q, x = reading.angles(self.q, self.chain.prismatic), reading.positions(self.x)
         return max(float(np.sqrt(np.square(self.distances(q, x, [(q, x)])).mean())), self.exact_m)
 
     def _best(self) -> list[Reading]:
-        """Return all readings, the best first."""
         return sorted(self.fits, key=lambda reading: self.fits[reading].nats + _Settings.a_change * reading.changes)
 
     def _most_probable(self, as_it_is: Reading) -> tuple[Reading, list[float]]:
@@ -297,7 +329,6 @@ class ReadingSearch:
         return fit.nats < best.nats + _Settings.certain or fit.error < THRESHOLDS.as_good * best.error
 
     def _try(self, readings: Iterable[Reading]) -> None:
-        """Fit readings that were not tried yet."""
         new = [reading for reading in dict.fromkeys(readings) if reading not in self._tried]
         self._tried.update(new)
         if new:

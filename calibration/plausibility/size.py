@@ -23,8 +23,7 @@ from .verdict import THRESHOLDS, Plausibility, mm
 _STEPS = 3
 # Candidate noise levels, as shares of the residuals with nominal links: tolerances explain the rest of these.
 _NOISES = np.geomspace(0.01, 2.0, 16)
-# Rows farther off than this multiple of the median are outliers.
-_FAR = 5.0
+_FAR = 5.0  # rows farther off than this multiple of the median are outliers
 
 
 class _Settings:
@@ -33,8 +32,7 @@ class _Settings:
     # Off by this many times its own uncertainty. Right recordings of real and generated arms come to 4.0, and fit
     # hardly better for it.
     far: float = 5.0
-    # Smaller ones are warned of: a joint whose ratio is 2 % off looks like positions 2.4 % off.
-    other: float = 0.04
+    other: float = 0.04  # Smaller ones are warned of: a joint whose ratio is 2 % off looks like positions 2.4 % off
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,10 +27,8 @@ class _Thresholds:
     # so on. Right readings of real arms leave up to `right`, wrong ones down to 0.03 with four changes, 0.09 with two.
     named: float = 0.12
     right: float = 0.032
-    # A known camera pose is not off by this much.
-    turned_rad: float = math.radians(30.0)
-    # Orientations of a tag on a nominal arm are no better than this.
-    oriented_rad: float = math.radians(1.0)
+    turned_rad: float = math.radians(30.0)  # a known camera pose is not off by this much
+    oriented_rad: float = math.radians(1.0)  # orientations of a tag on a nominal arm are no better than this
 
 
 THRESHOLDS = _Thresholds()
@@ -50,7 +48,6 @@ class Plausibility:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """All problems and warnings as sentences."""
         refused = () if self.refusal is None else (f"{self.refusal}. {self.remedy}",)
         return tuple(f"{text[0].upper()}{text[1:]}." for text in (*refused, *self.warnings))
 
@@ -66,5 +63,4 @@ class Plausibility:
 
 
 def mm(distance_m: float) -> str:
-    """Return a distance for people, as in `1.23 mm`."""
     return f"{1e3 * distance_m:.3g} mm" if distance_m < 1.0 else f"{distance_m:.3g} m"

@@ -16,12 +16,19 @@ from bodyschema.calibration.plausibility.search import ROWS
 from bodyschema.calibration.plausibility.verdict import FEWEST_ROWS
 from bodyschema.daemon.transport.status import UNDECIDED, Change
 from bodyschema.interfaces.protocols import Clock
-from bodyschema.learning.changes.record import JOINT, ChangeRecord, KindOfChange
 from bodyschema.learning.data_outlook import LearnerEvidence, Scatter, forecast
 from bodyschema.learning.model_bank import SOLVED
 from bodyschema.learning.online_learner import OnlineLearner
 from bodyschema.learning.solvers.tolerance_selection import WORKMANSHIP, probable
-from bodyschema.learning.status import ChainCalibration, JointZero, LearntFigure, Outlook
+from bodyschema.learning.status import (
+    JOINT,
+    ChainCalibration,
+    ChangeRecord,
+    JointZero,
+    KindOfChange,
+    LearntFigure,
+    Outlook,
+)
 from bodyschema.robot.calibrated_files import CAMERA_LINK
 from bodyschema.robot.description import RobotDescription
 from kbmaps import ChainBelief, KBMapsError

@@ -41,25 +41,15 @@ class _Settings:
 
 @dataclass(frozen=True, eq=False)
 class Explanation:
-    """A set of named causes with a set of unnamed ones.
+    """A set of named causes with a set of unnamed ones."""
 
-    Attributes:
-        fit: the fit with the named causes alone.
-        apart: fit with the unnamed causes removed from the data; None if there is no unnamed cause.
-        worth: log-evidence of the whole, comparable only with that of other explanations [nats].
-        size: RMS change by the unnamed causes beyond the named ones, in units of the stated noise.
-        promise: first-order gain of the best single unnamed cause beside the named ones [nats].
-        counted: effective number of independent rows per row (0, 1].
-        inexact: RMS change by an imperfect shape of the named causes, in the same units.
-    """
-
-    fit: Fit
-    apart: Apart | None
-    worth: float
-    size: float = 0.0
-    promise: float = -np.inf
-    counted: float = 1.0
-    inexact: float = 0.0
+    fit: Fit  # the fit with the named causes alone
+    apart: Apart | None  # fit with the unnamed causes removed from the data; None if there is no unnamed cause
+    worth: float  # log-evidence of the whole, comparable only with that of other explanations [nats]
+    size: float = 0.0  # RMS change by the unnamed causes beyond the named ones, in units of the stated noise
+    promise: float = -np.inf  # first-order gain of the best single unnamed cause beside the named ones [nats]
+    counted: float = 1.0  # effective number of independent rows per row (0, 1]
+    inexact: float = 0.0  # RMS change by an imperfect shape of the named causes, in the same units
 
     @property
     def wanders(self) -> bool:
@@ -81,7 +71,6 @@ class Explanation:
 
     @property
     def is_specific(self) -> bool:
-        """True if every unnamed cause is as specific as a named one."""
         return all(way.family.is_specific for way in self.unnamed_causes)
 
 
@@ -108,11 +97,7 @@ def explain(
 
 
 def _compared(found: Fit, path: Sequence[Fit], unnamed: UnnamedFamilies, search: Search, counted: float) -> Explanation:
-    """Return the most probable explanation.
-
-    Args:
-        counted: effective number of independent rows per row.
-    """
+    """Return the most probable explanation."""
     whole = _length(found, found.run.measured - path[0].run.measured)
     best = _with_unnamed(found, unnamed, search, counted)
     inexact = max(_Settings.of_the_causes * whole, _Settings.of_the_way * _length(found, changed_by_the_way(found)))

@@ -9,9 +9,9 @@ from scipy.special import fdtrc
 
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.search.held_out import Blocks
+from bodyschema.diagnosis.unnamed.families import joints_of
 from bodyschema.diagnosis.unnamed.family_fits import Apart, UnnamedFamilies, basis_of
 from bodyschema.diagnosis.unnamed.rattle import Rattle
-from bodyschema.diagnosis.unnamed.sensitivity import joints_of
 from bodyschema.diagnosis.unnamed.smooth import SmoothModel, smooth_model
 
 from .explanation import Explanation
@@ -21,31 +21,19 @@ _WANDERS = "an error that neighbouring rows share and nothing that was tested pr
 
 @dataclass(frozen=True, eq=False)
 class ResidualStructure:
-    """Residual structure after all causes have been named.
+    """Residual structure after all causes have been named."""
 
-    Attributes:
-        what: descriptions of the erring part and of what the error depends on.
-        joints: indices in q of the joints at which it acts or on which it depends.
-        with_time: True if it depends on time.
-        p_value: p-value of this structure arising by chance.
-        model: the causes beside a smooth model of it; None where no structure is left.
-        untold: descriptions of time-dependent parts, which no stored model can contain.
-        rattle: play of a loose marker; None for one that is fixed.
-        unpredicted_m: RMS of what neighbouring rows share and nothing predicts [m].
-    """
-
-    what: tuple[str, ...]
-    joints: tuple[int, ...]
-    with_time: bool
-    p_value: float
-    model: SmoothModel | None = None
-    untold: tuple[str, ...] = ()
-    rattle: Rattle | None = None
-    unpredicted_m: float = 0.0
+    what: tuple[str, ...]  # descriptions of the erring part and of what the error depends on
+    joints: tuple[int, ...]  # indices in q of the joints at which it acts or on which it depends
+    with_time: bool  # True if it depends on time
+    p_value: float  # p-value of this structure arising by chance
+    model: SmoothModel | None = None  # the causes beside a smooth model of it; None where no structure is left
+    untold: tuple[str, ...] = ()  # descriptions of time-dependent parts, which no stored model can contain
+    rattle: Rattle | None = None  # play of a loose marker; None for one that is fixed
+    unpredicted_m: float = 0.0  # RMS of what neighbouring rows share and nothing predicts [m]
 
     @property
     def is_there(self) -> bool:
-        """True if there is any structure."""
         return bool(self.what)
 
     @property

@@ -39,31 +39,20 @@ class _Settings:
     next_to_it = 1e-3  # smallest move there, as a share of a far one
 
 
-# A less probable rival is not listed.
-PROBABLE = 0.02
+PROBABLE = 0.02  # a less probable rival is not listed
 
 
 @dataclass(frozen=True, eq=False)
 class Rival:
-    """An alternative to a cause.
+    """An alternative to a cause."""
 
-    Attributes:
-        instead: the fit with it in the place of the cause.
-        itself: the effect with its best-fitting numbers, or what has no name.
-        probability: given that the cause or one of its rivals is present.
-        difference: Δχ² by which this motion is expected to separate them.
-        anywhere: the same for as many poses over the whole range of the joints.
-        signal: Δχ² of the cause itself on those poses.
-        is_one: True if the cause, refitted, also covers this rival on any motion, and it does not matter which is
-            corrected.
-    """
-
-    instead: Fit | UnnamedAlternative
-    itself: Effect | UnnamedAlternative
-    probability: float
-    difference: float
-    anywhere: float
-    signal: float
+    instead: Fit | UnnamedAlternative  # the fit with it in the place of the cause
+    itself: Effect | UnnamedAlternative  # the effect with its best-fitting numbers, or what has no name
+    probability: float  # given that the cause or one of its rivals is present
+    difference: float  # Δχ² by which this motion is expected to separate them
+    anywhere: float  # the same for as many poses over the whole range of the joints
+    signal: float  # Δχ² of the cause itself on those poses
+    # True if the cause, refitted, also covers this rival on any motion, and it does not matter which is corrected
     is_one: bool
 
     @property
@@ -79,34 +68,22 @@ class Rival:
 
 @dataclass(frozen=True, eq=False)
 class Standing:
-    """Assessment of one cause against all rivals.
+    """Assessment of one cause against all rivals."""
 
-    Attributes:
-        itself: the cause with its best first-order fit.
-        probability: probability of the cause or its equivalents.
-        dof: number of its amounts that the data determine.
-        gain: its Δχ².
-        rivals: the probable ones, the most probable first.
-        is_like_sag: True if a joint that gives under the arm's weight explains nearly as much, and was not tested, or
-            with weights that are assumed.
-    """
-
-    itself: Candidate
-    probability: float
-    dof: int
-    gain: float
-    rivals: tuple[Rival, ...]
+    itself: Candidate  # the cause with its best first-order fit
+    probability: float  # probability of the cause or its equivalents
+    dof: int  # number of its amounts that the data determine
+    gain: float  # its Δχ²
+    rivals: tuple[Rival, ...]  # the probable ones, the most probable first
+    # True if a joint that gives under the arm's weight explains nearly as much, and was not tested, or with weights
+    # that are assumed
     is_like_sag: bool = False
 
 
 def standings(
     fit: Fit, search: Search, blocks: Blocks, seed: int, unnamed: UnnamedFamilies | None = None
 ) -> list[Standing]:
-    """Assess each cause of a fit.
-
-    Args:
-        unnamed: unnamed families that may be rivals as well.
-    """
+    """Assess each cause of a fit."""
     return [_standing(fit, cause, search, blocks, seed, unnamed) for cause in fit.causes]
 
 
@@ -270,7 +247,9 @@ def whole_range(fit: Fit, joint: int) -> tuple[float, float]:
 def apart_on(one: Fit, other: Fit | UnnamedAlternative, motion: Motion) -> float:
     """Return the Δχ² by which two fits differ on a motion as long as theirs, the other refitted to it."""
     there = other.simulation.positions(motion) if isinstance(other, Fit) else other.positions(motion)
-    left = _beside(one.simulation.positions(motion) - there, _columns(other, motion))
+    apart = one.simulation.positions(motion) - there
+    flat = _columns(other, motion).reshape(apart.size, -1)
+    left = apart - (flat @ solved(flat.T @ flat, flat.T @ apart.ravel())).reshape(apart.shape)
     scale = float(np.median(np.linalg.det(one.observations.whitening))) ** (1.0 / 3.0)
     share = len(one.observations) / len(motion)
     return float(np.square(left * scale).sum() / one.noise.sigma**2 * share)
@@ -281,9 +260,3 @@ def _columns(fit: Fit | UnnamedAlternative, motion: Motion) -> FloatArray:
     if isinstance(fit, UnnamedAlternative):
         return fit.columns(motion)
     return amount_columns(fit.simulation.run(motion), fit.simulation.effects)
-
-
-def _beside(apart: FloatArray, columns: FloatArray) -> FloatArray:
-    """Return the part of `apart` (n, 3) that columns (n, 3, p) cannot follow."""
-    flat = columns.reshape(apart.size, -1)
-    return apart - (flat @ solved(flat.T @ flat, flat.T @ apart.ravel())).reshape(apart.shape)

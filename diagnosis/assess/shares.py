@@ -17,13 +17,10 @@ class Shares:
 
     A joint offset has a share here even where large tolerances could take its place: the tolerances are those of the
     fit, and the share is what the offset does and not what would be lost without it.
-
-    Attributes:
-        causes: share of each cause of the fit.
-        links, drives: shares of the tolerances of links and axes, and of the small periodic errors of drives.
     """
 
-    causes: tuple[float, ...]
+    causes: tuple[float, ...]  # share of each cause of the fit
+    # links, drives: shares of the tolerances of links and axes, and of the small periodic errors of drives
     links: float = 0.0
     drives: float = 0.0
 

@@ -19,10 +19,8 @@ from bodyschema.interfaces.records import FloatArray
 
 # Number of long blocks of time, each of which is left out once. In short ones a walk stays near where it was.
 _PARTS = 10
-# One-sided probability of the t-test.
-_SURELY = 0.95
-# Number of new poses.
-_POSES = 400
+_SURELY = 0.95  # one-sided probability of the t-test
+_POSES = 400  # number of new poses
 
 
 def stored(candidates: Sequence[Fit], markers: NDArray[np.bool_]) -> Fit:
@@ -57,16 +55,11 @@ def is_better_with(model: SmoothModel, simpler: Fit, markers: NDArray[np.bool_],
 
 @dataclass(frozen=True, eq=False)
 class _Elsewhere:
-    """What a fit is expected to do on another recording.
-
-    Attributes:
-        squares: sum of squared held-out errors in each long block, over the number of all rows (blocks,) [m²].
-        variance: mean squared distance between its predictions of new poses [m²].
-    """
+    """What a fit is expected to do on another recording."""
 
     fit: Fit
-    squares: FloatArray
-    variance: float
+    squares: FloatArray  # sum of squared held-out errors in each long block, over the number of all rows (blocks,) [m²]
+    variance: float  # mean squared distance between its predictions of new poses [m²]
 
     @classmethod
     def of(cls, fit: Fit, markers: NDArray[np.bool_]) -> _Elsewhere:
@@ -96,7 +89,6 @@ class _Elsewhere:
         return cls(fit, _sums(errors, markers), variance)
 
     def is_better_than(self, simpler: _Elsewhere) -> bool:
-        """Return True if this fit is surely better elsewhere."""
         gains = simpler.squares - self.squares
         unsure = float(np.std(gains, ddof=1)) * np.sqrt(len(gains)) * stdtrit(len(gains) - 1, _SURELY)
         return float(gains.sum()) - unsure > max(self.variance - simpler.variance, 0.0)
@@ -143,7 +135,6 @@ def _pose_columns(fit: Fit, run: Simulated) -> FloatArray:
 
 
 def _long_blocks(rows: int) -> Blocks:
-    """Return the long blocks of time."""
     return Blocks.cut(rows, _PARTS)
 
 

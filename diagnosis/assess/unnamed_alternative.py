@@ -22,15 +22,10 @@ _LESS_USUAL = 1.5
 
 @dataclass(frozen=True, eq=False)
 class UnnamedAlternative:
-    """Alternative to a cause: the other causes beside an unnamed one that is as specific.
+    """Causes beside an unnamed cause that is as specific as a named one."""
 
-    Attributes:
-        apart: the other causes, with the unnamed one removed from the data.
-        behind: its log-evidence over the cause in whose place it stands [nats].
-    """
-
-    apart: Apart
-    behind: float
+    apart: Apart  # the other causes, with the unnamed one removed from the data
+    behind: float  # its log-evidence over the cause in whose place it stands [nats]
 
     @classmethod
     def in_place_of(
@@ -56,7 +51,6 @@ class UnnamedAlternative:
 
     @property
     def what(self) -> str:
-        """Short description."""
         return self.apart.chosen[0].family.what
 
     @property

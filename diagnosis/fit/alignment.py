@@ -7,7 +7,6 @@ from scipy.spatial.transform import Rotation
 
 from bodyschema.effects import EFFECT_TYPES, Effect, Simulation
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.robot.description import RobotDescription
 
 from .fit import Fit, fitted
 from .observations import Observations
@@ -18,19 +17,14 @@ _ROUNDS, _KEPT = 10, 0.8
 def aligned(observations: Observations, simulation: Simulation) -> Fit:
     """Fit the free camera pose and the free marker where robot.toml does not know them."""
     robot = simulation.robot
-    nuisances = free_effects(robot)
+    free = [kind.name for kind in EFFECT_TYPES.values() if kind.is_free(robot)]
+    # The camera's pose first, from which the rest is fitted.
+    nuisances = [Effect.at(robot, name) for name in reversed(free)]
     if not robot.camera.pose_known:
         pose = placed(simulation.positions(observations.motion), observations.x)
         nuisances = [one.with_values(pose) if one.kind.stage == "camera" else one for one in nuisances]
     own = list(simulation.effects)
     return fitted(observations, simulation.with_effects([*nuisances, *own]), len(nuisances) + len(own))
-
-
-def free_effects(robot: RobotDescription) -> list[Effect]:
-    """Return the effects that stand for what robot.toml does not know."""
-    free = [kind.name for kind in EFFECT_TYPES.values() if kind.is_free(robot)]
-    # The camera's pose first, from which the rest is fitted.
-    return [Effect.at(robot, name) for name in reversed(free)]
 
 
 def placed(predicted: FloatArray, x: FloatArray) -> FloatArray:

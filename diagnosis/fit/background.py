@@ -18,16 +18,11 @@ from bodyschema.interfaces.records import FloatArray
 
 # Workshop tolerances (1 sigma): link length [m], axis or joint offset [rad], drive over a turn [rad].
 LENGTH_M, ANGLE_RAD, DRIVE_RAD = 0.3e-3, float(np.radians(0.06)), float(np.radians(0.01))
-# Tolerance of a prismatic joint's drive [m].
-_DRIVE_M = 0.03e-3
-# Periodic errors of every drive: once and twice per turn of the joint.
-_TWICE = 2.0
-# A drive error within this multiple of the usual size is a tolerance.
-_LIKE_OTHERS = 3.0
-# A row counts in full if its weight differs from 1 by less.
-_COUNTS_IN_FULL = 1e-9
-# Prior standard deviation of the logarithms of the scales.
-SPREAD = 2.0
+_DRIVE_M = 0.03e-3  # tolerance of a prismatic joint's drive [m]
+_TWICE = 2.0  # Periodic errors of every drive: once and twice per turn of the joint
+_LIKE_OTHERS = 3.0  # a drive error within this multiple of the usual size is a tolerance
+_COUNTS_IN_FULL = 1e-9  # a row counts in full if its weight differs from 1 by less
+SPREAD = 2.0  # prior standard deviation of the logarithms of the scales
 # Smallest and largest scale. With all at the smallest, the arm is exactly as described, such as a simulated one.
 SMALLEST, MOST = 1e-3, 10.0
 
@@ -42,7 +37,6 @@ class Scales(NamedTuple):
 
     @property
     def no_larger(self) -> Scales:
-        """Return these scales, each limited to 1 (a workshop's tolerance)."""
         return Scales(*np.minimum(self, 1.0).tolist())
 
     @property
@@ -67,12 +61,6 @@ class Background:
         scales: scales of the tolerances; None for no background at all.
         before: the background from which this one is derived; None where the simulation's own errors are known and the
             tolerances are centred on them.
-
-    Attributes:
-        effects: the effects with zero amounts: a link at each joint, eccentricity and ripple of each drive.
-        columns: derivatives (n, 3, p) [m] of the measured positions with respect to the amounts.
-        tolerances: prior standard deviation of each amount (p,).
-        start: the simulation's amounts (p,), about which the columns are linearised.
     """
 
     def __init__(
@@ -81,17 +69,20 @@ class Background:
         simulation = run.simulation
         self._whitening, self.scales = whitening, scales
         own = () if scales is None else simulation.background or background_effects(simulation, run.motion.q)
-        self.effects = tuple(_resting(effect) for effect in own)
+        # the effects with zero amounts: a link at each joint, eccentricity and ripple of each drive
+        self.effects = tuple(effect.with_amounts(0.0) for effect in own)
         amounts = np.concatenate([np.empty(0), *(effect.values[effect.amounts] for effect in own)])
         # Tolerances are centred here.
         self._centre = amounts
         if before is not None and before.scales is not None:
             self._centre = np.append(before._centre, np.zeros(len(amounts) - len(before._centre)))
-        self.start = amounts - self._centre
+        self.start = amounts - self._centre  # the simulation's amounts (p,), about which the columns are linearised
         parts = [run.columns(effect)[:, :, effect.amounts] for effect in own]
+        # derivatives (n, 3, p) [m] of the measured positions with respect to the amounts
         self.columns = np.concatenate([np.empty((len(run.motion), 3, 0)), *parts], axis=2)
         self.group = np.concatenate([np.empty(0, int), *map(_groups, self.effects)])
         units = np.concatenate([np.empty(0), *map(_units, self.effects)])
+        # prior standard deviation of each amount (p,)
         self.tolerances = units if scales is None else units * np.asarray(scales)[self.group]
 
     def shift(self, amounts: FloatArray) -> FloatArray:
@@ -102,7 +93,7 @@ class Background:
         """Return the background's effects with amounts (p,)."""
         ends = np.cumsum([len(effect.amounts) for effect in self.effects])
         return tuple(
-            _with(effect, (self._centre + amounts)[end - len(effect.amounts) : end])
+            effect.with_amounts((self._centre + amounts)[end - len(effect.amounts) : end])
             for effect, end in zip(self.effects, ends, strict=True)
         )
 
@@ -163,21 +154,11 @@ def background_effects(simulation: Simulation, q: FloatArray) -> tuple[Effect, .
     """Return the tolerance effects, with zero amounts, of each joint that moves over q (n, d) and each link between."""
     robot, found = simulation.robot, []
     for k, joint in enumerate(robot.joints):
-        found.append(_resting(Effect.at(robot, "link_geometry", joint)))
+        found.append(Effect.at(robot, "link_geometry", joint))
         if not robot.chain.prismatic[k] and np.ptp(q[:, k]) > 0.0:
-            found.append(_resting(Effect.at(robot, "joint_eccentricity", joint)))
-            found.append(_resting(Effect.at(robot, "joint_ripple", joint, values=[0.0, 0.0, _TWICE])))
-    return tuple(effect.one_more(-1) for effect in found)
-
-
-def _resting(effect: Effect) -> Effect:
-    return _with(effect, np.zeros(len(effect.amounts)))
-
-
-def _with(effect: Effect, amounts: FloatArray) -> Effect:
-    values = effect.values.copy()
-    values[effect.amounts] = amounts
-    return effect.with_values(values)
+            found.append(Effect.at(robot, "joint_eccentricity", joint))
+            found.append(Effect.at(robot, "joint_ripple", joint, values=[0.0, 0.0, _TWICE]))
+    return tuple(effect.with_amounts(0.0).one_more(-1) for effect in found)
 
 
 def _groups(effect: Effect) -> np.ndarray:

@@ -19,8 +19,7 @@ from .noise import ROUNDED, Noise, correlation
 from .observations import IntArray, Observations
 from .tangent import Tangent, solved
 
-# Prior limit of an effect, in units of its usual size; unidentifiable parameters stay near zero.
-LARGEST = 10.0
+LARGEST = 10.0  # prior limit of an effect, in units of its usual size; unidentifiable parameters stay near zero
 
 
 class _Settings:
@@ -51,33 +50,20 @@ class _Settings:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A simulation fitted to observations.
+    """A simulation fitted to observations."""
 
-    Attributes:
-        observations: the data of the fit.
-        simulation: with all effects, the nuisances first.
-        nuisances: number of leading effects that are not findings.
-        background: changes that the tolerances allow.
-        tolerated: amount of each of them (p,).
-        run: the simulation over the observed motion.
-        residuals: (n, 3) in units of the stated noise.
-        noise: the fitted noise model.
-        tangent: derivatives about a similar fit, for the first steps; None where there is none.
-    """
-
-    observations: Observations
-    simulation: Simulation
-    nuisances: int
-    background: Background
-    tolerated: FloatArray
-    run: Simulated
-    residuals: FloatArray
-    noise: Noise
-    tangent: Tangent | None = None
+    observations: Observations  # the data of the fit
+    simulation: Simulation  # with all effects, the nuisances first
+    nuisances: int  # number of leading effects that are not findings
+    background: Background  # changes that the tolerances allow
+    tolerated: FloatArray  # amount of each of them (p,)
+    run: Simulated  # the simulation over the observed motion
+    residuals: FloatArray  # (n, 3) in units of the stated noise
+    noise: Noise  # the fitted noise model
+    tangent: Tangent | None = None  # derivatives about a similar fit, for the first steps; None where there is none
 
     @property
     def causes(self) -> tuple[Effect, ...]:
-        """The effects that are findings."""
         return self.simulation.effects[self.nuisances :]
 
     @cached_property
@@ -110,7 +96,10 @@ class Fit:
         """Prior cost of large effects and tolerances [nats]."""
         beyond = 0.5 * float(self.background.precision @ np.square(self.tolerated))
         beyond += self.background.volume(self.noise.sigma)
-        return _cost(self.simulation.effects[self.nuisances :]) + beyond
+        for effect in self.simulation.effects[self.nuisances :]:
+            for k in effect.amounts:
+                beyond += float(0.5 * (effect.values[k] / (LARGEST * effect.parameters[k].usual)) ** 2)
+        return beyond
 
     @cached_property
     def predicted(self) -> FloatArray:
@@ -134,7 +123,6 @@ class Fit:
 
     @property
     def columns(self) -> FloatArray:
-        """Whitened and weighted `run_columns`."""
         return np.concatenate([self.effect_columns, self.tolerance_columns.reshape(*self.left.shape, -1)], axis=2)
 
     @cached_property
@@ -154,7 +142,6 @@ class Fit:
 
     @property
     def amounts(self) -> int:
-        """Number of amounts of all effects."""
         return sum(len(effect.amounts) for effect in self.simulation.effects)
 
     def doubtful(self, effects: Iterable[Effect] | None = None) -> NDArray[np.bool_]:
@@ -308,7 +295,6 @@ class Fit:
 
     @cached_property
     def own_tangent(self) -> Tangent:
-        """Derivatives about this fit."""
         return Tangent.of(self.simulation.effects, self._columns_of_each(None), self.background, self.noise.weights)
 
     @property
@@ -397,8 +383,8 @@ class Fit:
             amounts, shapes = amounts + len(effect.amounts), shapes + len(own)
         raise ValueError(f"{cause.name} is no effect of this fit")
 
-    def moved(self, step: FloatArray) -> tuple[Simulation, FloatArray]:
-        """Return the simulation and the tolerances after a step (p + s,)."""
+    def stepped(self, step: FloatArray) -> Fit:
+        """Return the fit after a step (p + s,), without further steps."""
         effects, first = [], 0
         shape = self.amounts + len(self.tolerated)
         for index, effect in enumerate(self.simulation.effects):
@@ -410,11 +396,8 @@ class Fit:
                     values[k] = effect.kind.bounded(effect, k, values[k] + step[shape], self.observations.motion)
                     shape += 1
             effects.append(effect.with_values(values))
-        return self.simulation.with_effects(effects), self.tolerated + step[first : first + len(self.tolerated)]
-
-    def stepped(self, step: FloatArray) -> Fit:
-        """Return the fit after a step (p + s,), without further steps."""
-        return self.at(*self.moved(step))
+        tolerated = self.tolerated + step[first : first + len(self.tolerated)]
+        return self.at(self.simulation.with_effects(effects), tolerated)
 
     def at(self, simulation: Simulation, tolerated: FloatArray | None = None) -> Fit:
         """Evaluate a simulation with the same nuisances, and the same tolerances by default, without fitting it."""
@@ -422,7 +405,6 @@ class Fit:
         return _at(self.observations, simulation, self.nuisances, self.noise, self.background, tolerated)
 
     def over(self, observations: Observations) -> Fit:
-        """Refit to observations of another motion of the same arm."""
         return improved(self._about(self.settled_simulation, self.background.scales, observations))
 
     def _about(self, simulation: Simulation, scales: Scales | None, observations: Observations | None = None) -> Fit:
@@ -433,7 +415,6 @@ class Fit:
         return _at(observations, simulation, self.nuisances, self.noise, background, run=run)
 
     def to(self, observations: Observations, start: Simulation | None = None) -> Fit:
-        """Refit to other observations of the same motion, optionally from another simulation."""
         simulation = start or self.simulation
         fit = _at(observations, simulation, self.nuisances, self.noise, self.background, self.tolerated)
         return improved(replace(fit, tangent=self.own_tangent))
@@ -465,7 +446,6 @@ class Fit:
 
     @property
     def settled_simulation(self) -> Simulation:
-        """The simulation with the tolerances moved into it."""
         if self.background.scales is None:
             return self.simulation
         return self.simulation.with_background(self.background.with_amounts(self.tolerated))
@@ -483,21 +463,17 @@ class Fit:
         return improved(self._about(self.settled_simulation, None, observations)).simulation
 
     def untolerated(self) -> Fit:
-        """Refit without any tolerance."""
         if self.background.scales is None:
             return self
         return improved(self._about(self.simulation.with_background(self.background.given), None))
 
     def without(self, cause: Effect) -> Fit:
-        """Refit with all causes but one."""
         return self.with_causes([effect for effect in self.causes if effect.identity != cause.identity])
 
     def with_causes(self, causes: Sequence[Effect]) -> Fit:
-        """Refit with other causes in place of the present ones."""
         return improved(self.starting(causes))
 
     def starting(self, causes: Sequence[Effect]) -> Fit:
-        """Replace the causes, without fitting."""
         started = self.at(self.simulation.with_effects((*self.simulation.effects[: self.nuisances], *causes)))
         return replace(started, tangent=self.own_tangent)
 
@@ -609,14 +585,6 @@ def prior_precision(simulation: Simulation, nuisances: int) -> FloatArray:
         usual = np.array([effect.parameters[j].usual for j in effect.amounts])
         parts.append(1.0 / np.square((LARGEST if k >= nuisances else 1e4) * usual))
     return np.concatenate(parts) if parts else np.empty(0)
-
-
-def _cost(causes: Sequence[Effect]) -> float:
-    total = 0.0
-    for effect in causes:
-        for k in effect.amounts:
-            total += 0.5 * (effect.values[k] / (LARGEST * effect.parameters[k].usual)) ** 2
-    return float(total)
 
 
 def amount_columns(run: Simulated, effects: Sequence[Effect]) -> FloatArray:

@@ -9,8 +9,7 @@ import numpy as np
 from .fit import Fit
 from .observations import Observations
 
-# Factors by which the stated noise may be wrong.
-_FACTORS = np.geomspace(0.05, 20.0, 61)
+_FACTORS = np.geomspace(0.05, 20.0, 61)  # factors by which the stated noise may be wrong
 # Beyond this share of coordinates with more quantisation than noise, the residuals do not show the noise's shape.
 _MOSTLY_ROUNDING = 0.5
 

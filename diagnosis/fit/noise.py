@@ -12,8 +12,7 @@ from bodyschema.interfaces.records import FloatArray
 
 from .observations import Observations
 
-# Floor of the residuals, in units of the stated noise: numerical rounding.
-ROUNDED = 1e-9
+ROUNDED = 1e-9  # Floor of the residuals, in units of the stated noise: numerical rounding
 
 
 class _Settings:
@@ -37,18 +36,12 @@ class Noise:
     """A mixture: most fixes have the stated noise times `sigma`; a share of outliers lies anywhere.
 
     Outliers are scattered. Where many rows in a row are off, something has changed.
-
-    Attributes:
-        sigma: size of the noise, in units of the stated one.
-        share: share of outliers.
-        weights: probability of each fix to be the marker (n,).
-        log_likelihood: log-likelihood of all residuals [nats].
     """
 
-    sigma: float
-    share: float
-    weights: FloatArray
-    log_likelihood: float
+    sigma: float  # size of the noise, in units of the stated one
+    share: float  # share of outliers
+    weights: FloatArray  # probability of each fix to be the marker (n,)
+    log_likelihood: float  # log-likelihood of all residuals [nats]
 
     @classmethod
     def of(
@@ -92,11 +85,7 @@ class Noise:
 
 
 def correlation(left: FloatArray, begins: NDArray[np.bool_]) -> float:
-    """Return the correlation [0, 1) of residuals (n, 3) of neighbouring rows; 0 within two errors of white rows.
-
-    Args:
-        begins: (n,), True in the first row after each break.
-    """
+    """Return the correlation [0, 1) of residuals (n, 3) of neighbouring rows; 0 within two errors of white rows."""
     follows = ~begins[1:]
     agree = float((left[1:][follows] * left[:-1][follows]).sum())
     squares = float(np.square(left[1:][follows]).sum())

@@ -15,43 +15,28 @@ from bodyschema.recordings.recording import Recording
 
 IntArray = NDArray[np.intp]
 
-# Isotropic noise for recordings that state none; its size is estimated in any case [m].
-_UNIT_M = 1e-3
-# Outliers lie within this multiple of the spread of the measured positions.
-_OUTLIER_SPREAD = 2.0
-# Floor of a measured variance, as a share of the median one.
-_SMALLEST_VARIANCE = 1e-4
-# Shorter runs are single poses, not paths.
-_ROWS_A_RUN = 10
+_UNIT_M = 1e-3  # isotropic noise for recordings that state none; its size is estimated in any case [m]
+_OUTLIER_SPREAD = 2.0  # outliers lie within this multiple of the spread of the measured positions
+_SMALLEST_VARIANCE = 1e-4  # floor of a measured variance, as a share of the median one
+_ROWS_A_RUN = 10  # shorter runs are single poses, not paths
 # Closer readings are equal; minimum of distinct gaps to find a step; tolerance around its multiples.
 _SAME_READING, _FEWEST_GAPS, _OFF_A_MULTIPLE = 1e-9, 20, 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class Observations:
-    """Measured positions over a motion.
+    """Measured positions over a motion."""
 
-    Attributes:
-        motion: the encoder readings.
-        x: measured positions (n, 3) [m].
-        stated: covariance (n, 3, 3) [m²] of the instrument, known up to one factor.
-        rounding: covariance (n, 3, 3) [m²] from encoder quantisation.
-        stated_factor: factor of the instrument's standard deviations over the stated ones.
-        doubtful: rows (n,) at which the simulation lacks a state it needs; None for no such rows.
-        rattling: covariance (n, 3, 3) [m²] of a loose marker; None for one that is fixed.
-        play: displacement (n, 3) [m] of a loose marker that was taken out of `x`; 0 for none.
-        is_whole: True if no row is ignored, since each is predicted by its own readings alone.
-    """
-
-    motion: Motion
-    x: FloatArray
-    stated: FloatArray
-    rounding: FloatArray
-    stated_factor: float = 1.0
+    motion: Motion  # the encoder readings
+    x: FloatArray  # measured positions (n, 3) [m]
+    stated: FloatArray  # covariance (n, 3, 3) [m²] of the instrument, known up to one factor
+    rounding: FloatArray  # covariance (n, 3, 3) [m²] from encoder quantisation
+    stated_factor: float = 1.0  # factor of the instrument's standard deviations over the stated ones
+    # rows (n,) at which the simulation lacks a state it needs; None for no such rows
     doubtful: NDArray[np.bool_] | None = None
-    rattling: FloatArray | None = None
-    play: FloatArray | float = 0.0
-    is_whole: bool = False
+    rattling: FloatArray | None = None  # covariance (n, 3, 3) [m²] of a loose marker; None for one that is fixed
+    play: FloatArray | float = 0.0  # displacement (n, 3) [m] of a loose marker that was taken out of `x`; 0 for none
+    is_whole: bool = False  # True if no row is ignored, since each is predicted by its own readings alone
 
     @classmethod
     def of(cls, recording: Recording, simulation: Simulation) -> Observations:
@@ -106,7 +91,6 @@ class Observations:
         return replace(self, doubtful=None, rattling=None, is_whole=True)
 
     def with_factor(self, stated_factor: float) -> Observations:
-        """Return the same observations with another factor on the instrument's noise."""
         return replace(self, stated_factor=stated_factor)
 
     def __len__(self) -> int:

@@ -18,27 +18,18 @@ from bodyschema.interfaces.records import FloatArray
 from .fit import Fit
 from .noise import ROUNDED
 
-# Relative size below which a direction that all others can change is rounding error.
-_ROUNDED_OFF = 1e-9
+_ROUNDED_OFF = 1e-9  # relative size below which a direction that all others can change is rounding error
 
 
 @dataclass(frozen=True, eq=False)
 class System:
-    """Normal equations of m choices of k columns each.
+    """Normal equations of m choices of k columns each."""
 
-    Attributes:
-        inner: products (m, k, k), after projecting out the fitted parameters.
-        onto: products with the directions that the fitted amounts can change (m, k, r).
-        toward: products with the residuals (m, k, s), in each of the s places.
-        raw: squares (m, k) of the unprojected columns.
-        freed: directions (r, f) that are freed, in each of the places.
-    """
-
-    inner: FloatArray
-    onto: FloatArray
-    toward: FloatArray
-    raw: FloatArray
-    freed: Sequence[FloatArray]
+    inner: FloatArray  # products (m, k, k), after projecting out the fitted parameters
+    onto: FloatArray  # products with the directions that the fitted amounts can change (m, k, r)
+    toward: FloatArray  # products with the residuals (m, k, s), in each of the s places
+    raw: FloatArray  # squares (m, k) of the unprojected columns
+    freed: Sequence[FloatArray]  # directions (r, f) that are freed, in each of the places
 
     @classmethod
     def of(cls, inner: FloatArray, onto: FloatArray, toward: FloatArray, freed: Sequence[FloatArray]) -> System:
@@ -60,22 +51,19 @@ class Products:
 
     Args:
         besides: causes of the fit; each adds a place in which it is absent. The first place is the fit itself.
-
-    Attributes:
-        rows: number of fixes that are the marker.
-        squares: sum of squared residuals in each place.
     """
 
     def __init__(self, fit: Fit, besides: Sequence[Effect] = ()) -> None:
         self._fit = fit
         flat = fit.orthogonal.reshape(fit.left.size, -1)
-        self.rows = float(fit.noise.weights.sum())
+        self.rows = float(fit.noise.weights.sum())  # number of fixes that are the marker
         freed = [np.zeros((flat.shape[1], 0)), *(self._only_of(cause, flat) for cause in besides)]
         lefts = np.stack([fit.evident.ravel(), *(self._left_without(cause) for cause in besides)], axis=1)
         for place, free in enumerate(freed):
             seen = flat.T @ lefts[:, place]
             lefts[:, place] -= flat @ (seen - free @ (free.T @ seen))
         # The simulation's own output leaves no residuals except rounding.
+        # sum of squared residuals in each place
         self.squares = np.maximum(np.square(lefts).sum(axis=0), 3.0 * self.rows * ROUNDED**2)
         # Tested columns are not `unshared`, since their rows are scaled one by one; apply it twice to the rest instead.
         directions, shares = fit.absorbed
@@ -142,19 +130,12 @@ class Products:
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Contributions of each row to the normal equations of columns (n, 3, k).
+    """Contributions of each row to the normal equations of columns (n, 3, k)."""
 
-    Attributes:
-        inner: products with one another (n, k, k).
-        onto: products with the directions that the fitted amounts can change (n, k, r).
-        toward: products with the residuals (n, k, s), in each of the places.
-        freed: as in `System`.
-    """
-
-    inner: FloatArray
-    onto: FloatArray
-    toward: FloatArray
-    freed: Sequence[FloatArray]
+    inner: FloatArray  # products with one another (n, k, k)
+    onto: FloatArray  # products with the directions that the fitted amounts can change (n, k, r)
+    toward: FloatArray  # products with the residuals (n, k, s), in each of the places
+    freed: Sequence[FloatArray]  # as in `System`
 
     def scaled(self, factors: FloatArray) -> System:
         """Return the system of rows times factors (n, m)."""
@@ -188,5 +169,4 @@ class Rows:
 
 
 def _summed(factors: FloatArray, rows: FloatArray) -> FloatArray:
-    """Return sums (m, ...) of rows (n, ...) times factors (n, m)."""
     return (factors.T @ rows.reshape(len(rows), -1)).reshape(factors.shape[1], *rows.shape[1:])

@@ -14,8 +14,7 @@ from .fit import Fit
 # Move beyond which the readings' noise does not matter, in multiples of it: a backlash needs only the direction of the
 # move, other effects its size.
 _PLAY_FAR, _FAR = 4.0, 20.0
-# Largest evidence of one row for one memory effect over another [nats].
-_MOST_OF_A_ROW = 1.0
+_MOST_OF_A_ROW = 1.0  # largest evidence of one row for one memory effect over another [nats]
 
 
 def remembers(effect: Effect) -> bool:

@@ -18,29 +18,21 @@ from .background import Background
 _COLLINEAR = 1e-11
 # A column that keeps a smaller share of its squares beside the others is not identifiable: it is of their rounding.
 TOLD_APART = 1e-7
-# Relative size below which an eigenvalue of normal equations is rounding.
-_SINGULAR = 1e-12
+_SINGULAR = 1e-12  # relative size below which an eigenvalue of normal equations is rounding
 
 dpotrf, dpotrs = get_lapack_funcs(("potrf", "potrs"), dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
 class Tangent:
-    """Derivatives of the predictions about one fit, and their products with one another.
+    """Derivatives of the predictions about one fit, and their products with one another."""
 
-    Attributes:
-        effects: all effects of the fit.
-        columns: derivatives (3 n, k) by the amounts, periods and time constants of each effect, whitened.
-        background: changes that the tolerances allow.
-        weights: of the rows (n,) in the products.
-        normal: products (p, p) of the columns of all effects, then of the tolerances.
-    """
-
-    effects: tuple[Effect, ...]
+    effects: tuple[Effect, ...]  # all effects of the fit
+    # derivatives (3 n, k) by the amounts, periods and time constants of each effect, whitened
     columns: tuple[FloatArray, ...]
-    background: Background
-    weights: FloatArray
-    normal: FloatArray
+    background: Background  # changes that the tolerances allow
+    weights: FloatArray  # of the rows (n,) in the products
+    normal: FloatArray  # products (p, p) of the columns of all effects, then of the tolerances
 
     @classmethod
     def of(

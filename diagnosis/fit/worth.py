@@ -11,14 +11,11 @@ from bodyschema.interfaces.records import FloatArray
 
 # Signals that differ by less than this, twice the log-likelihood that the right one is expected to gain, are one.
 SAME = 6.0
-# Smallest evidence gain of a cause [nats].
-NAMED = 3.0
+NAMED = 3.0  # smallest evidence gain of a cause [nats]
 # Cost of each further joint with the same kind of error, which is often set in one session [nats].
 ANOTHER = 2.0
-# Minimum cost of a parameter [nats].
-_CHEAPEST = 1.5
-# Fixed-point rounds of `rise_for`.
-_ROUNDS = 30
+_CHEAPEST = 1.5  # minimum cost of a parameter [nats]
+_ROUNDS = 30  # fixed-point rounds of `rise_for`
 
 
 def nats(gain: float, dof: int) -> float:

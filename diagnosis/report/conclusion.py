@@ -13,7 +13,7 @@ from bodyschema.diagnosis.diagnosis import MOST_DOUBTFUL, Diagnosis
 from bodyschema.diagnosis.fit.background import ANGLE_RAD, DRIVE_RAD, LENGTH_M
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.worth import NAMED, nats
-from bodyschema.diagnosis.search.aliases import alias_sentences
+from bodyschema.diagnosis.search.drives import alias_sentences
 from bodyschema.diagnosis.search.scan import Candidate
 from bodyschema.diagnosis.search.together import is_at_limit
 from bodyschema.effects import Effect, Identity
@@ -46,12 +46,15 @@ _UNTESTED_WEIGHT = "sag, which was not tested: robot.toml says that the hand bor
 
 
 def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
-    """Return the machine-readable form of a diagnosis."""
     percent, interval = diagnosis.gain()
     # A tracker or a scanner has no intrinsics in robot.toml.
     seen_by = "instrument" if diagnosis.aligned.simulation.robot.calibration is None else "camera"
     causes = _causes(diagnosis, seen_by)
-    rms = _rms_mm(diagnosis)
+    kept = diagnosis.markers
+    figures = {name: 1e3 * float(np.sqrt(np.square(d[kept]).mean())) for name, d in diagnosis.held_out.items()}
+    traces = np.trace(diagnosis.noise[kept], axis1=1, axis2=2)
+    # Residuals of held-out rows contain all of the noise.
+    rms = Errors(**figures, noise_floor=min(1e3 * float(np.sqrt(traces.mean())), figures["extended"]))
     tolerances = _tolerances(diagnosis)
     verdict = _verdict(diagnosis, causes, percent, tolerances)
     counted = diagnosis.gain_with_outliers() if diagnosis.outliers else (None, None)
@@ -107,14 +110,6 @@ def _verdict(diagnosis: Diagnosis, causes: tuple[Cause, ...], gain_percent: floa
         return "undecided" if tolerances.leaves_open else "nothing_found"
     is_open = any(cause.leaves_open for cause in causes) or tolerances.leaves_open or gain_percent <= 0.0
     return "undecided" if is_open else "explained"
-
-
-def _rms_mm(diagnosis: Diagnosis) -> Errors:
-    kept = diagnosis.markers
-    figures = {name: 1e3 * float(np.sqrt(np.square(d[kept]).mean())) for name, d in diagnosis.held_out.items()}
-    traces = np.trace(diagnosis.noise[kept], axis1=1, axis2=2)
-    # Residuals of held-out rows contain all of the noise.
-    return Errors(**figures, noise_floor=min(1e3 * float(np.sqrt(traces.mean())), figures["extended"]))
 
 
 def _named_mm(diagnosis: Diagnosis) -> float | None:

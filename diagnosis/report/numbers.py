@@ -54,37 +54,26 @@ _LEAST_DIGITS, _MOST_DIGITS = 0, 6
 _UNTOLD = (("_rad", 0.5), ("_m", 0.1))
 # Parameters of time and shape rather than size.
 _SAYS_HOW = ("t0", "cycles", "phase", "time_constant", "length", "hold")
-# An interval whose halves differ by more than this share is written with both its ends.
-_LOPSIDED = 0.3
+_LOPSIDED = 0.3  # an interval whose halves differ by more than this share is written with both its ends
 
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """One formatted number of a cause.
+    """One formatted number of a cause."""
 
-    Attributes:
-        label: name of the quantity.
-        value, interval: with unit; the interval as a half width or as both ends, "" where there is none.
-        may_be_none: True if its interval contains zero.
-        is_told: True if the recording determines it.
-    """
-
-    label: str
+    label: str  # name of the quantity
+    # value, interval: with unit; the interval as a half width or as both ends, "" where there is none
     value: str
     interval: str
-    may_be_none: bool
-    is_told: bool = True
+    may_be_none: bool  # True if its interval contains zero
+    is_told: bool = True  # True if the recording determines it
 
     def __str__(self) -> str:
         return f"{self.value} {self.interval}".rstrip()
 
 
 def numbers_of(cause: Cause, *, timed: bool) -> list[Number]:
-    """Return the formatted numbers of a cause.
-
-    Args:
-        timed: True if the recording has times; otherwise a moment is a row number.
-    """
+    """Return the formatted numbers of a cause."""
     names = [name for name in cause.parameters if name not in _SAID_AGAIN or not _has_amplitude(cause)]
     return [number(name, cause.parameters[name], timed=timed) for name in names]
 
@@ -103,7 +92,6 @@ def telling(numbers: list[Number]) -> list[Number]:
 
 
 def number(name: str, interval: Interval, *, timed: bool = True) -> Number:
-    """Format one number with its interval."""
     factor, unit = _unit(name, timed)
     value, low, high = (factor * v for v in (interval.value, *interval.ci95))
     half = 0.5 * (high - low)
@@ -135,14 +123,12 @@ def place(what: Cause | Rejected) -> str:
 
 
 def chance(p: float) -> str:
-    """Format a p-value."""
     if p < 0.001:
         return "< 0.001"
     return "1" if p >= 0.995 else f"{p:.2g}"
 
 
 def percent(share: float) -> str:
-    """Format a probability, never as certain."""
     if share >= 0.995:
         return "> 99 %"
     return "< 1 %" if share < 0.005 else f"{100.0 * share:.0f} %"
@@ -154,7 +140,6 @@ def share(of_hundred: float) -> str:
 
 
 def mm(value: float | None) -> str:
-    """Format a length given in mm."""
     if value is None or not math.isfinite(value):
         return "–"
     return _fixed(value, 0 if value >= 100 else 1 if value >= 10 else 2 if value >= 0.1 else 3, "")

@@ -37,10 +37,8 @@ _VERDICTS: dict[Verdict, tuple[str, str]] = {
         "nothing on the robot because of them alone.",
     ),
 }
-# Maximum of outlier rows listed by number.
-_NAMED_ROWS = 40
-# Number of causes shown with their plots; further and small ones are collapsed.
-_OPEN = 4
+_NAMED_ROWS = 40  # maximum of outlier rows listed by number
+_OPEN = 4  # number of causes shown with their plots; further and small ones are collapsed
 
 
 @dataclass(frozen=True)

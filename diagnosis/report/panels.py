@@ -17,25 +17,17 @@ from .svg_plot import ASPECT, Layout, Plot, round_up, span
 
 @dataclass(frozen=True)
 class Panel:
-    """A plot with its title.
+    """A plot with its title."""
 
-    Attributes:
-        title: description of the plot.
-        svg: the plot.
-        tells: share of the variance before that depends on the plotted quantity.
-    """
-
-    title: str
-    svg: str
-    tells: float = 1.0
+    title: str  # description of the plot
+    svg: str  # the plot
+    tells: float = 1.0  # share of the variance before that depends on the plotted quantity
 
     @property
     def is_telling(self) -> bool:
-        """True if the plot shows a clear dependence."""
         return self.tells >= Layout.telling
 
     def html(self) -> str:
-        """Return the plot with its title."""
         return f"<figure><figcaption>{escape(self.title)}</figcaption>{self.svg}</figure>"
 
 
@@ -179,7 +171,6 @@ def _cell_means(cells: NDArray[np.intp], at: FloatArray, error: FloatArray) -> F
 
 
 def histogram(residuals: Residuals) -> Panel:
-    """Plot lengths of the errors before and after, beside those of noise alone."""
     before, after = (1e3 * np.linalg.norm(e[residuals.rows], axis=1) for e in (residuals.before, residuals.after))
     noise = 1e3 * _noise(residuals)
     end = float(np.quantile(np.concatenate([before, after]), Layout.shown)) or 1.0

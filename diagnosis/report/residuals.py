@@ -14,13 +14,11 @@ from bodyschema.effects import Effect, Simulation
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
 
-# Maximum of points in a plot, and of arrows in a projection.
-POINTS, ARROWS = 450, 220
+POINTS, ARROWS = 450, 220  # maximum of points in a plot, and of arrows in a projection
 # A joint's rows count if it moves the marker by this share of its median effect.
 _TELLS = 0.5
 _BINS, _FEWEST_IN_A_BIN = 16, 8
-# A larger p-value counts as chance.
-SIGNIFICANT = 1e-3
+SIGNIFICANT = 1e-3  # a larger p-value counts as chance
 
 
 @dataclass(frozen=True)
@@ -44,12 +42,10 @@ class Residuals:
 
     @cached_property
     def before(self) -> FloatArray:
-        """Errors of the aligned simulation."""
         return self.diagnosis.errors["aligned"]
 
     @cached_property
     def after(self) -> FloatArray:
-        """Errors of the extended simulation."""
         return self.diagnosis.errors["extended"]
 
     def some(self, count: int, rows: NDArray[np.intp] | None = None) -> NDArray[np.intp]:
@@ -61,12 +57,10 @@ class Residuals:
 
     @property
     def calibration(self) -> StereoCalibration | None:
-        """Calibration of the stereo pair."""
         return self.robot.calibration
 
     @property
     def timed(self) -> bool:
-        """True if the recording has times."""
         return self.motion.t is not None
 
     @cached_property
@@ -76,11 +70,9 @@ class Residuals:
 
     @property
     def clock_label(self) -> str:
-        """Axis label of the clock."""
         return "time [s]" if self.timed else "row"
 
     def slides(self, joint: int) -> bool:
-        """Return True if a joint is prismatic."""
         return bool(self.robot.chain.prismatic[joint])
 
     def angles(self, joint: int) -> FloatArray:
@@ -145,7 +137,6 @@ class Residuals:
 
 
 def binned(x: FloatArray, y: FloatArray) -> Bins:
-    """Return means of y in bins of x."""
     member = _members(x)
     count = np.bincount(member).astype(np.float64)
     mean_x, mean_y = np.bincount(member, x) / count, np.bincount(member, y) / count

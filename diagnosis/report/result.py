@@ -6,12 +6,9 @@ from typing import Literal
 
 import msgspec
 
-# A cause with less weight [%] is told last and leaves the verdict as it is.
-SMALL = 5.0
-# A less probable cause leaves the verdict open, and is to be confirmed first.
-SURE = 0.9
-# Fixes that are not the marker, as a cause.
-OUTLIERS = "outliers"
+SMALL = 5.0  # a cause with less weight [%] is told last and leaves the verdict as it is
+SURE = 0.9  # a less probable cause leaves the verdict open, and is to be confirmed first
+OUTLIERS = "outliers"  # fixes that are not the marker, as a cause
 # Probability of what is no more probable than not.
 EVEN = 0.5
 Verdict = Literal["explained", "nothing_found", "undecided", "unexplained"]
@@ -25,54 +22,39 @@ class Interval(msgspec.Struct, frozen=True):
 
 
 class Gain(msgspec.Struct, frozen=True, rename={"from_": "from"}):
-    """Reduction of the RMS on held-out rows, relative to the aligned simulation [%].
-
-    Attributes:
-        ci95: its 95 % interval on new poses: of another recording of the same kind, half as long.
-        with_outliers_percent, with_outliers_ci95: the same if the fixes that are not the marker are counted; null where
-            there are none.
-    """
+    """Reduction of the RMS on held-out rows, relative to the aligned simulation [%]."""
 
     held_out_percent: float
-    ci95: tuple[float, float]
+    ci95: tuple[float, float]  # its 95 % interval on new poses: of another recording of the same kind, half as long
     from_: str = "aligned"
+    # with_outliers_percent, with_outliers_ci95: the same if the fixes that are not the marker are counted; null where
+    # there are none
     with_outliers_percent: float | None = None
     with_outliers_ci95: tuple[float, float] | None = None
 
 
 class Indistinguishable(msgspec.Struct, frozen=True):
-    """A rival of a cause.
+    """A rival of a cause."""
 
-    Attributes:
-        effect: its name; "unexplained" where it has none.
-        by: "this_motion" where another motion would separate them, "any_motion" where none would.
-        probability: probability of this rival.
-        what: description, where it has no name.
-    """
-
-    effect: str
+    effect: str  # its name; "unexplained" where it has none
     where: str | None
     source: str | None
+    # "this_motion" where another motion would separate them, "any_motion" where none would
     by: Literal["this_motion", "any_motion"]
-    probability: float
-    what: str = ""
+    probability: float  # probability of this rival
+    what: str = ""  # description, where it has no name
 
 
 class Cause(msgspec.Struct, frozen=True):
-    """One cause with its numbers.
-
-    Attributes:
-        share_of_gain_percent: share of the explained squared error, tolerances included.
-        held_out_gain_percent: rise of the held-out RMS without it, all else refitted.
-    """
+    """One cause with its numbers."""
 
     effect: str
     where: str | None
     source: str | None
     parameters: dict[str, Interval]
     probability: float
-    share_of_gain_percent: float
-    held_out_gain_percent: float
+    share_of_gain_percent: float  # share of the explained squared error, tolerances included
+    held_out_gain_percent: float  # rise of the held-out RMS without it, all else refitted
     indistinguishable_from: tuple[Indistinguishable, ...]
     rivals: tuple[Indistinguishable, ...]
     evidence: str
@@ -104,64 +86,46 @@ class Cause(msgspec.Struct, frozen=True):
 
 
 class Rejected(msgspec.Struct, frozen=True):
-    """A hypothesis that was tested and rejected.
-
-    Attributes:
-        held_out_gain_percent: gain on top of the causes.
-        p_value: p-value of no gain, corrected for all hypotheses tried.
-        why: reason for rejection despite a small p-value; empty where chance suffices.
-    """
+    """A hypothesis that was tested and rejected."""
 
     effect: str
     where: str | None
     source: str | None
-    held_out_gain_percent: float
-    p_value: float
-    why: str = ""
+    held_out_gain_percent: float  # gain on top of the causes
+    p_value: float  # p-value of no gain, corrected for all hypotheses tried
+    why: str = ""  # reason for rejection despite a small p-value; empty where chance suffices
 
 
 class Unexplained(msgspec.Struct, frozen=True):
-    """Structure that no effect fits: its size, the joints it depends on (`time` among them), and its p-value.
-
-    Attributes:
-        what: descriptions of the erring part and its dependence; the joints are also in `depends_on`.
-        model_joints: joints whose readings are inputs of the smooth model in extended.toml.
-        not_in_model: parts of `what` that change with time and cannot be in that model.
-    """
+    """Structure that no effect fits: its size, the joints it depends on (`time` among them), and its p-value."""
 
     rms_mm: float
     depends_on: tuple[str, ...]
     p_value: float
+    # descriptions of the erring part and its dependence; the joints are also in `depends_on`
     what: tuple[str, ...] = ()
-    model_joints: tuple[str, ...] = ()
-    not_in_model: tuple[str, ...] = ()
+    model_joints: tuple[str, ...] = ()  # joints whose readings are inputs of the smooth model in extended.toml
+    not_in_model: tuple[str, ...] = ()  # parts of `what` that change with time and cannot be in that model
 
 
 class Tolerances(msgspec.Struct, frozen=True):
     """Manufacturing tolerances of the arm without the causes found: 1-sigma, each with its 95 % interval.
 
     A lower end of 0 means that the recording does not show them: they are no larger than the upper end.
-
-    Attributes:
-        length_mm: tolerance of the positions of links.
-        angle_deg: tolerance of axes and joint offsets.
-        drive_deg: RMS of a drive's periodic error over a turn.
-        links_share_percent, drives_share_percent: shares of the gain of links and axes, and of drives.
-        in_extended: False where extended.toml leaves them out, since it would not surely be better elsewhere.
-        rivals: causes that may be there instead of tolerances several times a workshop's, the most probable first.
     """
 
-    length_mm: Interval
-    angle_deg: Interval
-    drive_deg: Interval
+    length_mm: Interval  # tolerance of the positions of links
+    angle_deg: Interval  # tolerance of axes and joint offsets
+    drive_deg: Interval  # RMS of a drive's periodic error over a turn
+    # links_share_percent, drives_share_percent: shares of the gain of links and axes, and of drives
     links_share_percent: float = 0.0
     drives_share_percent: float = 0.0
-    in_extended: bool = True
+    in_extended: bool = True  # False where extended.toml leaves them out, since it would not surely be better elsewhere
+    # causes that may be there instead of tolerances several times a workshop's, the most probable first
     rivals: tuple[Indistinguishable, ...] = ()
 
     @property
     def share_percent(self) -> float:
-        """Share of the gain of all tolerances together."""
         return self.links_share_percent + self.drives_share_percent
 
     @property
@@ -189,12 +153,7 @@ class Errors(msgspec.Struct, frozen=True):
 
 
 class DiagnosisFile(msgspec.Struct, frozen=True):
-    """The contents of `diagnosis.json`.
-
-    Attributes:
-        seen_by: the kind of measuring device: a camera, or an instrument such as a laser tracker.
-        weighed: True if the URDF states masses; otherwise compliances are those of links of 1 kg per metre.
-    """
+    """The contents of `diagnosis.json`."""
 
     verdict: Verdict
     sentence: str
@@ -208,6 +167,7 @@ class DiagnosisFile(msgspec.Struct, frozen=True):
     advice: tuple[str, ...]
     limitations: tuple[str, ...]
     tolerances: Tolerances | None = None
+    # the kind of measuring device: a camera, or an instrument such as a laser tracker
     seen_by: Literal["camera", "instrument"] = "camera"
-    weighed: bool = True
+    weighed: bool = True  # True if the URDF states masses; otherwise compliances are those of links of 1 kg per metre
     schema: int = 2

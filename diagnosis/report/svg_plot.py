@@ -25,8 +25,7 @@ class Layout:
     # Histogram: columns, the quantile of the errors at which it ends, and noise samples per row.
     most_columns, fewest_columns, pairs_a_column, shown, drawn = 48, 12, 12, 0.99, 20
     side, margin = 300, 26  # of a view with arrows
-    # Arrow length as a share of the largest span, for the given quantile of the errors before.
-    long, shorter = 0.1, 0.9
+    long, shorter = 0.1, 0.9  # arrow length as a share of the largest span, for the given quantile of the errors before
 
 
 ASPECT = (Layout.right - Layout.left) / (Layout.bottom - Layout.top)
@@ -34,21 +33,16 @@ ASPECT = (Layout.right - Layout.left) / (Layout.bottom - Layout.top)
 
 @dataclass(frozen=True)
 class Plot:
-    """Axes: x is linear, y is linear or logarithmic.
+    """Axes: x is linear, y is linear or logarithmic."""
 
-    Attributes:
-        x_label, y_label: with units.
-        x, y: their ranges; from high to low where the axis runs the other way.
-        names: labels for whole numbers on the x axis, instead of figures.
-        log_y: True for a logarithmic y axis; its range is positive.
-    """
-
+    # x_label, y_label: with units
     x_label: str
     y_label: str
+    # x, y: their ranges; from high to low where the axis runs the other way
     x: tuple[float, float]
     y: tuple[float, float]
-    names: Sequence[str] = ()
-    log_y: bool = False
+    names: Sequence[str] = ()  # labels for whole numbers on the x axis, instead of figures
+    log_y: bool = False  # True for a logarithmic y axis; its range is positive
 
     def svg(self, *marks: str) -> str:
         """Return the plot with marks, the first at the back."""
@@ -60,17 +54,14 @@ class Plot:
         return f'<svg viewBox="{size}" role="img" aria-label="{label}">{self._grid()}{inside}</svg>'
 
     def dots(self, x: FloatArray, y: FloatArray, look: str) -> str:
-        """Draw the points inside the axes, as one path to keep the file small."""
         return f'<path class="dots {look}" d="{self._points(x, y)}"/>'
 
     def line(self, x: FloatArray, y: FloatArray, look: str) -> str:
-        """Draw a curve through points in their order."""
         left, top = self._at(x, y)
         points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(left, top, strict=True))
         return f'<polyline class="line {look}" points="{points}"/>'
 
     def bars(self, x: FloatArray, y: FloatArray, half: FloatArray, look: str) -> str:
-        """Draw means with their 95 % intervals."""
         left, top = self._at(x, y)
         _, upper = self._at(x, y + half)
         _, lower = self._at(x, y - half)
@@ -81,14 +72,12 @@ class Plot:
         return f'<path class="bars {look}" d="{path}"/><path class="means {look}" d="{middle}"/>'
 
     def area(self, x: FloatArray, y: FloatArray, look: str) -> str:
-        """Fill the area down to the x axis."""
         left, top = self._at(x, y)
         points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(left, top, strict=True))
         bottom = Layout.bottom
         return f'<polygon class="area {look}" points="{left[0]:.1f},{bottom} {points} {left[-1]:.1f},{bottom}"/>'
 
     def arrows(self, x: FloatArray, y: FloatArray, dx: FloatArray, dy: FloatArray, look: str) -> str:
-        """Draw arrows from their feet."""
         left, top = self._at(x, y)
         right, end = self._at(x + dx, y + dy)
         path = "".join(
@@ -97,7 +86,6 @@ class Plot:
         return f'<path class="arrows {look}" d="{path}"/><path class="feet {look}" d="{self._points(x, y)}"/>'
 
     def moment(self, x: float, text: str) -> str:
-        """Draw a labelled vertical line."""
         (left, _), top = self._at(np.array([x]), np.array([self.y[0]])), Layout.top
         side = "end" if x > 0.5 * sum(self.x) else "start"
         shift = -4 if side == "end" else 4
@@ -145,7 +133,6 @@ class Plot:
 
 
 def ticks(low: float, high: float) -> list[float]:
-    """Return round figures in a range."""
     step = round_up((high - low) / Layout.ticks)
     first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
     return [k * step for k in range(first, last + 1)]

@@ -10,8 +10,7 @@ from bodyschema.diagnosis.report.presenters.registry import rival_named
 from bodyschema.diagnosis.report.result import Cause, DiagnosisFile, Indistinguishable, Rejected
 from bodyschema.diagnosis.report.text import in_order, other_shares
 
-# Rows to omit where they equal another.
-_SAME_AS = {"aligned": "nominal", "extended": "aligned"}
+_SAME_AS = {"aligned": "nominal", "extended": "aligned"}  # rows to omit where they equal another
 # Number of rejected hypotheses shown at first.
 NEAREST = 12
 _ERRORS = (
@@ -24,7 +23,6 @@ _ERRORS = (
 
 
 def errors(diagnosis: DiagnosisFile) -> str:
-    """Return a table of RMS and mean of each simulation."""
     rms, mean = diagnosis.rms_mm, diagnosis.mean_mm
     longest = max(value for name, _ in _ERRORS[1:] if (value := getattr(rms, name)) is not None) or 1.0
     rows = []

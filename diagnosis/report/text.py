@@ -190,7 +190,6 @@ def _head(causes: Sequence[Cause], tolerances: Tolerances | None, seen_by: str, 
 
 
 def _shows(tolerances: Tolerances | None) -> bool:
-    """Return True if small errors everywhere have more than a small share of the gain."""
     return tolerances is not None and tolerances.share_percent >= SMALL
 
 
@@ -202,7 +201,6 @@ def _or(cause: Cause, seen_by: str) -> str:
 
 
 def _or_a_cause(tolerances: Tolerances | None, seen_by: str) -> str:
-    """Return the most probable cause that may be there in the place of large tolerances, in parentheses."""
     if tolerances is None or not tolerances.leaves_open:
         return ""
     rival = tolerances.rivals[0]
@@ -240,7 +238,6 @@ def made_to(tolerances: Tolerances, seen_by: str) -> str:
 
 
 def _instead(tolerances: Tolerances, seen_by: str) -> str:
-    """Return a sentence on what may be there in the place of large tolerances."""
     told = [f"{rival_named(rival, seen_by)} ({100.0 * rival.probability:.0f} %)" for rival in tolerances.rivals]
     if not told:
         return ""
@@ -285,7 +282,6 @@ def modelled(left: Unexplained) -> str:
 
 
 def evidence(standing: Standing, seen_by: str) -> str:
-    """Return the evidence for a cause in one sentence."""
     text = (
         f"Without it the fit is worse by Δχ² = {standing.gain:.0f} for {standing.dof} number{'s' * (standing.dof > 1)}"
     )
@@ -296,7 +292,6 @@ def evidence(standing: Standing, seen_by: str) -> str:
 
 
 def called(cause: Effect | UnnamedAlternative, seen_by: str) -> str:
-    """Return a cause or an alternative without a name in a few words."""
     return named(*cause.key, seen_by) if isinstance(cause, Effect) else cause.what
 
 

@@ -41,15 +41,10 @@ FEWEST_ROWS_A_BLOCK = 5
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """Assignment of rows to blocks of time.
+    """Assignment of rows to blocks of time."""
 
-    Attributes:
-        of_row: the block of each row (n,).
-        count: number of blocks.
-    """
-
-    of_row: IntArray
-    count: int
+    of_row: IntArray  # the block of each row (n,)
+    count: int  # number of blocks
 
     @classmethod
     def cut(cls, rows: int, most: int = _Settings.most_blocks) -> Blocks:
@@ -114,15 +109,10 @@ def gain_percent(before: FloatArray, after: FloatArray, blocks: Blocks, seed: in
 
 @dataclass(frozen=True, slots=True)
 class Added:
-    """Gain of one more hypothesis on held-out data.
+    """Gain of one more hypothesis on held-out data."""
 
-    Attributes:
-        held_out_gain_percent: reduction of the squared error on held-out rows.
-        p_value: p-value of no gain, from the agreement of blocks, for this hypothesis alone.
-    """
-
-    held_out_gain_percent: float
-    p_value: float
+    held_out_gain_percent: float  # reduction of the squared error on held-out rows
+    p_value: float  # p-value of no gain, from the agreement of blocks, for this hypothesis alone
 
 
 def added(fit: Fit, candidates: Sequence[Candidate], blocks: Blocks) -> list[Added]:
@@ -149,22 +139,16 @@ def held_out_square(fit: Fit, columns: FloatArray, precision: FloatArray, blocks
 
 @dataclass(frozen=True, eq=False)
 class _Products:
-    """Products of columns with one another and with the residuals of a fit, fold by fold.
+    """Products of columns with one another and with the residuals of a fit, fold by fold."""
 
-    Attributes:
-        inner, toward: (folds, p, p) and (folds, p).
-        square: sum of squares of all residuals.
-        variance: noise variance, in units of the stated one.
-    """
-
+    # inner, toward: (folds, p, p) and (folds, p)
     inner: FloatArray
     toward: FloatArray
-    square: float
-    variance: float
+    square: float  # sum of squares of all residuals
+    variance: float  # noise variance, in units of the stated one
 
     @classmethod
     def of(cls, fit: Fit, columns: FloatArray, blocks: Blocks) -> _Products:
-        """Form the products of columns (n, 3, p)."""
         rows = []
         for fold in range(_Settings.folds):
             own = np.flatnonzero(blocks.fold == fold)
@@ -214,7 +198,6 @@ def beside_fit(fit: Fit, columns: FloatArray) -> FloatArray:
 
 
 def _p_value(fit: Fit, beside: FloatArray, blocks: Blocks) -> float:
-    """Return the `block_p_value` of columns from what they change beside the fit (n, 3, k)."""
     flat = beside.reshape(fit.left.size, -1)
     inner = flat.T @ flat
     scales = np.sqrt(np.maximum(np.diag(inner), 1e-300))

@@ -17,15 +17,10 @@ _FEWEST_ROWS = 20
 
 @dataclass(frozen=True, eq=False)
 class Hypotheses:
-    """The effects to test, and the reasons why others are left out.
+    """The effects to test, and the reasons why others are left out."""
 
-    Attributes:
-        effects: one of each kind and place, with zero amounts.
-        limitations: reasons why some were left out, a sentence each.
-    """
-
-    effects: tuple[Effect, ...]
-    limitations: tuple[str, ...]
+    effects: tuple[Effect, ...]  # one of each kind and place, with zero amounts
+    limitations: tuple[str, ...]  # reasons why some were left out, a sentence each
 
     @classmethod
     def of(

@@ -48,21 +48,13 @@ _Tried = tuple[int, FloatArray, FloatArray, int]
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A hypothesis with its best first-order fit.
+    """A hypothesis with its best first-order fit."""
 
-    Attributes:
-        effect: with the amounts of the linear fit, and the moment or period found.
-        gain: Δχ².
-        dof: number of its amounts that the data determine.
-        trials: number of moments, periods or choices of its numbers tried.
-        interval: 95 % interval of the moment; None for an effect that has none.
-    """
-
-    effect: Effect
-    gain: float
-    dof: int
-    trials: float = 1
-    interval: tuple[float, float] | None = None
+    effect: Effect  # with the amounts of the linear fit, and the moment or period found
+    gain: float  # Δχ²
+    dof: int  # number of its amounts that the data determine
+    trials: float = 1  # number of moments, periods or choices of its numbers tried
+    interval: tuple[float, float] | None = None  # 95 % interval of the moment; None for an effect that has none
 
 
 class Scan:
@@ -124,7 +116,7 @@ class Scan:
                 gains, amounts, dofs = self._solved(self._linear(effect), effect)
                 if not dofs[0]:
                     return None
-                return Candidate(_with_amounts(effect, amounts[0]), float(gains[0]), int(dofs[0]), choices(effect))
+                return Candidate(effect.with_amounts(amounts[0]), float(gains[0]), int(dofs[0]), choices(effect))
 
     def _in_parts(self, effect: Effect) -> Candidate | None:
         """Return an effect with those of its amounts free that are worth their number; None if none is identifiable."""
@@ -144,7 +136,7 @@ class Scan:
         if not np.isfinite(worths[best]):
             return None
         freed = effect.freeing(tuple(np.array(effect.amounts)[chosen[best]].tolist()))
-        found = _with_amounts(freed, amounts[best][chosen[best]])
+        found = freed.with_amounts(amounts[best][chosen[best]])
         return Candidate(found, float(gains[best]), int(dofs[best]), choices(found))
 
     def in_full(self, candidate: Candidate) -> Candidate:
@@ -200,7 +192,6 @@ class Scan:
         return Candidate(effect.with_values(values), float(gains[best]), int(dofs[best]), trials)
 
     def _each(self, effect: Effect, shapes: FloatArray) -> System:
-        """Return the system of each shape (m,), which scales the same columns row by row."""
         run = self._fit.run
         if not isinstance(effect.kind, EncoderEffect):
             constant = np.broadcast_to(np.eye(3), (len(run.motion), 3, 3))
@@ -283,7 +274,6 @@ class Scan:
         return self._best(self._products.kept(begun, lambda: self._rippled(effect, cycles)), effect)
 
     def _rippled(self, effect: Effect, cycles: FloatArray) -> System:
-        """Return the system of equally spaced numbers of cycles (m,)."""
         place = self._fit.simulation.place(effect)
         angle = self._fit.run.readings.q[:, place.joint] * (2.0 * np.pi if place.prismatic else 1.0)
         # Compute exp(i cycles angle), each from the one before.
@@ -318,12 +308,12 @@ class Scan:
             gains = np.append(gains, closer)[first]
         clock = self._fit.observations.motion.clock
         values = np.append(amounts, 0.5 * (clock[row - 1] + clock[row]))
-        interval = _interval(0.5 * (clock[tried - 1] + clock[tried]), gains)
+        shapes = 0.5 * (clock[tried - 1] + clock[tried])
+        near = np.flatnonzero(gains > gains.max() - float(chdtri(1, 0.05)))
+        interval = float(shapes[near[0]]), float(shapes[near[-1]])
         return Candidate(effect.with_values(values), float(gains.max()), dof, n - 2 * _Settings.beside, interval)
 
     def _linear(self, effect: Effect) -> System:
-        """Return the system of an effect that has amounts only."""
-
         def linear() -> System:
             encoder = effect.kind
             if not isinstance(encoder, EncoderEffect):
@@ -340,14 +330,12 @@ class Scan:
         return float(self._solved(self._products.of(columns), effect)[0][0])
 
     def _solved(self, system: System, effect: Effect) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return gains (m,), amounts (m, k) and degrees of freedom (m,) of m systems."""
         inner, gradient, raw = system.at(self._state)
         gains, amounts = self._gains(inner, gradient, effect)
         dofs = self._dofs(inner, raw, effect)
         return np.where(dofs > 0, gains, 0.0), amounts, dofs
 
     def _best(self, system: System, effect: Effect) -> _Tried:
-        """Return the index of the best of many systems, gains (m,), its amounts (k,) and degrees of freedom."""
         inner, gradient, raw = system.at(self._state)
         gains, amounts = self._gains(inner, gradient, effect)
         best = int(np.argmax(gains))
@@ -360,7 +348,6 @@ class Scan:
         return best, gains, amounts[best], dof
 
     def _gains(self, inner: FloatArray, gradient: FloatArray, effect: Effect) -> tuple[FloatArray, FloatArray]:
-        """Return gains (m,) and amounts (m, k)."""
         sigma2, unit = self._fit.noise.sigma**2, _units(effect)
         scaled = inner * unit[:, None] * unit
         if len(unit) == 1:
@@ -373,7 +360,6 @@ class Scan:
         return -3.0 * self._products.rows * np.log1p(-explained / square), amounts
 
     def _dofs(self, inner: FloatArray, raw: FloatArray, effect: Effect) -> FloatArray:
-        """Return degrees of freedom (m,)."""
         unit = _units(effect)
         shares = _eigenvalues(inner / np.sqrt(np.maximum(raw[:, :, None] * raw[:, None, :], 1e-300)))
         told = _eigenvalues(inner * unit[:, None] * unit) > 10.0 * self._fit.noise.sigma**2
@@ -393,7 +379,6 @@ def moment_again(fit: Fit, cause: Effect, doubted: NDArray[np.bool_]) -> Candida
 
 @cache
 def _subsets(count: int) -> NDArray[np.bool_]:
-    """Return all sets of some of `count` amounts (m, count)."""
     chosen = (np.arange(1, 2**count)[:, None] >> np.arange(count)) & 1
     return np.asarray(chosen, dtype=np.bool_)
 
@@ -404,21 +389,8 @@ def _units(effect: Effect) -> FloatArray:
 
 
 def _eigenvalues(matrices: FloatArray) -> FloatArray:
-    """Return the eigenvalues (m, k) of symmetric matrices (m, k, k), in increasing order."""
     values = matrices[:, 0] if matrices.shape[1] == 1 else np.linalg.eigvalsh(matrices)
     return np.asarray(values, dtype=np.float64)
-
-
-def _interval(shapes: FloatArray, gains: FloatArray) -> tuple[float, float]:
-    """Return the first and the last of the shapes (m,) within the 95 % drop of the best gain."""
-    near = np.flatnonzero(gains > gains.max() - float(chdtri(1, 0.05)))
-    return float(shapes[near[0]]), float(shapes[near[-1]])
-
-
-def _with_amounts(effect: Effect, amounts: FloatArray) -> Effect:
-    values = effect.values.copy()
-    values[effect.amounts] = amounts
-    return effect.with_values(values)
 
 
 def _most_gain(tried: tuple[_Tried, FloatArray]) -> float:

@@ -155,14 +155,11 @@ class Search:
     Args:
         hypotheses: the possible causes.
         tell: called with short messages on progress.
-
-    Attributes:
-        multiplicity: penalty for the number of hypotheses [nats].
     """
 
     def __init__(self, hypotheses: Sequence[Effect], tell: Callable[[str], None]) -> None:
         self._hypotheses, self._tell = hypotheses, tell
-        self.multiplicity = float(np.log(max(len(hypotheses), 1)))
+        self.multiplicity = float(np.log(max(len(hypotheses), 1)))  # penalty for the number of hypotheses [nats]
         self._trials: dict[Key, float] = {}
         self._known: tuple[Fit | None, Scan | None, dict[Identity, Beside]] = (None, None, {})
         # Lead of each cause when it was last reviewed, the log-likelihood then, and the observations [nats].
@@ -259,7 +256,9 @@ class Search:
         """Return the multiplicity penalty for the number of places searched, beside other causes [nats]."""
         self._trials[candidate.effect.key] = candidate.trials
         others = list(beside)
-        first = self.multiplicity - float(np.log(1 + _names(others)))
+        zeros = [cause for cause in others if cause.kind.is_zero]
+        # All joint offsets together have one name.
+        first = self.multiplicity - float(np.log(1 + len(others) - max(len(zeros) - 1, 0)))
         is_another = candidate.effect.kind.is_zero and any(one.kind.is_zero for one in others)
         return (min(first, ANOTHER) if is_another else first) + float(np.log(candidate.trials))
 
@@ -386,7 +385,6 @@ class Search:
 
 
 def _near_moment(fit: Fit, cause: Effect) -> NDArray[np.bool_]:
-    """Return the rows (n,) near the moment at which a cause begins."""
     row = int(np.searchsorted(fit.observations.motion.clock, cause.values[-1]))
     return np.abs(np.arange(len(fit.left)) + 0.5 - row) < _Settings.near_a_moment
 
@@ -441,12 +439,6 @@ def are_a_description(causes: Sequence[Effect]) -> bool:
 def simplicity(effect: Effect) -> int:
     """Return a complexity score; of equally probable causes the one with the lowest is named."""
     return len(effect.amounts) + len(effect.shapes) + (_Settings.of_a_link if effect.kind.in_parts else 0)
-
-
-def _names(causes: Sequence[Effect]) -> int:
-    """Return the number of names among causes; all joint offsets together have one."""
-    zeros = [cause for cause in causes if cause.kind.is_zero]
-    return len(causes) - max(len(zeros) - 1, 0)
 
 
 def describe(effect: Effect) -> str:

@@ -29,26 +29,21 @@ from .search import Key
 
 # Rounds for scales and noise, from afar and beside a similar set; stop when their logarithms change by less.
 _ROUNDS, _ROUNDS_NEAR, STILL = 25, 8, 0.02
-# Limit of a step in the logarithms.
-_FARTHEST = 1.0
-# Lower limit of the noise as a share of that of the fit.
-_QUIETEST = 1e-3
-# Number of the most promising moves that are tried with their own scales.
-_TRIED = 4
+_FARTHEST = 1.0  # limit of a step in the logarithms
+_QUIETEST = 1e-3  # lower limit of the noise as a share of that of the fit
+_TRIED = 4  # number of the most promising moves that are tried with their own scales
 # Logarithms of the sizes, in usual ones, with which a pose is tried before its own is fitted.
 _SIZES = (0.0, -2.0, -4.0)
 # Prior width of what robot.toml does not know, about the fit, in usual sizes; the same in all fits, to compare them.
 _FREE = 100.0
 # Relative rounding of squares, and of columns that are collinear up to rounding.
 _ROUNDED_OFF, _ONE_BEYOND_ROUNDING = 1e-13, 1e-8
-# Evidence loss without a scale's tolerances from which they show in the data [nats].
-_SHOWN = 3.0
+_SHOWN = 3.0  # evidence loss without a scale's tolerances from which they show in the data [nats]
 # Loss of evidence that rules a scale out with 95 % (a likelihood ratio on one side), and the step of logarithms tried.
 _RULED_OUT, _FINER = 1.35, 0.2
 # Maximum of changes to a set of causes, and of its causes for more to be added: beyond, the first order is not enough.
 _MOST_MOVES, _MOST_TOGETHER = 60, 8
-# Margin to the best within which a set is refitted, and a change tried [nats].
-COMES_NEAR = 15.0
+COMES_NEAR = 15.0  # margin to the best within which a set is refitted, and a change tried [nats]
 
 _LOG_SMALLEST, _LOG_MOST, SCALES = math.log(SMALLEST), math.log(MOST), len(Scales())
 
@@ -61,31 +56,18 @@ _Solution = tuple[FloatArray, FloatArray, FloatArray]
 
 @dataclass(frozen=True, eq=False)
 class Together:
-    """A set of causes with its evidence.
+    """A set of causes with its evidence."""
 
-    Attributes:
-        chosen: indices of its candidates.
-        worth: its evidence less the cost of naming its causes [nats]; comparable only with that of other sets.
-        scales: scales of the tolerances.
-        logs: logarithms of these scales, then of the sizes of poses in usual ones.
-        group: the index (p,) in `logs` of each column's prior width; -1 where it is 1.
-        sigma: size of the noise, in units of the stated one.
-        spent: effective number of data that determine each scale (4,).
-        amounts: amounts of all its columns (p,).
-        factor: lower Cholesky factor (p, p) of their precision; what is above its diagonal has no meaning.
-        columns: indices of its columns (p,).
-    """
-
-    chosen: tuple[int, ...]
-    worth: float
-    scales: Scales
-    logs: FloatArray
-    group: NDArray[np.int64]
-    sigma: float
-    spent: FloatArray
-    amounts: FloatArray
-    factor: FloatArray
-    columns: NDArray[np.intp]
+    chosen: tuple[int, ...]  # indices of its candidates
+    worth: float  # its evidence less the cost of naming its causes [nats]; comparable only with that of other sets
+    scales: Scales  # scales of the tolerances
+    logs: FloatArray  # logarithms of these scales, then of the sizes of poses in usual ones
+    group: NDArray[np.int64]  # the index (p,) in `logs` of each column's prior width; -1 where it is 1
+    sigma: float  # size of the noise, in units of the stated one
+    spent: FloatArray  # effective number of data that determine each scale (4,)
+    amounts: FloatArray  # amounts of all its columns (p,)
+    factor: FloatArray  # lower Cholesky factor (p, p) of their precision; what is above its diagonal has no meaning
+    columns: NDArray[np.intp]  # indices of its columns (p,)
 
     @cached_property
     def covariance(self) -> FloatArray:
@@ -212,7 +194,7 @@ class Sets:
                 return seen[frozenset(here.chosen)]
             seen[frozenset(here.chosen)] = here
             better = self._without_one(here)
-            if better is None and self._count(here) < _MOST_TOGETHER:
+            if better is None and len({self.effects[k].identity for k in here.chosen}) < _MOST_TOGETHER:
                 better = self._with_one_more(here) or self._exchanged(here) or self._with_smaller_tolerances(here)
             if better is None:
                 return here
@@ -220,7 +202,6 @@ class Sets:
         return here
 
     def _without_one(self, here: Together) -> Together | None:
-        """Remove one cause or a part of one, where that is more probable."""
         present = frozenset(here.chosen)
         groups = [group for group in self._groups if present.issuperset(group)]
         losses = self._losses(here, groups)
@@ -236,7 +217,6 @@ class Sets:
         return _better([self.of((*here.chosen, *group), here) for group in more[:_TRIED]], here)
 
     def _exchanged(self, here: Together) -> Together | None:
-        """Exchange one cause for another, where that is more probable."""
         tried = []
         for identity in dict.fromkeys(self.effects[k].identity for k in here.chosen):
             own = tuple(k for k in here.chosen if self.effects[k].identity == identity)
@@ -270,10 +250,6 @@ class Sets:
                 best[key] = max(best.get(key, one), one, key=lambda tried: tried.worth)
         yield from ((self.effects[self._keys.index(key)], one) for key, one in best.items())
 
-    def _count(self, here: Together) -> int:
-        """Return the number of causes of a set."""
-        return len({self.effects[k].identity for k in here.chosen})
-
     def _losses(self, here: Together, groups: Sequence[tuple[int, ...]]) -> FloatArray:
         """Return the worth of each of some groups of numbers with scales and noise held fixed [nats]."""
         own = [np.searchsorted(here.columns, self._places_of(group)) for group in groups]
@@ -283,7 +259,6 @@ class Sets:
         return squares + volumes - self._costs_of(here.chosen, groups, are_in=True)
 
     def _cost(self, chosen: Sequence[int]) -> float:
-        """Return the cost of naming the causes of a set [nats]."""
         total, kinds = 0.0, set[EffectType]()
         numbers: Counter[Key] = Counter()
         for k in chosen:
@@ -470,7 +445,6 @@ class Sets:
         return factor, variances, dpotrs(factor, toward / sigma**2, lower=True)[0]
 
     def causes(self, here: Together) -> list[Effect]:
-        """Return the causes of a set, with their amounts."""
         found: dict[Identity, Effect] = {}
         for k in here.chosen:
             effect, places = self.effects[k], self._places[k]
@@ -483,7 +457,6 @@ class Sets:
 
 
 def _usual(effects: Sequence[Effect]) -> FloatArray:
-    """Return the usual sizes of the amounts of effects (p,)."""
     return np.array([effect.parameters[k].usual for effect in effects for k in effect.amounts])
 
 

@@ -26,27 +26,19 @@ from .scan import Candidate, Scan
 from .search import Key
 from .sets import COMES_NEAR, SCALES, STILL, Sets, Together
 
-# Maximum of refitted sets.
-_MOST_REFITTED = 8
+_MOST_REFITTED = 8  # maximum of refitted sets
 # Tolerances may stand for a cause of which they leave less than this share of the squares; a third is left of a jump.
 _FOLLOWED = 0.1
 
 
 @dataclass(frozen=True, eq=False)
 class Tolerated:
-    """Estimated sizes of the tolerances.
+    """Estimated sizes of the tolerances."""
 
-    Attributes:
-        scales: the most probable ones.
-        unsure: standard deviations of their logarithms (4,).
-        seen: True for scales that show in the data (4,).
-        most: the largest ones (4,) that the data do not rule out with 95 %; of use where they do not show.
-    """
-
-    scales: Scales
-    unsure: FloatArray
-    seen: NDArray[np.bool_]
-    most: FloatArray
+    scales: Scales  # the most probable ones
+    unsure: FloatArray  # standard deviations of their logarithms (4,)
+    seen: NDArray[np.bool_]  # True for scales that show in the data (4,)
+    most: FloatArray  # the largest ones (4,) that the data do not rule out with 95 %; of use where they do not show
 
 
 def together(start: Fit, hypotheses: Sequence[Effect], tell: Callable[[str], None] = lambda _: None) -> Fit:
@@ -106,7 +98,6 @@ def in_place_of_tolerances(fit: Fit, hypotheses: Sequence[Effect]) -> list[tuple
 
 
 def tolerated(fit: Fit) -> Tolerated:
-    """Return the scales of tolerances with the most evidence beside the causes of a fit."""
     if fit.background.scales is None:
         unseen = np.zeros(SCALES, dtype=np.bool_)
         return Tolerated(Scales(), np.full(SCALES, SPREAD), unseen, np.full(SCALES, MOST))
@@ -158,7 +149,7 @@ class _Place:
     def __init__(self, fit: Fit, hypotheses: Sequence[Effect], others: Sequence[_Place]) -> None:
         self.fit = fit
         self._doubt = float(np.log(max(len(hypotheses), 1)))
-        self._sets = _sets_about(fit, hypotheses, self._doubt)
+        self._sets = _sets_of(fit, [_at_rest(one) for one in _beside_links(fit, _absent(fit, hypotheses))], self._doubt)
         own = self._sets.again(fit.causes)
         self.here = self._sets.of(own)
         if self.here.worth > max((place.here.worth for place in others), default=-np.inf) + COMES_NEAR:
@@ -201,7 +192,6 @@ class _Place:
         return best if best is not None and self._worth(best) > self.here.worth + STILL else None
 
     def numbers_of(self, one: Together) -> list[Effect]:
-        """Return the causes of a set, those of which some numbers may be free once for each."""
         return [self._sets.effects[k] for k in one.chosen]
 
     def refitted(self, one: Together) -> Fit:
@@ -218,32 +208,17 @@ class _Place:
         return max(fits, key=self._worth)
 
     def _worth(self, fit: Fit) -> float:
-        """Return the evidence of a fit's own causes less the cost of naming them [nats]."""
         return _own(fit, self._doubt).worth
 
 
 def _own(fit: Fit, doubt: float) -> Together:
-    """Return the set of a fit's own causes.
-
-    Args:
-        doubt: minimum cost of naming one of them [nats].
-    """
+    """Return the set of a fit's own causes."""
     parts = [part for cause in fit.causes for part in _in_parts(Candidate(cause, 0.0, 1))]
     sets = Sets(fit, parts, doubt)
     return sets.of(sets.again(fit.causes))
 
 
-def _sets_about(fit: Fit, hypotheses: Sequence[Effect], doubt: float) -> Sets:
-    """Return the sets of a fit's causes and of the hypotheses that are none.
-
-    Args:
-        doubt: minimum cost of naming one of them [nats].
-    """
-    return _sets_of(fit, [_at_rest(one) for one in _beside_links(fit, _absent(fit, hypotheses))], doubt)
-
-
 def _sets_of(fit: Fit, candidates: Sequence[Candidate], doubt: float) -> Sets:
-    """Return the sets of a fit's causes and of some candidates."""
     everything = [*(Candidate(cause, 0.0, 1) for cause in fit.causes), *candidates]
     return Sets(fit, [part for candidate in everything for part in _in_parts(candidate)], doubt)
 
@@ -280,9 +255,6 @@ def _in_parts(candidate: Candidate) -> list[Candidate]:
 
 def _at_rest(candidate: Candidate) -> Candidate:
     """Return the candidate at zero amounts, where it is linear in them."""
-    effect = candidate.effect
-    if not effect.kind.is_linear:
+    if not candidate.effect.kind.is_linear:
         return candidate
-    values = effect.values.copy()
-    values[effect.amounts] = 0.0
-    return Candidate(effect.with_values(values), candidate.gain, candidate.dof, candidate.trials)
+    return Candidate(candidate.effect.with_amounts(0.0), candidate.gain, candidate.dof, candidate.trials)

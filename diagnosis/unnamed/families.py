@@ -37,32 +37,22 @@ Columns = Callable[[Simulated], FloatArray]
 
 @dataclass(frozen=True, eq=False)
 class Family:
-    """One family of smooth errors.
+    """One family of smooth errors."""
 
-    Attributes:
-        what: short description.
-        kind: the erring part: a joint, a body (a link, the tool, the camera), the place in the image, or the clock.
-        joint: the erring joint, or the joint after the erring link; None where there is no single joint.
-        drivers: the one or two joints on which alone it depends; empty for other families.
-        over_time: True if it depends on time.
-        moves: displacements (n, 3, a) [m] per unit of each motion.
-        amounts: functions (n, b) that it may depend on; each motion is a linear combination of them.
-        ties: instead, each motion is proportional to its own amount (b = a), by factors that are these mixtures (a, p)
-            of the parameters; None for free functions.
-        is_specific: True if it is as specific as a named effect.
-        undone: function from measured positions (n, 3) and parameters (p,) to the positions (n, 3) without it; None
-            where subtracting the linear columns is exact.
-    """
-
-    what: str
+    what: str  # short description
+    # the erring part: a joint, a body (a link, the tool, the camera), the place in the image, or the clock
     kind: Literal["joint", "body", "place", "clock"]
-    joint: int | None
-    drivers: tuple[int, ...]
-    over_time: bool
-    moves: Columns
-    amounts: Columns
+    joint: int | None  # the erring joint, or the joint after the erring link; None where there is no single joint
+    drivers: tuple[int, ...]  # the one or two joints on which alone it depends; empty for other families
+    over_time: bool  # True if it depends on time
+    moves: Columns  # displacements (n, 3, a) [m] per unit of each motion
+    amounts: Columns  # functions (n, b) that it may depend on; each motion is a linear combination of them
+    # instead, each motion is proportional to its own amount (b = a), by factors that are these mixtures (a, p) of the
+    # parameters; None for free functions
     ties: FloatArray | None = None
-    is_specific: bool = False
+    is_specific: bool = False  # True if it is as specific as a named effect
+    # function from measured positions (n, 3) and parameters (p,) to the positions (n, 3) without it; None where
+    # subtracting the linear columns is exact
     undone: Callable[[FloatArray, FloatArray], FloatArray] | None = None
 
     def columns(self, run: Simulated) -> FloatArray:
@@ -332,3 +322,55 @@ def _one(run: Simulated) -> FloatArray:
 def _with_one(amounts: FloatArray) -> FloatArray:
     """Add a constant: a part of the error that depends on nothing belongs to the same cause."""
     return np.concatenate([np.ones((len(amounts), 1)), amounts], axis=1)
+
+
+_SHOWS = 0.05  # smallest share of the variance at which an error counts as depending on a joint
+# Limit of extrapolation beyond the observed range, as a share of it.
+_BEYOND = 0.1
+_SEED = 0
+
+
+def joints_of(family: Family, numbers: FloatArray, run: Simulated) -> frozenset[int]:
+    """Return the joints that err or on which the error depends, by their indices in q.
+
+    Args:
+        numbers: parameters of the family (p,).
+    """
+    own = frozenset[int]() if family.joint is None else frozenset({family.joint})
+    if family.over_time:
+        return own
+    return own | frozenset(np.flatnonzero(shares(family, numbers, run) >= _SHOWS).tolist())
+
+
+def shares(family: Family, numbers: FloatArray, run: Simulated) -> FloatArray:
+    """Return the share of the error's variance due to each joint, the others given (d,).
+
+    It is half the mean square change when only this joint is taken from another row (Jansen 1999).
+
+    Args:
+        numbers: parameters of the family (p,).
+    """
+    rng = np.random.default_rng(_SEED)
+    amounts, moves = family.amounts(run), family.moves(run)
+    low, high = amounts.min(axis=0), amounts.max(axis=0)
+    margin = _BEYOND * (high - low) + 1e-12
+    by = family.moved_by(run, numbers)
+    # Keep each row's directions fixed: the leverage of a joint on the marker does not count.
+    lengths = np.einsum("nia,nib->nab", moves, moves)
+    variance = _square(lengths, by - by.mean(axis=0))
+    found = np.zeros(run.motion.q.shape[1])
+    for k in range(len(found)):
+        q = run.motion.q.copy()
+        q[:, k] = rng.permutation(q[:, k])
+        other = run.simulation.run(replace(run.motion, q=q))
+        there = family.amounts(other)
+        seen = ((there >= low - margin) & (there <= high + margin)).all(axis=1)
+        change = (family.moved_by(other, numbers) - by)[seen]
+        if seen.any():
+            found[k] = 0.5 * _square(lengths[seen], change) / max(variance, 1e-300)
+    return found
+
+
+def _square(lengths: FloatArray, by: FloatArray) -> float:
+    """Return the mean square displacement by moves (n, a) [m²]; `lengths` (n, a, a) are their products."""
+    return float(np.einsum("na,nab,nb->n", by, lengths, by).mean())

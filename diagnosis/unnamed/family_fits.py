@@ -26,8 +26,7 @@ from bodyschema.interfaces.records import FloatArray
 from .families import Family, families
 from .low_rank import low_rank, numbers_of
 
-# Prior penalty of a family as specific as a named effect [nats].
-SPECIFIC = 5.0
+SPECIFIC = 5.0  # prior penalty of a family as specific as a named effect [nats]
 
 
 class _Settings:
@@ -49,21 +48,13 @@ class _Settings:
 
 @dataclass(frozen=True, eq=False)
 class Way:
-    """A family, or a part of one, prepared for fits of the same observations.
+    """A family, or a part of one, prepared for fits of the same observations."""
 
-    Attributes:
-        family: the family.
-        moved: displacements (n, 3, m), whitened; many are scaled to about unit length, a single one is shared.
-        functions: functions (n, a) of each motion, scaled so that their columns have about unit length.
-        scales: lengths of the columns (p,): those of the motions times those of the functions.
-        choice: number of further parameters spent on choosing the part.
-    """
-
-    family: Family
-    moved: FloatArray
-    functions: FloatArray
-    scales: FloatArray
-    choice: int = 0
+    family: Family  # the family
+    moved: FloatArray  # displacements (n, 3, m), whitened; many are scaled to about unit length, a single one is shared
+    functions: FloatArray  # functions (n, a) of each motion, scaled so that their columns have about unit length
+    scales: FloatArray  # lengths of the columns (p,): those of the motions times those of the functions
+    choice: int = 0  # number of further parameters spent on choosing the part
 
     @classmethod
     def of(cls, family: Family, start: Fit, moved: FloatArray | None = None) -> Way:
@@ -119,7 +110,6 @@ class Way:
 
     @property
     def moves(self) -> int:
-        """Number of motions."""
         return self.moved.shape[2]
 
     @property
@@ -139,21 +129,13 @@ class Way:
 
 @dataclass(frozen=True, eq=False)
 class Apart:
-    """A fit of the causes to the observations after removing the unnamed errors.
+    """A fit of the causes to the observations after removing the unnamed errors."""
 
-    Attributes:
-        observations: the complete observations.
-        chosen: the unnamed families.
-        numbers: parameters of each of them (p,).
-        fit: the fit of the causes.
-        precision: prior precision of these parameters, in units in which their columns have unit length.
-    """
-
-    observations: Observations
-    chosen: tuple[Way, ...]
-    numbers: tuple[FloatArray, ...]
-    fit: Fit
-    precision: float
+    observations: Observations  # the complete observations
+    chosen: tuple[Way, ...]  # the unnamed families
+    numbers: tuple[FloatArray, ...]  # parameters of each of them (p,)
+    fit: Fit  # the fit of the causes
+    precision: float  # prior precision of these parameters, in units in which their columns have unit length
 
     @property
     def predicted(self) -> FloatArray:
@@ -183,7 +165,6 @@ class UnnamedFamilies:
         self._apart: WeakKeyDictionary[Noise, dict[tuple[Way, ...], Apart]] = WeakKeyDictionary()
 
     def _way(self, k: int) -> Way:
-        """Return a family, prepared on first use."""
         if k not in self._prepared:
             family = self._families[k]
             joint = family.joint if family.kind == "joint" else None
@@ -192,13 +173,11 @@ class UnnamedFamilies:
 
     @cached_property
     def _by_joint(self) -> list[FloatArray]:
-        """Displacements (n, 3, 1) by each joint, whitened."""
         moved = self._start.observations.whitened(self._run.by_joint)
         return [moved[:, :, [k]] for k in range(moved.shape[2])]
 
     @property
     def count(self) -> int:
-        """Number of families."""
         return len(self._families)
 
     def again(self, ways: Sequence[Way]) -> tuple[Way, ...]:

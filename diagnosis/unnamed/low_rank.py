@@ -7,10 +7,8 @@ import numpy as np
 from bodyschema.diagnosis.fit.fit import solved
 from bodyschema.interfaces.records import FloatArray
 
-# Maximum of alternating rounds; stop when the explained sum rises by less.
-_ROUNDS, _ENOUGH = 12, 0.1
-# Ridge, relative to columns of unit length.
-_RIDGE = 1e-7
+_ROUNDS, _ENOUGH = 12, 0.1  # maximum of alternating rounds; stop when the explained sum rises by less
+_RIDGE = 1e-7  # ridge, relative to columns of unit length
 
 
 def numbers_of(moves: int, amounts: int, rank: int) -> int:

@@ -35,30 +35,20 @@ class _Settings:
 
 @dataclass(frozen=True, eq=False)
 class Rattle:
-    """A loose marker.
+    """A loose marker."""
 
-    Attributes:
-        half_m: half of its play [m].
-        ratio: variance along the play over the variance across it, less one.
-        axis: direction of the play in the marker's link (3,).
-        ways: the same at each row (n, 3), in the measurement frame.
-        sides: mean of the side, -1 or 1, on which the marker lies at each row (n,).
-        likelihood: log-likelihood of the residuals with two sides, less the cost of the tolerances beside it,
-            comparable with `likelihood` of a fit [nats].
-        is_clear: True if the sides are surely two, and farther apart than noise of any shape.
-    """
-
-    half_m: float
-    ratio: float
-    axis: FloatArray
-    ways: FloatArray
-    sides: FloatArray
+    half_m: float  # half of its play [m]
+    ratio: float  # variance along the play over the variance across it, less one
+    axis: FloatArray  # direction of the play in the marker's link (3,)
+    ways: FloatArray  # the same at each row (n, 3), in the measurement frame
+    sides: FloatArray  # mean of the side, -1 or 1, on which the marker lies at each row (n,)
+    # log-likelihood of the residuals with two sides, less the cost of the tolerances beside it, comparable with
+    # `likelihood` of a fit [nats]
     likelihood: float
-    is_clear: bool = True
+    is_clear: bool = True  # True if the sides are surely two, and farther apart than noise of any shape
 
     @property
     def what(self) -> str:
-        """Short description."""
         return f"the marker is loose on the hand, by ±{1e3 * self.half_m:.2g} mm"
 
     def ways_of(self, fit: Fit) -> FloatArray:

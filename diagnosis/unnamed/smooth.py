@@ -37,35 +37,23 @@ class _Settings:
     left_out, too_far_off = 0.02, 0.5  # tolerance of a stored model, and its largest error, in units of the noise
 
 
-# Harmonics of one joint's angle, and of each of two joints' angles.
-_HARMONICS = {1: 14, 2: 4}
+_HARMONICS = {1: 14, 2: 4}  # harmonics of one joint's angle, and of each of two joints' angles
 
 
 @dataclass(frozen=True, eq=False)
 class SmoothModel:
-    """Smooth functions of families, fitted to the residuals of the causes.
+    """Smooth functions of families, fitted to the residuals of the causes."""
 
-    Attributes:
-        fit: the causes beside the stored part, which is in its simulation.
-        stored: the learnt model; None where everything changes with time or no lasting part remains.
-        explained: prediction of the functions at the rows (n, 3) [m].
-        unstored: the time-dependent part of it, which is not in the fit's simulation.
-        unseen: change of each row's prediction by the stored simulation due to that row being fitted (n, 3) [m].
-    """
-
-    fit: Fit
-    stored: Unexplained | None
-    explained: FloatArray
-    unstored: FloatArray
+    fit: Fit  # the causes beside the stored part, which is in its simulation
+    stored: Unexplained | None  # the learnt model; None where everything changes with time or no lasting part remains
+    explained: FloatArray  # prediction of the functions at the rows (n, 3) [m]
+    unstored: FloatArray  # the time-dependent part of it, which is not in the fit's simulation
+    # change of each row's prediction by the stored simulation due to that row being fitted (n, 3) [m]
     unseen: FloatArray
 
 
 def smooth_model(alone: Fit, apart: Apart, families: Sequence[Family], blocks: Blocks) -> SmoothModel:
-    """Learn the families' functions beside the causes of a fit.
-
-    Args:
-        apart: the same causes beside the families.
-    """
+    """Learn the families' functions beside the causes of a fit."""
     said = apart.predicted - alone.predicted
     lasting = [family for family in families if not family.over_time]
     # All families of image position share the same functions, so one stands for all.
@@ -106,7 +94,6 @@ def _learnt(
 
 
 def _noise_m(fit: Fit) -> float:
-    """Return the RMS length of the noise [m]."""
     roots = np.linalg.inv(fit.observations.whitening)
     return fit.noise.sigma * float(np.sqrt(np.square(roots).sum(axis=(1, 2)).mean()))
 
@@ -141,7 +128,6 @@ class _Functions:
 
     @cached_property
     def columns(self) -> FloatArray:
-        """Functions at the rows of the fit (n, 3, p)."""
         return self._at(self.given) / self._scales
 
     def stored(self, amounts: FloatArray, tolerance_m: float) -> tuple[Unexplained, float]:
@@ -260,7 +246,6 @@ class _Amounts:
 
     @property
     def of_functions(self) -> FloatArray:
-        """Amounts of the functions that last (p,)."""
         return self._all[self._causes :][: self._lasting]
 
     @property
@@ -293,7 +278,6 @@ class _Amounts:
         return more
 
     def _missed(self, size: float) -> float:
-        """Return the sum of squares left on held-out rows."""
         total = 0.0
         for k, (inner, toward, square) in enumerate(self._products):
             amounts = self._solved(size, without=k)

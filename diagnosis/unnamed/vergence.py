@@ -8,10 +8,8 @@ from scipy.spatial.transform import Rotation
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
 
-# Step for numerical derivatives [rad].
-_STEP = 1e-5
-# Fixed-point iterations to invert the distortion.
-_ROUNDS = 8
+_STEP = 1e-5  # step for numerical derivatives [rad]
+_ROUNDS = 8  # fixed-point iterations to invert the distortion
 
 
 def reported(x: FloatArray, calibration: StereoCalibration, turn: FloatArray) -> FloatArray:

@@ -14,8 +14,7 @@ from bodyschema.effects.motion import Motion
 from bodyschema.effects.parameter import Parameter, Place
 from bodyschema.interfaces.records import FloatArray, frozen_array
 
-# Widths tried [rad, m].
-WIDTHS = np.geomspace(2e-4, 0.15, 14)
+WIDTHS = np.geomspace(2e-4, 0.15, 14)  # widths tried [rad, m]
 
 
 class Backlash(EncoderEffect):

@@ -8,8 +8,7 @@ from bodyschema.effects.effect_type import Effect, SimulationRun, TimeEffect
 from bodyschema.effects.parameter import Parameter
 from bodyschema.interfaces.records import FloatArray
 
-# Step of the numerical derivative [s].
-_STEP_S = 1e-5
+_STEP_S = 1e-5  # step of the numerical derivative [s]
 
 
 class CameraLatency(TimeEffect):

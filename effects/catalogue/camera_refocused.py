@@ -10,8 +10,7 @@ from bodyschema.effects.parameter import T0, Parameter
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
 
-# An autofocus hunts: it jumps again and again, where what is bumped or slips does so once or twice.
-_MOST_MOMENTS = 12
+_MOST_MOMENTS = 12  # An autofocus hunts: it jumps again and again, where what is bumped or slips does so once or twice
 
 
 class CameraRefocused(CameraEffect):

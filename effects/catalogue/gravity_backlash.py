@@ -14,8 +14,7 @@ from bodyschema.interfaces.records import FloatArray
 
 # Uncertainty factor of the friction, and the smallest relative load that counts.
 _FRICTION_WITHIN, _UPRIGHT = 2.0, 0.02
-# Frictions tried, as shares of the largest load.
-_HOLDS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35)
+_HOLDS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35)  # frictions tried, as shares of the largest load
 
 
 class GravityBacklash(StructureEffect):

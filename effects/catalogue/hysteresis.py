@@ -16,10 +16,8 @@ from bodyschema.interfaces.records import FloatArray, frozen_array
 
 from .backlash import WIDTHS
 
-# Lengths tried [rad, m].
-_LENGTHS = np.geomspace(5e-4, 0.3, 14)
-# After this many lengths, only the last direction determines the strain.
-_STRAINED = 3.0
+_LENGTHS = np.geomspace(5e-4, 0.3, 14)  # lengths tried [rad, m]
+_STRAINED = 3.0  # after this many lengths, only the last direction determines the strain
 
 
 class Hysteresis(EncoderEffect):

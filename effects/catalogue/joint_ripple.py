@@ -11,10 +11,8 @@ from bodyschema.effects.motion import Motion
 from bodyschema.effects.parameter import Parameter, Place
 from bodyschema.interfaces.records import FloatArray
 
-# Largest step of the phase over the joint's range [rad].
-_OF_A_PEAK = 0.5
-# At once per turn it would be an eccentricity.
-_FEWEST_CYCLES = 1.5
+_OF_A_PEAK = 0.5  # largest step of the phase over the joint's range [rad]
+_FEWEST_CYCLES = 1.5  # at once per turn it would be an eccentricity
 
 
 class JointRipple(EncoderEffect):

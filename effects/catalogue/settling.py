@@ -17,8 +17,7 @@ from bodyschema.interfaces.records import FloatArray, frozen_array
 
 # Shares of a lag that remain at the next reading: those tried, the largest step, and the largest.
 _MEMORIES, _OF_A_MEMORY, _LONGEST_MEMORY = np.linspace(0.0, 0.9, 19), 0.1, 0.95
-# The joint is at rest when this share of its initial lag remains.
-_AT_REST = 0.05
+_AT_REST = 0.05  # the joint is at rest when this share of its initial lag remains
 
 
 class Settling(EncoderEffect):

@@ -10,10 +10,8 @@ from bodyschema.effects.motion import Motion
 from bodyschema.effects.parameter import Parameter, shifts
 from bodyschema.interfaces.records import FloatArray
 
-# A drift that ends within a smaller share of the recording is an offset from the beginning.
-_SHORTEST = 0.03
-# Time constants tried, as shares of the recording's duration.
-_TIME_CONSTANTS = np.geomspace(_SHORTEST, 4.0, 24)
+_SHORTEST = 0.03  # a drift that ends within a smaller share of the recording is an offset from the beginning
+_TIME_CONSTANTS = np.geomspace(_SHORTEST, 4.0, 24)  # time constants tried, as shares of the recording's duration
 
 
 class ThermalDrift(TimeEffect):

@@ -42,7 +42,6 @@ def sentences(left_out: Iterable[LeftOut]) -> list[str]:
 
 
 def numbers(effect: Effect) -> str:
-    """Return the values of an effect with their names, in readable form."""
     return ", ".join(f"{p.name} = {value:.4g}" for p, value in zip(effect.parameters, effect.values, strict=True))
 
 
@@ -59,7 +58,6 @@ class ArmErrors:
 
     @classmethod
     def of(cls, simulation: Simulation) -> Self:
-        """Sort the effects of a simulation."""
         stayed = simulation.after_moments
         joints = {joint: JointErrors() for joint in simulation.robot.joints}
         payloads: list[PointMass] = []
@@ -89,14 +87,12 @@ class ArmErrors:
 
 
 def residual_note(simulation: Simulation) -> list[str]:
-    """Return a sentence on the unexplained part, if there is one."""
     if simulation.residual is None:
         return []
     return ["not in the file: [unexplained]: a learnt map of the readings has no counterpart there"]
 
 
 def moment_notes(simulation: Simulation) -> Iterator[str]:
-    """Yield a sentence on each effect that began at a moment and stays."""
     for effect in simulation.all_effects:
         if effect.kind.stays_as is not None:
             at = "" if effect.where is None else f" at {effect.where}"
@@ -111,7 +107,6 @@ def geometry_of(simulation: Simulation) -> CalibratedGeometry:
 
 
 def geometry_without_zeros(simulation: Simulation) -> CalibratedGeometry:
-    """Return the geometry without joint offsets."""
     own, background = (
         [effect for effect in effects if not effect.kind.is_zero]
         for effects in (simulation.effects, simulation.background)

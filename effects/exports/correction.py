@@ -23,8 +23,7 @@ from bodyschema.robot.urdf import inverse
 from .arm_errors import BORNE_BY_HAND, LeftOut, moment_notes, residual_note, sentences
 
 FORMAT = "bodyschema correction 3"
-# Registers that every file has: 0 is the number of joints, 1 of registers.
-PACE, POSE, ANGLES = 2, 3, 15
+PACE, POSE, ANGLES = 2, 3, 15  # Registers that every file has: 0 is the number of joints, 1 of registers
 # Steps by number; from OUTWARDS on for one row, two, three.
 ADD, ADD_THREE, WAVE, MEMORY, TORQUE, SIDE, INWARDS, OUTWARDS = range(8)
 OUTWARDS_THREE = OUTWARDS + 2
@@ -91,14 +90,11 @@ def write_correction(
 
 
 class _Program:
-    """Registers and the steps that fill them, as docs/exporting.md describes them.
-
-    Attributes:
-        angles: register of each joint's true angle, as far as the steps have come.
-    """
+    """Registers and the steps that fill them, as docs/exporting.md describes them."""
 
     def __init__(self, joints: int) -> None:
         self.readings = range(ANGLES + joints, ANGLES + 2 * joints)
+        # register of each joint's true angle, as far as the steps have come
         self.angles = list(range(ANGLES, ANGLES + joints))
         self._registers = [0.0] * self.readings.stop
         self._steps: list[tuple[int, int, int, int, int]] = []
@@ -276,5 +272,4 @@ def _onto_z(axis: FloatArray) -> FloatArray:
 
 
 def _numbers(T: FloatArray) -> list[float]:
-    """Return the upper three rows of a pose, row by row."""
     return T[:3].ravel().tolist()

@@ -24,8 +24,7 @@ from kbmaps.rotations import quaternions
 _MESHES = (".stl", ".obj", ".msh")
 _MOST_TRIANGLES = 200_000
 _STL_HEADER, _STL_TRIANGLE = 84, 50
-# A link without a shape becomes a rod from its joint to the next one [m].
-_ROD_RADIUS, _SHORTEST_ROD = 0.02, 0.01
+_ROD_RADIUS, _SHORTEST_ROD = 0.02, 0.01  # a link without a shape becomes a rod from its joint to the next one [m]
 # Floor of a moment of inertia [kg·m²]; MuJoCo needs a positive one.
 LEAST_INERTIA = 1e-9
 _GREY = "0.7 0.7 0.72 1"
@@ -104,7 +103,6 @@ def placed(T: FloatArray) -> dict[str, str]:
 
 
 def texts(values: FloatArray) -> str:
-    """Return numbers as an attribute, exactly."""
     return " ".join(map(repr, (np.atleast_1d(values) + 0.0).tolist()))  # no minus before a zero
 
 
@@ -118,21 +116,16 @@ def _blamed_on(element: Any, urdf: Path) -> Iterator[None]:
         raise RobotError(what, file=urdf, line=element.sourceline, remedy="Give numbers") from None
 
 
-def _origin(element: Any) -> FloatArray:
-    """Return the pose (4, 4) of an element's <origin>."""
-    origin, T = element.find("origin"), np.eye(4)
-    if origin is not None:
-        T[:3, :3] = rotation_of(_floats(origin.get("rpy", "0 0 0")))
-        T[:3, 3] = _floats(origin.get("xyz", "0 0 0"))
-    return T
-
-
 def _inertia(inertial: Any) -> FloatArray:
     """Return the inertia tensor (3, 3) along the link's axes, corrected to be physically possible."""
     element = inertial.find("inertia")
     xx, yy, zz, xy, xz, yz = (float(element.get(key, "0")) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
     moments, axes = np.linalg.eigh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    R = _origin(inertial)[:3, :3] @ axes
+    origin, T = inertial.find("origin"), np.eye(4)
+    if origin is not None:
+        T[:3, :3] = rotation_of(_floats(origin.get("rpy", "0 0 0")))
+        T[:3, 3] = _floats(origin.get("xyz", "0 0 0"))
+    R = T[:3, :3] @ axes
     return R @ np.diag(np.maximum(moments, LEAST_INERTIA)) @ R.T
 
 

@@ -107,7 +107,6 @@ class _Document:
 
     @property
     def told(self) -> list[str]:
-        """Sentences on what is not in the file, or in another form."""
         told = self._errors.told()
         if self._parts.unreadable:
             some = ", ".join(self._parts.unreadable[:3]) + (", ..." if len(self._parts.unreadable) > 3 else "")
@@ -180,7 +179,6 @@ class _Document:
                 self._link(body, joint.child, standing(joint, False, held), None)
 
     def _payloads(self, body: Any) -> None:
-        """Add the masses that the URDF lacks, as points."""
         for count, payload in enumerate(self._errors.payloads):
             held = self._add(body, "body", name=f"{self._robot.robot.marker_link}_payload_{count}")
             centre, inertia = texts(payload.centre), texts(np.full(3, LEAST_INERTIA))
@@ -354,7 +352,6 @@ class _Document:
         return total
 
     def _keep_left_out(self) -> None:
-        """Store the numbers of effects that the file cannot hold, for programs that know them."""
         for count, left_out in enumerate(self._errors.left_out):
             effect = left_out.effect
             name = f"{'_'.join(filter(None, effect.key))}_{count}"

@@ -13,7 +13,9 @@ from kbmaps.arrays import BoolArray, FloatArray, evenly_spread, frozen, numbers,
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.parameters import ChainParameters, ChainTolerances
 from kbmaps.errors import DegenerateDataError, SettingError, ShapeError
-from kbmaps.robust import MEDIAN_NORM, ROUNDING_M, UNCALIBRATED_SIGMAS
+from kbmaps.maps.kbmap import POSITION_OUTPUTS, KBMap
+from kbmaps.pairs import checked_pairs
+from kbmaps.robust import ROUNDING_M, UNCALIBRATED_SIGMAS, middle_sigma
 from kbmaps.rotations import cross_matrix, exponentials, nearest_rotation, rotation_vector
 
 
@@ -23,8 +25,7 @@ class _Settings:
     step_tolerance: float = 1e-12
     # Starting points are only compared: the best one is fitted again, to the tolerance above.
     trial_tolerance: float = 1e-5
-    # This many evenly spread pairs suffice to place the arm.
-    placed: int = 64
+    placed: int = 64  # this many evenly spread pairs suffice to place the arm
     # Singular values below this share of the largest are directions that the data do not determine.
     rank_tolerance: float = 1e-7
 
@@ -62,7 +63,6 @@ class _Fit:
     shift: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     def markers(self) -> FloatArray:
-        """Return the marker positions (n, 3) in the nominal frame."""
         return self.nominal_positions + self.nominal_rotations @ self.shift
 
     def errors(self) -> FloatArray:
@@ -72,18 +72,10 @@ class _Fit:
         return np.linalg.norm(self.errors(), axis=1)
 
     def spread(self, least: float) -> float:
-        """Return a robust standard deviation [m] of one coordinate's error, at least `least`.
-
-        Taken from the middle distance. Its rank lies above the median by the number of pairs that the fitted parameters
-        can always explain (Rousseeuw and Leroy 1987, least median of squares). Otherwise a few pairs would fit
-        perfectly and the others would count as outliers.
-        """
-        free_pairs = 2 * self.fit_pose + self.fit_marker
-        rank = min(len(self.x) // 2 + free_pairs, len(self.x) - 1)
-        return max(float(np.partition(self.norms(), rank)[rank]) / MEDIAN_NORM, least)
+        """Return a robust standard deviation [m] of one coordinate's error, at least `least`."""
+        return max(middle_sigma(self.norms(), len(self.x) // 2 + 2 * self.fit_pose + self.fit_marker), least)
 
     def place(self, weights: FloatArray) -> None:
-        """Fit the best pose for the current marker offset."""
         self.rotation, self.translation = rigid_motion(self.markers(), self.x, weights)
 
     def improve(self, weights: FloatArray) -> float:
@@ -153,7 +145,13 @@ def align(
         raise ShapeError("x", f"({len(angles)}, 3) to go with q", positions.shape)
     if sigma is not None and not (sigma > 0.0 and math.isfinite(sigma)):
         raise SettingError(f"sigma must be finite and greater than 0, got {sigma!r}")
-    _check_enough(len(angles), pose_known, marker_known)
+    pairs = len(angles)
+    needed = 1 if pose_known else 3 if marker_known else 4
+    if pairs < needed:
+        raise DegenerateDataError(
+            f"aligning needs at least {needed} pairs when pose_known = {pose_known} and marker_known = {marker_known}, "
+            f"got {pairs}; record more"
+        )
     poses = chain.poses(angles)
     fit = _Fit(poses[:, :3, :3], poses[:, :3, 3], positions, not pose_known, not marker_known)
     if fit.fit_pose:
@@ -165,7 +163,12 @@ def align(
         fit.shift = _start_shift(fit, sigma or 0.0, None if turns is None else numbers("turns", turns))
     if fit.fit_pose or fit.fit_marker:
         inliers = _fit_robustly(fit, sigma or 0.0)
-    return _alignment(chain, fit, inliers)
+    transform = np.eye(4)
+    transform[:3, :3], transform[:3, 3] = fit.rotation, fit.translation
+    square = np.square(fit.errors()).sum(axis=1)[inliers]
+    inliers.flags.writeable = False
+    fitted = chain.with_tool(fit.shift).transformed(transform)
+    return Alignment(fitted, frozen(transform), frozen(fit.shift), math.sqrt(float(square.mean())), inliers)
 
 
 def rigid_motion(points: FloatArray, targets: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -261,24 +264,6 @@ def _fit_robustly(fit: _Fit, sigma: float, tolerance: float = _Settings.step_tol
     return inliers
 
 
-def _alignment(chain: RigidChain, fit: _Fit, inliers: BoolArray) -> Alignment:
-    transform = np.eye(4)
-    transform[:3, :3], transform[:3, 3] = fit.rotation, fit.translation
-    square = np.square(fit.errors()).sum(axis=1)[inliers]
-    inliers.flags.writeable = False
-    fitted = chain.with_tool(fit.shift).transformed(transform)
-    return Alignment(fitted, frozen(transform), frozen(fit.shift), math.sqrt(float(square.mean())), inliers)
-
-
-def _check_enough(pairs: int, pose_known: bool, marker_known: bool) -> None:
-    needed = 1 if pose_known else 3 if marker_known else 4
-    if pairs < needed:
-        raise DegenerateDataError(
-            f"aligning needs at least {needed} pairs when pose_known = {pose_known} and marker_known = {marker_known}, "
-            f"got {pairs}; record more"
-        )
-
-
 def _check_spread(points: FloatArray, what: str) -> None:
     singular = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     if not singular[1] > 1e-6 * max(float(singular[0]), 1e-6):
@@ -323,3 +308,50 @@ class PlacedStart:
         change[parameters.base_shift] = placed.T_measured_nominal[:3, 3]
         change[parameters.tool] = placed.marker_shift
         return change
+
+
+def with_refitted_tool(
+    kbmap: KBMap, chain: RigidChain, q: ArrayLike, x: ArrayLike, sigma: float | None = None
+) -> KBMap:
+    """Return the map after its marker was moved to another place on the last link, or the tool was changed.
+
+    The offset δ is fitted, robustly, to pairs seen since: x ≈ f(q) + R(q) δ with the orientation R of the nominal
+    chain. With E the nets of R it is built in exactly, G ← G + E δ. Errors of R itself are left to a learner.
+
+    Args:
+        kbmap: the map as learnt before the change; of its outputs only the position moves.
+        chain: the nominal chain, which supplies the orientations.
+        q, x: pairs since the change, (n, d) [rad, m] and (n, 3) [m].
+        sigma: noise of one coordinate [m], if known.
+
+    Raises:
+        ShapeError, NonFiniteError, SettingError (a sigma that is not positive), DegenerateDataError (no pairs)
+    """
+    angles, positions, _ = checked_pairs(q, x, sigma, chain.joints)
+    if not len(angles):
+        raise DegenerateDataError("a marker's move needs at least 1 pair seen since; record more")
+    oriented = KBMap(kbmap.bases, np.concatenate([kbmap.net[:POSITION_OUTPUTS], chain.orientation_maps(kbmap.bases)]))
+    errors = positions - oriented.predict(angles)
+    # R is a rotation: its transpose takes each pair's error to an estimate of δ, with the same noise.
+    offsets = (chain.orientation(angles).swapaxes(1, 2) @ errors[..., None])[..., 0]
+    net = kbmap.net.copy()
+    net[:POSITION_OUTPUTS] = oriented.with_tool(_robust_mean(offsets, sigma or 0.0)).net[:POSITION_OUTPUTS]
+    return KBMap(kbmap.bases, net, kbmap.metadata)
+
+
+def _robust_mean(offsets: FloatArray, sigma: float) -> FloatArray:
+    """Return the mean (3,) of offsets (n, 3) without outliers.
+
+    It starts from their median, so that up to half of them may be arbitrary. Fewer than five have no majority, and all
+    count.
+    """
+    centre = np.median(offsets, axis=0)
+    for _ in range(len(offsets)):
+        distances = np.linalg.norm(offsets - centre, axis=1)
+        # One pair is always explained by an offset.
+        spread = max(middle_sigma(distances, len(distances) // 2 + 1), sigma)
+        mean = offsets[distances <= ROUNDING_M + UNCALIBRATED_SIGMAS * spread].mean(axis=0)
+        if (mean == centre).all():
+            break
+        centre = mean
+    return centre

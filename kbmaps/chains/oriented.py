@@ -161,7 +161,6 @@ class _Fit:
         self._freedom = 3.0  # degrees of freedom that the parameters have used up so far
 
     def step(self) -> None:
-        """Linearise, weight and solve once."""
         errors, columns = self._linearised()
         lengths = np.linalg.norm(errors, axis=1)
         noise = self._noise(lengths)
@@ -184,7 +183,6 @@ class _Fit:
         self._turn = exponentials(change[None, free:])[0][0] @ self._turn
 
     def result(self) -> OrientedChain:
-        """Return the chain at the current estimate."""
         size = self._belief.parameters.size
         outward = np.zeros((size + 3, len(self._chosen) + 3))
         outward[:size, : len(self._chosen)] = self._belief.root
@@ -194,7 +192,6 @@ class _Fit:
         return OrientedChain(self._belief.parameters, self._mean, turn, outward @ self._root, noise)
 
     def _linearised(self) -> tuple[FloatArray, FloatArray]:
-        """Return the errors (n, 3) [rad] and their derivatives by the unknowns (n, 3, k + 3)."""
         hand, omega = self._belief.parameters.turned(self._mean, self._q)
         errors = rotation_vectors(self._measured @ (hand @ self._turn).swapaxes(1, 2))
         return errors, np.concatenate([omega @ self._belief.root, hand], axis=2)

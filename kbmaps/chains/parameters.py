@@ -201,7 +201,10 @@ class ChainParameters:
         motions = self._motions(geometry, geometry.zeros[None])[:, 0]
         fixed[1:] = np.linalg.inv(frames[:-1]) @ motions @ frames[1:]
         fixed[1:, 3] = (0.0, 0.0, 0.0, 1.0)
-        return RigidChain(_reorthonormalised(fixed), self.reference.axes, self.reference.prismatic)
+        # The products have gathered rounding errors.
+        u, _, vt = np.linalg.svd(fixed[:, :3, :3])
+        fixed[:, :3, :3] = u @ vt
+        return RigidChain(fixed, self.reference.axes, self.reference.prismatic)
 
     def positions(self, change: ArrayLike, q: ArrayLike) -> FloatArray:
         """Return marker positions [m] (3,) at q (d,), or (n, 3) at (n, d)."""
@@ -370,13 +373,6 @@ def tangents(axes: FloatArray) -> FloatArray:
     columns[..., 0] = first / np.linalg.norm(first, axis=1, keepdims=True)
     columns[..., 1] = (cross @ columns[..., :1])[..., 0]
     return frozen(columns)
-
-
-def _reorthonormalised(transforms: FloatArray) -> FloatArray:
-    """Replace products that have gathered rounding errors by the nearest proper rotations."""
-    u, _, vt = np.linalg.svd(transforms[:, :3, :3])
-    transforms[:, :3, :3] = u @ vt
-    return transforms
 
 
 CHAIN = ("fixed", "axes", "prismatic")

@@ -25,8 +25,7 @@ class _Settings:
     # Once the weights have settled, a step that lowers the cost by less than this share is the last.
     small_gain: float = 1e-3
     settling: int = 4
-    # Holds undetermined directions; as a share of the largest diagonal entry.
-    ridge: float = 1e-9
+    ridge: float = 1e-9  # holds undetermined directions; as a share of the largest diagonal entry
 
 
 @dataclass(frozen=True, eq=False)

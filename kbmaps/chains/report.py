@@ -10,8 +10,7 @@ import numpy as np
 from kbmaps.arrays import BoolArray, FloatArray, frozen
 from kbmaps.chains.parameters import ChainParameters
 
-# In standard deviations of a Gaussian.
-_HALF_WIDTH_95 = 1.959964
+_HALF_WIDTH_95 = 1.959964  # in standard deviations of a Gaussian
 
 _DEG = math.degrees(1.0)
 _MM = 1e3
@@ -84,7 +83,18 @@ class ChainReport:
     prismatic: tuple[bool, ...]
 
     def __str__(self) -> str:
-        return _text(self)
+        lines = [f"{'':<14}{'change':>10}   95 %"]
+        lines += _of_axes("base shift", self.base_translation, "mm", _MM)
+        lines += _of_axes("base turn", self.base_rotation, "deg", _DEG)
+        lines += _of_axes("tool", self.tool_shift, "mm", _MM)
+        for k, slides in enumerate(self.prismatic):
+            unit, scale = ("mm", _MM) if slides else ("deg", _DEG)
+            lines.append(_line(f"joint {k + 1} zero", unit, scale, self.zeros, k))
+        lines.append(f"noise {_MM * self.noise:.3g} mm, misfit {self.misfit:.2f}, outliers left out: {self.outliers}")
+        lines.append(f"directions of the parameters that the pairs show: {self.determined}")
+        if self.undetermined:
+            lines.append(f"Not shown, so about as believed before: {', '.join(self.undetermined)}.")
+        return "\n".join(lines)
 
 
 def chain_report(
@@ -122,22 +132,6 @@ def chain_report(
         undetermined=tuple(names[k] for k in np.flatnonzero(hidden)),
         prismatic=tuple(parameters.reference.prismatic.tolist()),
     )
-
-
-def _text(report: ChainReport) -> str:
-    """Return the figures with their 95 % intervals, one per line, then the data they rest on."""
-    lines = [f"{'':<14}{'change':>10}   95 %"]
-    lines += _of_axes("base shift", report.base_translation, "mm", _MM)
-    lines += _of_axes("base turn", report.base_rotation, "deg", _DEG)
-    lines += _of_axes("tool", report.tool_shift, "mm", _MM)
-    for k, slides in enumerate(report.prismatic):
-        unit, scale = ("mm", _MM) if slides else ("deg", _DEG)
-        lines.append(_line(f"joint {k + 1} zero", unit, scale, report.zeros, k))
-    lines.append(f"noise {_MM * report.noise:.3g} mm, misfit {report.misfit:.2f}, outliers left out: {report.outliers}")
-    lines.append(f"directions of the parameters that the pairs show: {report.determined}")
-    if report.undetermined:
-        lines.append(f"Not shown, so about as believed before: {', '.join(report.undetermined)}.")
-    return "\n".join(lines)
 
 
 def _of_axes(name: str, interval: Interval, unit: str, scale: float) -> list[str]:

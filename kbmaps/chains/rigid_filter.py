@@ -53,15 +53,6 @@ class RigidFilter:
 
     Each pair is linearised once: at the last fit, or, before any fit, at the current estimate. The curvature left out
     counts as noise, so that early pairs do not make the estimate overconfident.
-
-    Attributes:
-        change: the parameters (size,) as in `ChainParameters`.
-        origin: linearisation point (size,); None: at `change`. Many directions of a chain have no effect on positions,
-            and others hardly any. With one origin for all pairs, these directions are the same for each pair. With
-            several, pairs seem to carry information about them, and the chain drifts along them (Huang, Mourikis and
-            Roumeliotis 2010).
-        noise_square: the estimated variance [m²] of a coordinate of the pairs that came without their sigma.
-        noise_coordinates: number of coordinates that this estimate rests on.
     """
 
     STORED = ("change", "covariance", "noise", "origin")
@@ -76,11 +67,16 @@ class RigidFilter:
         self._bends = parameters.turning.astype(np.float64)[self._active]
         self._reach = parameters.reach
         self._kernel = self._filter_kernel()
-        self.change = np.zeros(parameters.size)
+        self.change = np.zeros(parameters.size)  # the parameters (size,) as in `ChainParameters`
+        # linearisation point (size,); None: at `change`. Many directions of a chain have no effect on positions, and
+        # others hardly any. With one origin for all pairs, these directions are the same for each pair. With several,
+        # pairs seem to carry information about them, and the chain drifts along them (Huang, Mourikis and Roumeliotis
+        # 2010)
         self.origin: FloatArray | None = None
         self._covariance: FloatArray = np.diag(np.square(std[self._active] / self._scales))
+        # the estimated variance [m²] of a coordinate of the pairs that came without their sigma
         self.noise_square = noise**2
-        self.noise_coordinates = NOISE_COORDINATES
+        self.noise_coordinates = NOISE_COORDINATES  # number of coordinates that this estimate rests on
 
     @property
     def covariance(self) -> FloatArray:
@@ -166,7 +162,6 @@ class RigidFilter:
         )
 
     def _learn_compiled(self, kernel: FilterKernel, q: FloatArray, x: FloatArray, sigma: FloatArray) -> None:
-        """Run `_learn_one` on each pair, compiled."""
         taken, self.noise_square, self.noise_coordinates = kernel.learn(
             self.change,
             self._covariance,
@@ -181,7 +176,6 @@ class RigidFilter:
             raise np.linalg.LinAlgError("Singular matrix")
 
     def _linearised(self, change: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return positions (n, 3) of the chain at `change`, and their derivatives (n, 3, p) at the origin."""
         x, jacobian = self.parameters.linearised(change if self.origin is None else self.origin, q)
         if self.origin is not None:
             x = self.parameters.positions(change, q)

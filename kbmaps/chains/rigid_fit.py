@@ -12,7 +12,7 @@ from scipy.special import chdtrc  # pyright: ignore[reportMissingTypeStubs, repo
 from kbmaps.arrays import BoolArray, FloatArray
 from kbmaps.chains.belief import ChainBelief, squared
 from kbmaps.pairs import Pairs
-from kbmaps.robust import MEDIAN_NORM, OUTLIER_SIGMAS, ROUNDING_M
+from kbmaps.robust import OUTLIER_SIGMAS, ROUNDING_M, middle_sigma
 
 
 class _Settings:
@@ -117,13 +117,9 @@ class _Fitter:
         self.used = float(min(len(self.point.offset), 3 * len(pairs)))
 
     def typical(self) -> float:
-        """Return noise over unit from the middle residual (Rousseeuw and Leroy 1987, least median of squares).
-
-        Its rank lies above the median by the number of pairs that the parameters can always explain.
-        """
+        """Return noise over unit from the middle residual."""
         norms = self.point.norms
-        rank = min(int(0.5 * (len(norms) + self.used / 3.0)), len(norms) - 1)
-        return max(float(np.partition(norms, rank)[rank]) / MEDIAN_NORM, self.least_noise)
+        return max(middle_sigma(norms, 0.5 * (len(norms) + self.used / 3.0)), self.least_noise)
 
     def improve(self, weights: FloatArray, noise: float) -> float:
         """Take a Levenberg-Marquardt step; return its length in posterior sigmas (0: no better step found)."""

@@ -33,12 +33,10 @@ from kbmaps.variance_components import error_covariances, inverse_roots, tells_d
 
 
 class _Settings:
-    # A direction is open if at least this share of the prior's variance remains.
-    open: float = 0.5
+    open: float = 0.5  # a direction is open if at least this share of the prior's variance remains
     # No step along a direction changes a parameter by more than this [rad, m]: beyond, the second order does not hold.
     longest_step: float = 0.1
-    # The curvature of the posterior is estimated from about this many evenly spread pairs.
-    followed: int = 100
+    followed: int = 100  # the curvature of the posterior is estimated from about this many evenly spread pairs
     # A parameter counts as undetermined if its standard deviation stayed above this share of the prior's.
     hardly_narrower: float = 0.5
 
@@ -106,6 +104,7 @@ class RigidLearner(Model):
 
     Raises:
         ShapeError: the prior is one of another chain.
+        DegenerateDataError: `scatter` and `report` before the first pair.
 
     Example:
         >>> import numpy as np
@@ -192,11 +191,7 @@ class RigidLearner(Model):
 
     @property
     def scatter(self) -> Scatter:
-        """Scatter of the pairs about the chain.
-
-        Raises:
-            DegenerateDataError: no pair has been learnt.
-        """
+        """Scatter of the pairs about the chain."""
         fit = self._fitted()
         if fit is None:
             raise DegenerateDataError("nothing lies around the chain before the first pair was learnt")
@@ -303,21 +298,19 @@ class RigidLearner(Model):
         return Estimate(x, sigma, near_data(variance, self._widest)).like(angles)
 
     def report(self) -> ChainReport:
-        """Return hand-eye, tool centre point and joint offsets with 95 % intervals.
-
-        Raises:
-            DegenerateDataError: no pairs have been learnt.
-        """
+        """Return hand-eye, tool centre point and joint offsets with 95 % intervals."""
         fit = self._fitted()
         if fit is None:
             raise DegenerateDataError("there is nothing to report before the first pair was learnt")
         pairs, scatter = self.data, self._scatter(fit)
         widening = 1.0 if pairs.known else student(fit.freedom)
+        before, after = (np.sqrt(np.square(belief.root).sum(axis=1)) for belief in (self._prior, fit.belief))
+        lever = np.where(self._parameters.turning, self._parameters.reach, 1.0)
         return chain_report(
             self._parameters,
             fit.belief.mean,
             widening * self._deviations(fit, pairs),
-            self._hidden(fit, scatter.noise * scatter.misfit),
+            (after > _Settings.hardly_narrower * before) & (before * lever > (scatter.noise * scatter.misfit)),
             scatter=scatter,
             widening=widening,
             outliers=int((~fit.inliers).sum()),
@@ -329,12 +322,6 @@ class RigidLearner(Model):
         unit = math.sqrt(float(np.square(pairs.unit).mean()))
         noise, misfit = (unit, fit.noise) if pairs.known else (unit * fit.noise, 1.0)
         return Scatter(noise, misfit, fit.freedom)
-
-    def _hidden(self, fit: RigidFit, noise: float) -> BoolArray:
-        """Return True for each parameter (size,) that matters and was not determined; noise of a coordinate [m]."""
-        before, after = (np.sqrt(np.square(belief.root).sum(axis=1)) for belief in (self._prior, fit.belief))
-        lever = np.where(self._parameters.turning, self._parameters.reach, 1.0)
-        return (after > _Settings.hardly_narrower * before) & (before * lever > noise)
 
     def to_bytes(self) -> bytes:
         arrays = chain_arrays(self.nominal) | self.stored()

@@ -38,8 +38,7 @@ class _Settings:
     """
 
     least_window: int = 16
-    # With few pairs and no prior, an earlier fit may be far off: start from the nominal chain.
-    fresh: int = 200
+    fresh: int = 200  # With few pairs and no prior, an earlier fit may be far off: start from the nominal chain
     # The first refit comes with this pair, the next when the kept pairs have grown by this factor, or the window is
     # full.
     first: int = 8
@@ -50,12 +49,6 @@ class _Settings:
 
 class RigidWindow:
     """Keeps at most `size` pairs. Older ones are folded: linearised at a fit that also used the pairs after them.
-
-    Attributes:
-        belief: posterior of the chain before the kept pairs.
-        noise: noise estimated before them, from pairs that came without their sigma.
-        farthest: configuration (1, d) of the folded pair with the largest predicted uncertainty; (0, d) without any.
-        excess: variance [m²] of a coordinate that the chain did not explain at the last fit, with the noise given.
 
     Raises:
         SettingError: size below 16.
@@ -68,10 +61,13 @@ class RigidWindow:
         if size < _Settings.least_window:
             raise SettingError(f"a window must hold at least {_Settings.least_window} pairs, got {size}")
         self.size = size
+        # posterior of the chain before the kept pairs
         self.belief = ChainBelief.from_tolerances(parameters, tolerances)
-        self.noise = NOTHING_KNOWN
+        self.noise = NOTHING_KNOWN  # noise estimated before them, from pairs that came without their sigma
+        # variance [m²] of a coordinate that the chain did not explain at the last fit, with the noise given
         self.excess = 0.0
         self._begun = False
+        # configuration (1, d) of the folded pair with the largest predicted uncertainty; (0, d) without any
         self.farthest = np.empty((0, parameters.reference.joints))
         self._place = PlacedStart(parameters, tolerances)
         self._joints, self._count = parameters.reference.joints, 0
@@ -307,8 +303,12 @@ class RecursiveRigidLearner(Model):
             raise SettingError(f"tolerance must be finite and greater than 0 m, got {tolerance!r}")
         if self.kept >= _Settings.first:
             self._window.fold(self._set_right(), self.kept)
-        belief = ChainBelief.from_covariance(self._parameters, self._filter.change, self._filter.covariance)
-        self._go_on_from(belief.with_other_tool(tolerance), fitted=False)
+        before = ChainBelief.from_covariance(self._parameters, self._filter.change, self._filter.covariance)
+        belief = before.with_other_tool(tolerance)
+        self._filter.go_on_from(belief, fitted=False)
+        self._window.begin_with(belief)
+        self._widest = None
+        self._due = _Settings.first
 
     def predict(self, q: ArrayLike) -> FloatArray:
         return self._parameters.positions(self._filter.change, rows_or_vector("q", q, self.joints))
@@ -368,9 +368,3 @@ class RecursiveRigidLearner(Model):
             coordinates = fit.freedom + self._window.noise.coordinates
             self._filter.noise_coordinates = float(np.clip(coordinates, NOISE_COORDINATES, NOISE_MEMORY))
         return fit
-
-    def _go_on_from(self, belief: ChainBelief, *, fitted: bool) -> None:
-        self._filter.go_on_from(belief, fitted=fitted)
-        self._window.begin_with(belief)
-        self._widest = None
-        self._due = _Settings.first

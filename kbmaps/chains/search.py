@@ -23,13 +23,11 @@ class _Settings:
     least_damping: float = 1e-14
     least_raised_damping: float = 1e-8
     most_damping: float = 1e6
-    # A start with a residual [m] this small has found the chain to the last digits.
-    exact_m: float = 1e-12
+    exact_m: float = 1e-12  # a start with a residual [m] this small has found the chain to the last digits
     # A start ends after this many steps that each reduce the squared residual by less than this share.
     stalled: float = 1e-4
     stalled_steps: int = 8
-    # A start whose residual is below this multiple of the noise has found the chain.
-    explained: float = 1.2
+    explained: float = 1.2  # a start whose residual is below this multiple of the noise has found the chain
 
 
 @dataclass(frozen=True, eq=False)

@@ -186,7 +186,6 @@ def _log_prior(k: int) -> FloatArray:
 
 
 def _sizes(k: int) -> FloatArray:
-    """Return the sizes of bends of the k-th length."""
     return np.array(_Settings.bends if k == 0 else _Settings.bends[1:])
 
 
@@ -220,8 +219,7 @@ def _own_errors(angles: FloatArray, turning: FloatArray) -> FloatArray:
     return np.concatenate(columns, axis=2)
 
 
-# Maximum number of pairs, the newest ones, that are evaluated.
-MOST_PAIRS = 1200
+MOST_PAIRS = 1200  # maximum number of pairs, the newest ones, that are evaluated
 
 
 def log_ratios_if_it_bends(

@@ -96,8 +96,7 @@ class Onsets:
 
 # Minimum average number of pairs between two false alarms, if the model's uncertainty is correct.
 PAIRS_BETWEEN_FALSE_ALARMS = 75_000.0
-# Number of the newest errors that are kept.
-MOST_SURPRISES = 3000
+MOST_SURPRISES = 3000  # number of the newest errors that are kept
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,8 +12,7 @@ from scipy.special import ndtr, stdtrit  # pyright: ignore[reportMissingTypeStub
 from kbmaps.arrays import FloatArray, frozen
 from kbmaps.variance_components import in_typical_units, most_probable_shares
 
-# Minimum number of pairs for each estimated variance.
-_FEWEST = 10
+_FEWEST = 10  # minimum number of pairs for each estimated variance
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +63,8 @@ class WhiteNoise:
             return cls.as_claimed(joints)
         off = np.diff(errors, axis=0) * np.sqrt(0.5)
         alike = np.broadcast_to(np.eye(3), (len(errors), 1, 3, 3))
-        spread = np.concatenate([_outer(derivatives), covariances[:, None], alike], axis=1)
+        columns = derivatives.mT
+        spread = np.concatenate([(columns[..., :, None] * columns[..., None, :]), covariances[:, None], alike], axis=1)
         spread = 0.5 * (spread[1:] + spread[:-1])
         spread, units = in_typical_units(spread, off)
         shares, likelihood = most_probable_shares(spread, off)
@@ -84,29 +84,19 @@ class WhiteNoise:
         return self.claimed * covariances + self.beside * np.eye(3) + self.of_readings(derivatives)
 
 
-def _outer(derivatives: FloatArray) -> FloatArray:
-    """Return the outer product of each joint's column (n, 3, d) with itself, (n, d, 3, 3)."""
-    columns = derivatives.mT
-    return columns[..., :, None] * columns[..., None, :]
-
-
 class _Settings:
-    # Default number of neighbours of a path that share a model's error: 20 degrees of it.
-    usually_shared: int = 10
+    usually_shared: int = 10  # Default number of neighbours of a path that share a model's error: 20 degrees of it
     # Sums over longer lags than this, or than this share of the series, would be dominated by noise.
     longest_lag: int = 200
     longest_lag_share: float = 0.125
-    # Neighbours share an error if their products are this many standard errors above 0.
-    clearly: float = 2.0
+    clearly: float = 2.0  # neighbours share an error if their products are this many standard errors above 0
     # The estimated variance must hold in the tail [sigmas], where a Gaussian coordinate falls once in as many pairs as
     # lie between false alarms.
     tail_sigmas: float = 4.5
-    # Longer runs are treated as this long.
-    longest_run: int = 1000
+    longest_run: int = 1000  # longer runs are treated as this long
     # Lower bound: residuals of 0 determine no variance, and no model is this much better than its claim.
     least: float = 1e-12
-    # A fit absorbs at most this share of the error that neighbours share.
-    most_taken: float = 0.8
+    most_taken: float = 0.8  # a fit absorbs at most this share of the error that neighbours share
 
 
 @dataclass(frozen=True, eq=False)

@@ -66,8 +66,7 @@ class _Settings:
     max_steps: int = 3000
     tolerance_m: float = 1e-7
     tolerance_rad: float = 1e-7
-    # Starts are chosen among this many times as many samples near the target.
-    candidates: int = 8
+    candidates: int = 8  # starts are chosen among this many times as many samples near the target
 
 
 Reason = Literal["reached", "out_of_reach", "steps_ran_out"]
@@ -158,7 +157,9 @@ class InverseKinematics:
         )
         if not (low <= high).all():
             raise SettingError(f"joint {int((low > high).argmax()) + 1}'s lower limit is above its upper one")
-        begin, end = _one_turn(low, high)
+        # One turn where there are no limits, from the one there is or about 0.
+        begin = np.where(np.isfinite(low), low, np.where(np.isfinite(high), high - 2.0 * np.pi, -np.pi))
+        end = np.where(np.isfinite(high), high, begin + 2.0 * np.pi)
         half = 0.5 * (end - begin)
         self._joints = JointRange(low, high, np.where(half > 0.0, half, 1.0))
         self._starts, self._max_steps = starts, max_steps
@@ -302,9 +303,3 @@ def _pose_features(x: FloatArray, rotations: FloatArray, lever: float) -> FloatA
     """Return points (..., 12) whose distances are those of poses: for small angles metres, and radians times lever."""
     turned = rotations.reshape(*x.shape[:-1], 9) * (lever / np.sqrt(2.0))
     return np.concatenate([x, turned], axis=-1)
-
-
-def _one_turn(low: FloatArray, high: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the limits; where there are none, one turn from the one there is, or about 0."""
-    begin = np.where(np.isfinite(low), low, np.where(np.isfinite(high), high - 2.0 * np.pi, -np.pi))
-    return begin, np.where(np.isfinite(high), high, begin + 2.0 * np.pi)

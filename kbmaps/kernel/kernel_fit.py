@@ -64,8 +64,7 @@ class _Settings:
     but for `search_start` by 4 %.
     """
 
-    # Start of the search for λ, relative to the mean diagonal of the Gram matrix.
-    search_start: float = 1e-4
+    search_start: float = 1e-4  # start of the search for λ, relative to the mean diagonal of the Gram matrix
     # Relative to the trace of the Gram matrix: just enough for a stable Cholesky factorisation.
     vanishing_ridge: float = 1e-15
     # The refinement of the exact solution ends when a step no longer reduces the residual to this share.

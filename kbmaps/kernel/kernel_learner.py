@@ -117,10 +117,6 @@ class KeptPairs:
         self.behind = _last(self.behind, behind, kept)
         self.total += len(q)
 
-    def replace_model(self, model: Predictor) -> None:
-        """Replace the prior model behind the same pairs."""
-        self.behind = model.predict(self.q)
-
     def observations(self, kernel: ProductKernel) -> Observations:
         """Return the pairs, weighted by their sigma and their age."""
         pairs = with_units(self.q, self.x, self.sigma)
@@ -164,8 +160,7 @@ def _last(old: FloatArray, new: FloatArray, kept: int) -> FloatArray:
 
 
 _KIND = "kernel learner, 1"
-# Rounding of positions, relative to the largest coordinate.
-_ROUNDING = 1e-11
+_ROUNDING = 1e-11  # rounding of positions, relative to the largest coordinate
 
 
 _THIRD_OF_A_TURN = 2.0 * math.pi / 3.0
@@ -241,6 +236,7 @@ class KernelLearner(Model):
 
     Raises:
         SettingError: a precision that is neither None, "evidence", nor a number above 0.
+        DegenerateDataError: `noise`, `log_evidence`, `prior_precision` and `prior_std` before the first pair.
     """
 
     def __init__(
@@ -283,20 +279,12 @@ class KernelLearner(Model):
 
     @property
     def noise(self) -> float:
-        """Noise of a measured coordinate, 1-sigma [m]: estimated, or given with the pairs.
-
-        Raises:
-            DegenerateDataError: no pair has been learnt.
-        """
+        """Noise of a measured coordinate, 1-sigma [m]: estimated, or given with the pairs."""
         return math.sqrt(self._fitted().noise_variance) * self._pairs.mean_unit
 
     @property
     def log_evidence(self) -> float | None:
-        """Log marginal likelihood of the pairs; None for the exact solution.
-
-        Raises:
-            DegenerateDataError: no pair has been learnt.
-        """
+        """Log marginal likelihood of the pairs; None for the exact solution."""
         return self._fitted().log_evidence
 
     def predict(self, q: ArrayLike) -> FloatArray:
@@ -324,20 +312,12 @@ class KernelLearner(Model):
 
     @property
     def prior_precision(self) -> float:
-        """λ of the current fit; 0 for the exact one.
-
-        Raises:
-            DegenerateDataError: no pair has been learnt.
-        """
+        """λ of the current fit; 0 for the exact one."""
         return self._fitted().precision
 
     @property
     def prior_std(self) -> float:
-        """Standard deviation of the control points around the prior [m].
-
-        Raises:
-            DegenerateDataError: no pair has been learnt.
-        """
+        """Standard deviation of the control points around the prior [m]."""
         return math.sqrt(self._fitted().prior_variance)
 
     def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
@@ -355,7 +335,7 @@ class KernelLearner(Model):
 
     def rebase(self, prior: Predictor) -> None:
         """Replace the prior for the same pairs, or use the same one after it has changed."""
-        self._pairs.replace_model(prior)
+        self._pairs.behind = prior.predict(self._pairs.q)
         self._prior, self._fit = prior, None
 
     def estimate(self, q: ArrayLike) -> Estimate:
@@ -431,5 +411,4 @@ def _same(x: FloatArray, other: FloatArray) -> bool:
 
 
 def _parse_precision(value: Any) -> Precision:
-    """Return a stored precision. Raises ModelFormatError."""
     return value if value is None or value == "evidence" else number(value, "the precision")

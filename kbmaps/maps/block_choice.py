@@ -21,19 +21,16 @@ from kbmaps.maps.stack import BasisStack
 
 class _Settings:
     most_blocks: int = 20
-    # Precision used while there are too few pairs for blocks.
-    first_precision: float = 1e-3
+    first_precision: float = 1e-3  # precision used while there are too few pairs for blocks
     # Neighbours on a path are nearly the same configuration: they share this much of their prior variance. In bases
     # over the whole turn that is a step of 8 degrees, along which a function that bends three times as fast still
     # shares 0.95.
     path_correlation: float = 0.995
-    # Relative to the largest eigenvalue of the kernel: smaller ones are rounding.
-    smallest_eigenvalue: float = 1e-15
+    smallest_eigenvalue: float = 1e-15  # Relative to the largest eigenvalue of the kernel: smaller ones are rounding
 
 
 FEWEST_BLOCKS = 4
-# Along a guided path, pairs this far apart share little of their errors.
-BLOCK_PAIRS = 30
+BLOCK_PAIRS = 30  # along a guided path, pairs this far apart share little of their errors
 # Candidate precisions, relative to the kernel's mean diagonal: from almost no prior to hardly any learning.
 PRECISIONS = 10.0 ** np.arange(-13.0, 3.25, 0.5)
 

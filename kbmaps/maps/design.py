@@ -13,8 +13,7 @@ from kbmaps.maps.contraction import contracted
 from kbmaps.maps.factor import RowFactor
 from kbmaps.maps.stack import BasisStack
 
-# Number of pairs whose weights are formed at once.
-_BLOCK = 512
+_BLOCK = 512  # number of pairs whose weights are formed at once
 # Products w_a w_b of one joint, each pair once; with these factors their norm is that of the full matrix w wᵀ.
 _FIRST, _SECOND = np.array([0, 1, 2, 0, 0, 1]), np.array([0, 1, 2, 1, 2, 2])
 _FACTORS = np.array([1.0, 1.0, 1.0, *[math.sqrt(2.0)] * 3])
@@ -96,7 +95,6 @@ def _full_products(polynomials: FloatArray, size: int) -> FloatArray:
 
 
 def _kronecker(factors: Sequence[FloatArray]) -> FloatArray:
-    """Return row-wise Kronecker products: (n, product of the widths)."""
     product = factors[-1]
     for factor in reversed(factors[:-1]):
         product = (factor[:, :, None] * product[:, None, :]).reshape(len(product), -1)

@@ -25,8 +25,7 @@ class _Settings:
     # above.
     least_share: float = 1e-20
     greatest_share: float = 1e2
-    # Multiplicative step of the search.
-    step: float = math.log(8.0)
+    step: float = math.log(8.0)  # multiplicative step of the search
     # A vertex nearer than this share of a step is not tried: evidence is flat there, and a try costs a factorisation.
     near: float = 0.1
 

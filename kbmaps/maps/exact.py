@@ -273,7 +273,11 @@ class ExactLearner:
             return ExactSolution(self._prior, None, 0.0, None, 0.0)
         errors = self._design.errors(self._prior_coefficients)
         if prior_precision is None:
-            return self._solve_unregularised(errors)
+            change = nearest_solution(self._design, errors)
+            freedom = self._count - self._design.unknowns
+            squares = self._residual_squares(errors, change)
+            noises = [math.sqrt(float(squares[part].mean()) / freedom) if freedom > 0 else None for part in self._parts]
+            return self._solution(change, noises, 0.0, None, squares)
         gram = ShiftedGram(self._design.gram())
         rhs = self._design.transposed_times(errors) if self._design.overdetermined else errors
         if isinstance(prior_precision, str):
@@ -282,13 +286,6 @@ class ExactLearner:
         else:
             fit = self._fit(gram, errors, rhs, prior_precision)
         return self._refined(gram, errors, fit)
-
-    def _solve_unregularised(self, errors: FloatArray) -> ExactSolution:
-        change = nearest_solution(self._design, errors)
-        freedom = self._count - self._design.unknowns
-        squares = self._residual_squares(errors, change)
-        noises = [math.sqrt(float(squares[part].mean()) / freedom) if freedom > 0 else None for part in self._parts]
-        return self._solution(change, noises, 0.0, None, squares)
 
     def _refined(self, gram: ShiftedGram, errors: FloatArray, fit: _Fit) -> ExactSolution:
         """Take one step of refinement through the pairs, which corrects the rounding of the Gram matrix."""
@@ -343,7 +340,6 @@ class ExactLearner:
         return [positions] if self._outputs == POSITION_OUTPUTS else [positions, slice(POSITION_OUTPUTS, POSE_OUTPUTS)]
 
     def _most_evident(self, gram: ShiftedGram, errors: FloatArray, rhs: FloatArray) -> _Fit:
-        """Return the fit at λ of the greatest evidence, searched from the last λ on."""
         mean = gram.trace / gram.size
         low, high = (limit * mean for limit in SEARCH_LIMITS)
         fits: dict[float, _Fit] = {}

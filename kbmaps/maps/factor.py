@@ -43,15 +43,12 @@ class RowFactor:
             self._targets[self._filled : self._filled + taken] = targets[:taken]
             self._filled += taken
             if self._filled == self.unknowns:
-                self._triangularise()
+                self._rows = np.asfortranarray(self._rows)
+                self._rows, self._targets = lapack.qr_in_place(self._rows, np.asfortranarray(self._targets))
+                self._triangular = True
         if taken < len(rows):
             below, below_targets = np.asfortranarray(rows[taken:]), np.array(targets[taken:], order="F")
             self._rows, self._targets = lapack.qr_append(self._rows, self._targets, below, below_targets)
-
-    def _triangularise(self) -> None:
-        self._rows = np.asfortranarray(self._rows)
-        self._rows, self._targets = lapack.qr_in_place(self._rows, np.asfortranarray(self._targets))
-        self._triangular = True
 
 
 class ShiftedGram:

@@ -93,7 +93,12 @@ class SupportSet:
         if self._size == len(self._q):
             self._thin()
             return self.add(angles)
-        self._append(angles, left, right, reduced, rest)
+        size = self._size
+        pivot = math.sqrt(rest + self._noise)
+        self._inverse[size, :size] = -(reduced @ self._inverse[:size, :size]) / pivot
+        self._inverse[size, size] = 1.0 / pivot
+        self._q[size], self._left[size], self._right[size] = angles, left, right
+        self._size = size + 1
         return True
 
     def unexplained(self, q: ArrayLike) -> float | FloatArray:
@@ -134,14 +139,6 @@ class SupportSet:
         size = self._size
         kernel = (self._left[:size] @ left) * (self._right[:size] @ right)
         return self._inverse[:size, :size] @ kernel
-
-    def _append(self, q: FloatArray, left: FloatArray, right: FloatArray, reduced: FloatArray, rest: float) -> None:
-        size = self._size
-        pivot = math.sqrt(rest + self._noise)
-        self._inverse[size, :size] = -(reduced @ self._inverse[:size, :size]) / pivot
-        self._inverse[size, size] = 1.0 / pivot
-        self._q[size], self._left[size], self._right[size] = q, left, right
-        self._size = size + 1
 
     def _thin(self) -> None:
         """Double the threshold (never beyond half way to 1) and select again among the kept configurations."""

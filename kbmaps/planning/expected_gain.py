@@ -13,8 +13,7 @@ from scipy.special import ndtr, ndtri  # pyright: ignore[reportMissingTypeStubs,
 
 from kbmaps.arrays import FloatArray, rows, vector
 from kbmaps.errors import SettingError
-from kbmaps.planning.design import ExperimentDesign
-from kbmaps.planning.posterior import Posterior
+from kbmaps.planning.design import ExperimentDesign, Posterior
 
 # Random designs per motion, averaged: a single one depends on chance where the pairs are few.
 _DESIGNS = 6

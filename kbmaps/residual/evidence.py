@@ -16,8 +16,7 @@ from kbmaps.robust import VARIANCE_FLOOR
 
 # Candidate variances of a group, relative to the variance at which its best determined direction is barely visible.
 _TRIED = 10.0 ** np.arange(0.0, 7.0, 0.5)
-# Prior odds against a group [nats]. Its variance is optimised, which inflates the likelihood.
-PRICE = 2.0
+PRICE = 2.0  # Prior odds against a group [nats]. Its variance is optimised, which inflates the likelihood.
 
 
 class _Settings:
@@ -27,10 +26,8 @@ class _Settings:
     but for `least_gain` by 5 %, `window` by 1 %; not varied: `rounds`.
     """
 
-    # Models less probable than the best by more than this many nats are left out of averages.
-    window: float = 4.0
-    # A group that gains less is left out of averages: it makes almost no difference.
-    least_gain: float = 0.5
+    window: float = 4.0  # models less probable than the best by more than this many nats are left out of averages
+    least_gain: float = 0.5  # A group that gains less is left out of averages: it makes almost no difference
     # Sets of groups less probable than the chosen one by more than this many nats are not extended.
     swap_window: float = 8.0
     rounds: int = 40
@@ -135,7 +132,10 @@ class GroupedModel:
         active = self.variances if active is None else active
         moments = self._moments if moments is None else moments
         index = self.index(active)
-        variance = self._variance(active)
+        parts: list[FloatArray] = [np.ones(len(self._centre))]
+        for name, value in active.items():
+            parts.append(value * np.ones(self._columns[name].stop - self._columns[name].start))
+        variance = np.concatenate(parts)
         precision = 1.0 / self.noise**2
         centre = np.zeros(len(index))
         centre[: len(self._centre)] = self._centre
@@ -308,12 +308,6 @@ class GroupedModel:
         gains = 0.5 * (tried * squares / (1.0 + tried * values) - np.log1p(tried * values)).sum(axis=1)
         best = int(gains.argmax())
         return float(gains[best]), float(tried[best, 0])
-
-    def _variance(self, active: Mapping[str, float]) -> FloatArray:
-        parts: list[FloatArray] = [np.ones(len(self._centre))]
-        for name, value in active.items():
-            parts.append(value * np.ones(self._columns[name].stop - self._columns[name].start))
-        return np.concatenate(parts)
 
     def _used(self, active: Mapping[str, float], determined: FloatArray) -> dict[str, float]:
         used: dict[str, float] = {}

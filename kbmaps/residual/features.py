@@ -25,14 +25,11 @@ SMOOTH_GROUPS = ("one joint", "two joints", "three joints")
 
 
 class _Settings:
-    # Larger groups are left out: arms of many joints then use the lower orders only.
-    most_features: int = 500
+    most_features: int = 500  # Larger groups are left out: arms of many joints then use the lower orders only
     # With more joints, loads are lumped into two points: the marker and the middle of all joints beyond.
     joints_with_own_loads: int = 8
-    # Narrower joint ranges [rad, m] would scale the functions up too far.
-    least_range: float = 1e-3
-    # Neighbours on a path share this much of smooth functions over the pairs' reach.
-    path_correlation: float = 0.9
+    least_range: float = 1e-3  # narrower joint ranges [rad, m] would scale the functions up too far
+    path_correlation: float = 0.9  # neighbours on a path share this much of smooth functions over the pairs' reach
     # A camera may be mounted on a head with up to this many joints; the link behind them then has constant gravity.
     most_neck_joints: int = 3
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import cast
 
@@ -30,18 +30,14 @@ class _Settings:
     correlations: tuple[float, ...] = (0.0, 0.2, 0.4, 0.55, 0.65, 0.75, 0.8, 0.85, 0.88, 0.91, 0.94, 0.97)
     rounds: int = 6
     selections: int = 2
-    # Few enough rows for a processor's cache.
-    rows_at_once: int = 150
+    rows_at_once: int = 150  # few enough rows for a processor's cache
     # With fewer coordinates of pairs on a path, no group is added: it cannot be separated from shared errors.
     fewest_on_path: int = 30
-    # Number of runs of pairs left out in turn on a path.
-    blocks: int = 8
+    blocks: int = 8  # number of runs of pairs left out in turn on a path
     # A step that moves the predictions by less than this share of their posterior uncertainty is the last.
     small_step: float = 0.05
-    # Fixed-point rounds in which the noise settles well enough to compare correlations.
-    noise_rounds: int = 4
-    # A prior's noise counts as this many coordinates.
-    noise_rows: float = 10.0
+    noise_rounds: int = 4  # fixed-point rounds in which the noise settles well enough to compare correlations
+    noise_rows: float = 10.0  # a prior's noise counts as this many coordinates
     # A given noise explains a sum of squared residuals up to this many of its standard deviations (χ²) above its mean.
     misfit_sigmas: float = 3.0
 
@@ -139,7 +135,9 @@ class _Fitter:
             model.prune()
         posterior = model.posterior()
         self.used = sum(posterior.used.values())
-        step = posterior.mean - self._before_step(model.variances)
+        parts = [np.zeros(len(self._free))]
+        parts += [self._fresh.get(g, np.zeros(self._features.size(g))) for g in model.variances]
+        step = posterior.mean - np.concatenate(parts)
         moved = model.square_of(step) / model.noise**2
         self.variances, self.noise = dict(model.variances), model.noise
         self._take(posterior.mean, tuple(model.variances))
@@ -247,12 +245,6 @@ class _Fitter:
         )
         some = self._pairs.chosen(run)
         return some.whitened(design) / some.unit[:, None, None], some.whitened(target) / some.unit[:, None]
-
-    def _before_step(self, groups: Iterable[str]) -> FloatArray:
-        """Return the weights before the step."""
-        parts = [np.zeros(len(self._free))]
-        parts += [self._fresh.get(g, np.zeros(self._features.size(g))) for g in groups]
-        return np.concatenate(parts)
 
     def _take(self, mean: FloatArray, groups: Sequence[str]) -> None:
         start = len(self._free)

@@ -78,7 +78,7 @@ class ResidualLearner(Model):
     def model(self) -> ResidualModel:
         """Snapshot of the learnt model; later learning does not change it."""
         self._fitted()
-        return self._model_before if self._model is None else self._model
+        return self._model or self._prior or ResidualModel.of_belief(self._rigid.belief)
 
     @property
     def chain(self) -> RigidChain:
@@ -153,11 +153,6 @@ class ResidualLearner(Model):
         """True if no deviation from the rigid chain was found, by this learner or in its prior."""
         return self._fitted() is None and not self.model.weights
 
-    @property
-    def _model_before(self) -> ResidualModel:
-        """Model without pairs."""
-        return self._prior or ResidualModel.of_belief(self._rigid.belief)
-
     def _fitted(self) -> ResidualFit | None:
         """Return the fit; None without pairs, or if they support nothing but the rigid chain."""
         if self._model is None and self.pairs:
@@ -185,7 +180,6 @@ class ResidualLearner(Model):
 
 
 def _stored_prior(value: Any) -> ChainBelief | ResidualModel | None:
-    """Return the prior among the fields of stored bytes. Raises ModelFormatError, TypeError, ValueError."""
     if value is None:
         return None
     if isinstance(value, dict) and "belief" in value:

@@ -24,8 +24,7 @@ from kbmaps.residual.features import ResidualFeatures, ResidualScaling
 _KIND = "rigid chain with residual, fitted, 2"
 _SCALING = ("middle", "half", "centre", "load")
 _GROUP = "group "
-# Lumped loads on linear springs are accurate to a few per cent of the deflection that they explain.
-_LAW_ERROR = 0.03
+_LAW_ERROR = 0.03  # lumped loads on linear springs are accurate to a few per cent of the deflection that they explain
 # Fourth-order differences [rad, m]: truncation and rounding errors are both about 1e-13 of the derivative.
 _STEP = 1e-3
 _STENCIL = np.array([-2.0, -1.0, 1.0, 2.0])

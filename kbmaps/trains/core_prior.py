@@ -15,8 +15,7 @@ from kbmaps.rotations import cross_matrix
 from kbmaps.trains.train import TensorTrain
 
 CORE_NUMBERS = 36
-# Six of a link and three of the marker.
-_MOTIONS = 9
+_MOTIONS = 9  # six of a link and three of the marker
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,8 +22,7 @@ class _Settings:
     first_damping: float = 1e-3
     smallest_damping: float = 1e-15
     largest_damping: float = 1e6
-    # A step that gains less than this share of the objective ends the search.
-    smallest_gain: float = 1e-6
+    smallest_gain: float = 1e-6  # a step that gains less than this share of the objective ends the search
 
 
 @dataclass(frozen=True, eq=False)

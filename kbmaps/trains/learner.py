@@ -86,7 +86,6 @@ def _by_coordinates(family: CoreFamily, jacobian: FloatArray, residuals: FloatAr
 
 
 def _by_cores(family: CoreFamily, jacobian: FloatArray, residuals: FloatArray) -> list[float]:
-    """Return the log evidence of each of `ELLIPSE_STDS`."""
     joints, size = len(family.mean), jacobian.shape[1]
     blocks = (jacobian.T @ jacobian).reshape(joints, CORE_NUMBERS, joints, CORE_NUMBERS)
     slope = (jacobian.T @ residuals).reshape(joints, CORE_NUMBERS, 1)
@@ -114,8 +113,7 @@ _FITTED = ("z", "sure", "used", "information", "absorbed")
 
 
 class _Settings:
-    # Initial noise of the first fit around a prior, relative to the residuals under the prior.
-    first_noise: float = 0.1
+    first_noise: float = 0.1  # initial noise of the first fit around a prior, relative to the residuals under the prior
     # A refit with this many times the noise of the fit before has diverged, and the search starts again.
     lost: float = 3.0
     share_before_refit: int = 4
@@ -464,7 +462,6 @@ class TensorLearner(Model):
 
 
 def _of_rows(name: str, values: FloatArray, length: int, width: int) -> FloatArray:
-    """Return finite `values` of shape (length, width). Raises ShapeError, NonFiniteError."""
     if len(values) != length:
         raise ShapeError(name, f"({length}, {width})", values.shape)
     return rows(name, values, width)

@@ -26,8 +26,7 @@ class _Settings:
     # Minimum of twice the gain in log evidence for a kind of errors; one arm in twelve reaches it by chance.
     telling: float = 2.0
     batch_rows: int = 512
-    # Assumed error of the last frame's axes, as a share of a marker's displacement.
-    frame_error: float = 0.05
+    frame_error: float = 0.05  # assumed error of the last frame's axes, as a share of a marker's displacement
 
 
 def misfit_directions(train: TensorTrain, q: FloatArray) -> FloatArray:
@@ -105,7 +104,7 @@ def _phases(bases: Sequence[JointBasis], q: FloatArray) -> FloatArray:
 
 
 class TensorPosterior:
-    """Gauss-Newton posterior of a train's cores. A `kbmaps.planning.posterior.Posterior`.
+    """Gauss-Newton posterior of a train's cores. A `kbmaps.planning.design.Posterior`.
 
     Args:
         train: the most likely one.

@@ -19,8 +19,7 @@ from kbmaps.trains.train import TensorTrain
 
 
 class _Settings:
-    # Relative to the spread of the positions: smaller residuals are rounding.
-    noise_floor: float = 1e-13
+    noise_floor: float = 1e-13  # Relative to the spread of the positions: smaller residuals are rounding
     # With residuals below this share of the positions' spread, no further start is needed.
     explained: float = 1e-4
     first_noise: float = 2e-2
@@ -32,16 +31,12 @@ class _Settings:
     # A pair farther than this many robust standard deviations is an outlier: 1.5e-5 of good pairs are.
     outlier_distance: float = 5.0
     weight_scale: float = 4.0
-    # Reweighting ends when no residual moves by more than this many standard deviations.
-    same_lengths: float = 0.05
-    # Random starts use at most this many pairs per joint.
-    search_pairs: int = 40
-    # With fewer degrees of freedom per pair, residuals cannot separate noise from outliers.
-    least_freedom: float = 0.2
+    same_lengths: float = 0.05  # reweighting ends when no residual moves by more than this many standard deviations
+    search_pairs: int = 40  # random starts use at most this many pairs per joint
+    least_freedom: float = 0.2  # with fewer degrees of freedom per pair, residuals cannot separate noise from outliers
 
 
-# Failed starts leave a tenth or more of the spread, and may agree on it by chance.
-PLAUSIBLE = 0.1
+PLAUSIBLE = 0.1  # failed starts leave a tenth or more of the spread, and may agree on it by chance
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,19 +202,14 @@ def _settle(pairs: Pairs, prior: CorePrior, z: FloatArray, noise: float) -> Fit:
             if optimiser.converged:
                 break
             continue
-        found = max(_noise(pairs, problem, z), pairs.noise_floor)
+        freedom = 1.0 - effective_parameters(problem, z) / (3.0 * len(pairs.x))
+        mean_square = float(np.square(problem.residuals(z))[pairs.unknown].mean())
+        found = max(math.sqrt(mean_square / max(freedom, 1e-9)), pairs.noise_floor)
         steady = abs(found / noise - 1.0) < _Settings.same_noise
         noise = found
         if (optimiser.converged and steady) or found == pairs.noise_floor:
             break
     return Fit(z, noise, used)
-
-
-def _noise(pairs: Pairs, problem: TensorProblem, z: FloatArray) -> float:
-    """Return the noise of a coordinate of the pairs that came without a sigma [m]."""
-    freedom = 1.0 - effective_parameters(problem, z) / (3.0 * len(pairs.x))
-    mean_square = float(np.square(problem.residuals(z))[pairs.unknown].mean())
-    return math.sqrt(mean_square / max(freedom, 1e-9))
 
 
 def _distances(pairs: Pairs, prior: CorePrior, fit: Fit) -> tuple[FloatArray, bool]:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.changes.monitor import DetectedChange
-from bodyschema.learning.changes.record import NAMED, TOOL
 from bodyschema.learning.solvers.solver import fitted_belief
+from bodyschema.learning.status import NAMED, TOOL
 from kbmaps import ChainBelief, ChainTolerances, ChangeKind, Explanation, KBMap, ResidualModel, any_change, explanations
 
 # 1-sigma of each coordinate [m] of the marker's displacement by another tool, and of an unknown marker position about
@@ -29,7 +29,6 @@ class KnownArm:
 
     @classmethod
     def from_bytes(cls, chain: bytes, tolerances: ChainTolerances, residual: bytes | None) -> KnownArm:
-        """Return the arm from the bytes of its parts' `to_bytes`."""
         known = None if residual is None else ResidualModel.from_bytes(residual)
         return cls(ChainBelief.from_bytes(chain), tolerances, known)
 
@@ -54,17 +53,13 @@ class KnownArm:
 
 
 class _Settings:
-    # An unnamed change widens every kind at least this probable.
-    improbable: float = 0.02
+    improbable: float = 0.02  # an unnamed change widens every kind at least this probable
     # 1-sigma of the changed part: this multiple of its most probable change, and at least this many noises.
     wider: float = 3.0
     least_noises: float = 3.0
-    # Number of runs of neighbours left out in turn to compare the new model with the old one.
-    folds: int = 4
-    # Pairs farther from a prediction than this many sigmas are clipped.
-    clipped: float = 5.0
-    # Minimum number of pairs before the change that update the previous posterior.
-    fewest_before: int = 10
+    folds: int = 4  # number of runs of neighbours left out in turn to compare the new model with the old one
+    clipped: float = 5.0  # pairs farther from a prediction than this many sigmas are clipped
+    fewest_before: int = 10  # minimum number of pairs before the change that update the previous posterior
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,9 +107,7 @@ class Origin:
 
         Args:
             found: probability of each kind of change, the most probable first.
-            q: joint values since the change.
-            x: positions since the change.
-            cov: their covariances (n, 3, 3) [m²], NaN where a pair has none; None where no pair has any.
+            cov: as `PairMemory.append` takes them.
         """
         arm = self._forgetful(found)
         belief = fitted_belief(arm.chain, q, self._of_chain(q, x), cov)

@@ -19,22 +19,17 @@ from kbmaps.variance_components import inverse_roots
 
 
 class _Settings:
-    # Minimum number of pairs of a reference model: with fewer it may be too far off.
-    fewest_known: int = 100
+    fewest_known: int = 100  # Minimum number of pairs of a reference model: with fewer it may be too far off
     # A newer model replaces the reference after half as many pairs as it knows, within these limits. It would absorb a
     # change that took longer to show.
     shortest_trial: int = 50
     longest_trial: int = 1000
-    # A model counts as the chain alone if it is this near to it, over the noise of a pair.
-    alone: float = 0.1
-    # Lower bound of a measurement's noise, whatever it claims [m].
-    smallest_m: float = 1e-6
+    alone: float = 0.1  # a model counts as the chain alone if it is this near to it, over the noise of a pair
+    smallest_m: float = 1e-6  # lower bound of a measurement's noise, whatever it claims [m]
 
 
-# If no newer model comes, the older half of this many pairs is dropped.
-MOST_WATCHED = 5000
-# Number of the model's own pairs that show its noise.
-LOOKED_BACK = 1000
+MOST_WATCHED = 5000  # if no newer model comes, the older half of this many pairs is dropped
+LOOKED_BACK = 1000  # number of the model's own pairs that show its noise
 # An alarm that a bent arm explains is evaluated again when the pairs since the change have grown by this factor, or the
 # alarm's log odds by this much.
 LOOK_AGAIN, GROWN_ODDS = 1.25, 4.0
@@ -131,7 +126,6 @@ class _Shown:
     off: FloatArray
 
     def with_newer(self, other: _Shown) -> _Shown:
-        """Return the newest of both."""
         return _Shown(
             *(
                 np.concatenate([getattr(self, name), getattr(other, name)])[-MOST_SURPRISES:]
@@ -153,7 +147,8 @@ class ChangeMonitor:
         self._next_at = self._asked_at = 0
         self._pairs: list[_Watched] = []
         self._earlier: deque[_Watched] = deque(maxlen=LOOKED_BACK)
-        self._detector: ChangeDetector | None = None
+        # Compares the pairs with the current reference; None before there is one.
+        self.detector: ChangeDetector | None = None
         self._white = WhiteNoise.as_claimed(0)
         self._change: ChangeScore | None = None
         self._look_at = 0
@@ -163,12 +158,7 @@ class ChangeMonitor:
     @property
     def ready(self) -> bool:
         """True if there is a reference that has been tried out."""
-        return self._detector is not None and self._shown is not None
-
-    @property
-    def detector(self) -> ChangeDetector | None:
-        """Detector that compares the pairs with the current reference; None before there is one."""
-        return self._detector
+        return self.detector is not None and self._shown is not None
 
     @property
     def held(self) -> int:
@@ -202,19 +192,23 @@ class ChangeMonitor:
         if self._reference is None:
             self._renew()  # not in `offer`: that runs in the background, and this takes a while
         if len(self._pairs) + len(pairs) > MOST_WATCHED and not self.alarmed:
-            self._shorten()
+            gone = len(self._pairs) // 2
+            self._drop(gone)
+            self._asked_at, self._next_at = max(self._asked_at - gone, 0), max(self._next_at - gone, 0)
+            if self._reference is not None:
+                self._hold(self._reference)
         for pair, learnt in zip(pairs, np.broadcast_to(kept, len(pairs)).tolist(), strict=True):
             turn = np.full(4, np.nan) if pair.R is None else pair.R
             self._pairs.append(_Watched(pair.seq, pair.q, pair.x, pair.cov, turn, learnt))
-        if self._detector is None:
+        if self.detector is None:
             return
         self._feed(self._pairs[-len(pairs) :])
         if not self.ready:
             if self._reference is not None and len(self._pairs) >= _trial(self._reference.known):
                 self._show()
                 self._hold(self._reference)
-        elif self._detector.due:
-            self._suspect(self._detector)
+        elif self.detector.due:
+            self._suspect(self.detector)
         tried = len(self._pairs) - self._next_at
         if self._next is not None and self.ready and not self.alarmed and tried >= _trial(self._next.known):
             self._show()
@@ -241,7 +235,7 @@ class ChangeMonitor:
         Args:
             run: number of the last pairs that have shown it in another way: it began there if not before.
         """
-        reference, detector = self._reference, self._detector
+        reference, detector = self._reference, self.detector
         if reference is None or detector is None or not self.ready or not (self.alarmed or run):
             return None
         first = earliest = latest = len(self._pairs) - run
@@ -265,9 +259,9 @@ class ChangeMonitor:
 
     def _show(self) -> None:
         """Record the distances of the pairs from a model that does not know them."""
-        if self._detector is None or self._reference is None:
+        if self.detector is None or self._reference is None:
             return
-        surprises = self._detector.surprises
+        surprises = self.detector.surprises
         pairs = self._pairs[-len(surprises) :]
         q, _, covariances = self._measured(self._reference, pairs)
         # In metres, because the next weighting of pairs may differ.
@@ -280,16 +274,7 @@ class ChangeMonitor:
         self._earlier.extend(self._pairs[:count])
         del self._pairs[:count]
 
-    def _shorten(self) -> None:
-        """Drop the older half of the pairs."""
-        gone = len(self._pairs) // 2
-        self._drop(gone)
-        self._asked_at, self._next_at = max(self._asked_at - gone, 0), max(self._next_at - gone, 0)
-        if self._reference is not None:
-            self._hold(self._reference)
-
     def _renew(self) -> None:
-        """Replace the reference by the next one."""
         if self._next is not None:
             self._drop(self._next_at)
             self._asked_at, self._next_at = max(self._asked_at - self._next_at, 0), 0
@@ -313,10 +298,10 @@ class ChangeMonitor:
         noise = seen.at_least(SharedNoise.repeated(read).times(seen.single))
         noise_m = float(np.sqrt(noise.single * _traces(covariances).mean() / 3.0))
         distance_m = float(np.linalg.norm(reference.x, axis=1).mean())
-        self._detector = ChangeDetector(reference.belief, noise, noise_m, distance_m)
+        self.detector = ChangeDetector(reference.belief, noise, noise_m, distance_m)
         if float(np.square(reference.beyond_chain(q)).mean()) < (_Settings.alone * noise_m) ** 2:
             # Terms that another model learnt from these pairs would hide the arm's bends.
-            self._detector.recall(q, reference.x - reference.belief.predict(q), covariances)
+            self.detector.recall(q, reference.x - reference.belief.predict(q), covariances)
         self._change, self._look_at = None, 0
         self._odds = self._refuted_odds = -math.inf
         self._feed(self._pairs)
@@ -327,8 +312,8 @@ class ChangeMonitor:
         return SharedNoise.of(np.matvec(inverse_roots(covariances), shown.off))
 
     def _feed(self, pairs: Sequence[_Watched]) -> None:
-        if self._reference is not None and self._detector is not None and pairs:
-            self._detector.add(*self._measured(self._reference, pairs))
+        if self._reference is not None and self.detector is not None and pairs:
+            self.detector.add(*self._measured(self._reference, pairs))
 
     def _measured(self, reference: Reference, pairs: Sequence[_Watched]) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return joint values (n, d), errors (n, 3) [m] and the covariances of these (n, 3, 3) [m²]."""

@@ -10,14 +10,10 @@ from numpy.typing import NDArray
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.replay_memory import PairMemory
 
-# A pair is an outlier if it is this many times farther from the prediction than expected.
-DOUBT = 5.0
-# Median length of errors to their 1-sigma per axis, three equal axes: 1 / sqrt(2.366).
-MEDIAN_TO_SIGMA = 0.6501
-# No robot is this exact: an expected distance is never taken to be smaller [m].
-SMALLEST_M = 1e-3
-# This many consecutive outliers prove a change.
-CHANGE = 6
+DOUBT = 5.0  # a pair is an outlier if it is this many times farther from the prediction than expected
+MEDIAN_TO_SIGMA = 0.6501  # Median length of errors to their 1-sigma per axis, three equal axes: 1 / sqrt(2.366)
+SMALLEST_M = 1e-3  # No robot is this exact: an expected distance is never taken to be smaller [m]
+CHANGE = 6  # this many consecutive outliers prove a change
 # This many are enough if one other position of the marker explains them: their remaining distances are at most this
 # multiple of the expected ones, and at most this share of those from the prediction.
 FEWEST_FOR_CHANGE = 3
@@ -32,17 +28,12 @@ class OutlierGate:
 
     def __init__(self, joints: int) -> None:
         self._memory = PairMemory(joints, CHANGE)
-        self._in_a_row = 0
-
-    @property
-    def in_a_row(self) -> int:
-        """Number of consecutive outliers up to now."""
-        return self._in_a_row
+        self.in_a_row = 0
 
     @property
     def changed(self) -> bool:
         """True if the run of outliers is long enough to prove a change."""
-        return self._in_a_row >= CHANGE
+        return self.in_a_row >= CHANGE
 
     @property
     def perhaps_changed(self) -> bool:
@@ -52,7 +43,7 @@ class OutlierGate:
     def doubt(self, q: FloatArray, x: FloatArray, distance_m: float, limit_m: float) -> bool:
         """Return True if the pair at q (d,), x (3,), `distance_m` from its prediction, is an outlier."""
         doubted = distance_m > limit_m
-        self._in_a_row = self._in_a_row + 1 if doubted else 0
+        self.in_a_row = self.in_a_row + 1 if doubted else 0
         if doubted:
             self._memory.append(q[None], x[None])
         else:
@@ -66,7 +57,7 @@ class OutlierGate:
     def restore(self, q: FloatArray, x: FloatArray, in_a_row: int) -> None:
         """Resume from the run q (n, d), x (n, 3), of which `in_a_row` were counted."""
         self._memory.restore(q, x, in_a_row)
-        self._in_a_row = in_a_row
+        self.in_a_row = in_a_row
 
 
 def sound(distances_m: FloatArray, noise_m: float) -> NDArray[np.bool_]:

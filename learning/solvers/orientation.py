@@ -30,8 +30,7 @@ KEPT, FITTED = 4000, 1000
 # Growth of the number of pairs before the next solution, with a new search for the maps' precision; the chain with
 # residual waits for it too, since it takes up to a second.
 GROWTH = 1.15
-# Minimum number of orientations for a map: with fewer, the chain suffices.
-FEWEST_FOR_MAP = 30
+FEWEST_FOR_MAP = 30  # Minimum number of orientations for a map: with fewer, the chain suffices
 # An entry of a rotation matrix errs by this much of a small turn's 1-sigma about one axis: √(2/3).
 ENTRY_OF_TURN = 0.8165
 
@@ -81,9 +80,6 @@ class OrientationSolver:
         chain = fitted_orientation(belief, self._q[chosen], self._turns[chosen])
         if not self._with_map or self._pairs < FEWEST_FOR_MAP:
             return OrientationSolution(self._pairs, chain)
-        return self._with_solved_map(chain)
-
-    def _with_solved_map(self, chain: OrientedChain) -> OrientationSolution:
         prior = chain.chain.to_kbmap(self._bases, orientation=True)
         if self._exact is None:
             self._exact = ExactLearner(prior, memory=Memory(window=WINDOW))

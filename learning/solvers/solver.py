@@ -33,23 +33,18 @@ from kbmaps.arrays import evenly_spread
 
 log = logging.getLogger(__name__)
 
-# Memory and time grow with the square and the cube of the control points: 3^7 take 77 MB and 0.2 s.
-LARGEST_NET = 2187
+LARGEST_NET = 2187  # Memory and time grow with the square and the cube of the control points: 3^7 take 77 MB and 0.2 s
 
 
 class _Settings:
-    # Growth of the number of pairs before the next search for the prior's precision.
-    retune: float = 1.25
-    # Number of pairs that a chain is fitted to, evenly spread.
-    fitted: int = 2000
+    retune: float = 1.25  # growth of the number of pairs before the next search for the prior's precision
+    fitted: int = 2000  # number of pairs that a chain is fitted to, evenly spread
     # With this growth of the number of pairs, this share of them is solved for first, if it is at least this many.
     first_growth: float = 1.5
     first_share: float = 0.75
     fewest_first: int = 5
-    # Minimum number of neighbours counting as one at which their correlation is not chance.
-    shared: float = 1.5
-    # While pairs are few, a solution is cheap, and renewed after this growth of their number.
-    growth: float = 0.1
+    shared: float = 1.5  # minimum number of neighbours counting as one at which their correlation is not chance
+    growth: float = 0.1  # while pairs are few, a solution is cheap, and renewed after this growth of their number
 
 
 # The information about the chain of pairs older than those kept is folded into its prior, this many at a time.
@@ -92,14 +87,7 @@ class Solver(Protocol):
     def learn(
         self, q: FloatArray, x: FloatArray, cov: FloatArray | None = None, turns: FloatArray | None = None
     ) -> None:
-        """Add pairs, q (n, d) [rad] and x (n, 3) [m].
-
-        Args:
-            q: joint values.
-            x: positions.
-            cov: their covariances (n, 3, 3) [m²], NaN where a pair has none; None where no pair has any.
-            turns: their orientations, quaternions (n, 4), likewise.
-        """
+        """Add pairs, q (n, d) [rad] and x (n, 3) [m], cov and turns as `PairMemory.append` takes them."""
 
     def solve(self) -> None:
         """Request the solutions of all pairs so far; `poll` returns them one by one, perhaps later."""
@@ -125,7 +113,6 @@ class DirectSolver:
         self._q = self._x = self._cov = np.empty((0, 0))
 
     def start(self, task: Task) -> None:
-        """Forget all pairs and begin a new task."""
         self._solved_at = 0
         self._task, self._folded, self._folded_residual = task, task.belief, task.residual or task.belief
         within = Memory(window=WINDOW)
@@ -138,7 +125,6 @@ class DirectSolver:
     def learn(
         self, q: FloatArray, x: FloatArray, cov: FloatArray | None = None, turns: FloatArray | None = None
     ) -> None:
-        """Add pairs, as `Solver` does."""
         if self._orientations is not None and turns is not None:
             self._orientations.learn(q, x, turns)
         if self._exact is not None:
@@ -156,12 +142,13 @@ class DirectSolver:
         self._solved += self.solutions()
 
     def poll(self) -> Solved | None:
-        """Return the next answer to the last `solve`."""
         return self._solved.pop(0) if self._solved else None
 
     def solutions(self) -> Iterator[Solved]:
         """Yield each model's solution as it is found, the rigid chain first: it is the quickest."""
-        task = self._started
+        if self._task is None:
+            raise RuntimeError("start a task first")
+        task = self._task
         if self._pairs >= _Settings.first_growth * self._solved_at:
             yield from self._solved_of_some(task)
         self._solved_at = self._pairs
@@ -215,12 +202,6 @@ class DirectSolver:
 
     def _first(self, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
         return self._q[:count], self._x[:count], self._cov[:count]
-
-    @property
-    def _started(self) -> Task:
-        if self._task is None:
-            raise RuntimeError("start a task first")
-        return self._task
 
     @property
     def _before(self) -> ChainBelief:
@@ -318,7 +299,6 @@ class SolverClient:
 
     @property
     def due(self) -> bool:
-        """True if it is time to ask."""
         enough = min(self._every, max(_Settings.growth * self._solved_at, 1.0))
         return self.fed > 0 and (self._soon or self.fed - self._solved_at >= enough)
 
@@ -357,12 +337,10 @@ class SolverClient:
         self.fed = fed
 
     def ask(self) -> None:
-        """Request the solutions of all pairs so far."""
         self._solver.solve()
         self.busy, self._soon, self._solved_at = True, False, self.fed
 
     def poll(self) -> Solved | None:
-        """Return the next answer if there is one, without waiting."""
         solved = self._solver.poll()
         if solved is not None:
             self.busy = not solved.last

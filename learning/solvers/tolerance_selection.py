@@ -16,12 +16,9 @@ from kbmaps.robust import ROUNDING_M
 
 # Candidate tilts of an axis [rad] and shifts [m], 1-sigma, from a milled arm to a kit.
 WORKMANSHIP = ((0.0003, 0.0001), (0.001, 0.0005), (0.003, 0.001), (0.01, 0.003), (0.03, 0.01), (0.06, 0.03))
-# Pairs at which candidates are compared with the posterior, evenly spread.
-FOLLOWED = 100
-# Less probable tolerances are not considered.
-LEAST_SHARE = 0.01
-# Narrower tolerances are kept unless wider ones are more probable by more than the inverse of this.
-LIKELY = 1.0 / 3.0
+FOLLOWED = 100  # pairs at which candidates are compared with the posterior, evenly spread
+LEAST_SHARE = 0.01  # less probable tolerances are not considered
+LIKELY = 1.0 / 3.0  # narrower tolerances are kept unless wider ones are more probable by more than the inverse of this
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,7 @@ import sqlite3
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 
-# Batch size: deleting this many takes a few milliseconds, so no new pair waits long.
-AT_ONCE = 500
+AT_ONCE = 500  # Batch size: deleting this many takes a few milliseconds, so no new pair waits long
 
 
 @dataclass(frozen=True, slots=True)

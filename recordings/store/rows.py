@@ -40,7 +40,6 @@ class Checked(NamedTuple):
 
 
 def row_of(pair: Pair, session: int) -> tuple[Any, ...]:
-    """Return the values of the columns of `pairs`."""
     arrays = (as_json(pair.q.tolist()), as_json(pair.x.tolist()), as_json(upper_triangle(pair.cov)))
     centres = None if pair.centres_px is None else as_json(pair.centres_px)
     turn = None if pair.R is None else as_json(pair.R.tolist())

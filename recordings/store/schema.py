@@ -124,7 +124,6 @@ def check_kind(connection: sqlite3.Connection, file: Path) -> None:
 
 
 def version(connection: sqlite3.Connection) -> int:
-    """Return the schema of the file."""
     return int(connection.execute("PRAGMA user_version").fetchone()[0])
 
 
@@ -182,7 +181,6 @@ def meta(connection: sqlite3.Connection) -> dict[str, str]:
 
 
 def new_meta(joints: Sequence[str], utc: str) -> dict[str, str]:
-    """Return the properties of a new store."""
     return {"store": str(uuid.uuid4()), "created_utc": utc, "joints": msgspec.json.encode(joints).decode()}
 
 
@@ -212,7 +210,6 @@ def write_meta(connection: sqlite3.Connection, contents: dict[str, str]) -> None
 
 
 def create(connection: sqlite3.Connection, contents: dict[str, str]) -> None:
-    """Create the tables of an empty store."""
     with transaction(connection):
         for statement in TABLES:
             connection.execute(statement)

@@ -185,7 +185,6 @@ class PairReader:
             return max(newest + behind, self._given_up_to)
 
     def first_seq(self) -> int:
-        """Return the sequence number of the oldest pair; 1 if there is none."""
         with self._reading() as connection:
             return oldest(connection)
 
@@ -285,7 +284,6 @@ class PairStore:
 
     @property
     def identity(self) -> str:
-        """UUID of the store."""
         return self.reader.identity
 
     @property

@@ -8,7 +8,7 @@ import msgspec
 import pytest
 
 from bodyschema.daemon.learner.findings import Changes
-from bodyschema.learning.changes.record import ChangeRecord, KindOfChange
+from bodyschema.learning.status import ChangeRecord, KindOfChange
 
 JOINTS = ("waist", "shoulder", "elbow")
 UNDECIDED = ChangeRecord(

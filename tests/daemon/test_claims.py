@@ -16,7 +16,7 @@ from kbmaps import ChainBelief, ChainParameters, ChainTolerances
 NOISE = np.full(3, 1e-6)
 FAR = np.full((1, JOINTS), 2.5)
 NOMINAL = nominal_model()
-MODEL = NOMINAL.prior()
+MODEL = NOMINAL.prior
 TOLERANCES = chain_tolerances(LearnerConfig())
 DRAWN = NOMINAL.belief(NOMINAL.chain, TOLERANCES)
 

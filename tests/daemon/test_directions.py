@@ -151,7 +151,7 @@ def test_the_chain_with_residual_weighs_them_too() -> None:
 
 def test_the_solver_weighs_what_it_was_fed() -> None:
     seen, solver = Seen(4, ONE_CAMERA), DirectSolver()
-    solver.start(Task(1, NOMINAL.prior(), BELIEF))
+    solver.start(Task(1, NOMINAL.prior, BELIEF))
     for part in (slice(0, 50), slice(50, None)):
         solver.learn(seen.q[part], seen.x[part], seen.cov[part])
     solved = [each for each in solver.solutions() if each.wide is not None][-1]

@@ -60,7 +60,7 @@ def test_first_pairs_that_the_fitted_tool_contradicts_are_no_part_of_a_run() -> 
     nominal, scene = nominal_model(), Scene.draw(0, 8)
     tolerances = ChainTolerances(tool=0.03)
     arm = KnownArm(nominal.belief(nominal.chain, tolerances), tolerances)
-    era = Regime(nominal.prior(), arm, UncertaintyTracker(nominal.bases, 0.1), LearnerConfig(), itertools.count())
+    era = Regime(nominal.prior, arm, UncertaintyTracker(nominal.bases, 0.1), LearnerConfig(), itertools.count())
     x = np.array([pair.x for pair in scene.pairs])
     x[0] += 0.2  # with the old tool
     era.begin_with(scene.q[:6], x[:6])

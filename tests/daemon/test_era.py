@@ -49,7 +49,7 @@ def learn(era: Regime, part: slice) -> None:
 def era() -> Regime:
     """Return a regime with a chain and residual models; the rigid chain's map is the best of the maps."""
     arm = KnownArm(BELIEF, TOLERANCES)
-    era = Regime(NOMINAL.prior(), arm, UncertaintyTracker(NOMINAL.bases, 0.1), LearnerConfig(), itertools.count())
+    era = Regime(NOMINAL.prior, arm, UncertaintyTracker(NOMINAL.bases, 0.1), LearnerConfig(), itertools.count())
     learn(era, slice(0, 20))
     residual = fitted_residual(BELIEF, SCENE.q, X)
     assert residual is not None

@@ -64,4 +64,4 @@ def test_a_solver_that_cannot_start_is_tried_again(monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr("bodyschema.daemon.learner.solver_process.subprocess.Popen", no_more)
     with SolverProcess() as solver, pytest.raises(SolverLostError, match="cannot be started: Too many open files"):
-        solver.start(Task(1, NOMINAL.prior(), NOMINAL.belief(NOMINAL.chain, ChainTolerances())))
+        solver.start(Task(1, NOMINAL.prior, NOMINAL.belief(NOMINAL.chain, ChainTolerances())))

@@ -15,10 +15,8 @@ from hidden_units import DESK_ARM, unit
 
 from bodyschema.cli.main import main
 from bodyschema.diagnosis.report.result import Cause, DiagnosisFile, Errors, Gain, Interval, Pairs, Unexplained
-from bodyschema.fleet.diagnosing import Diagnosed
-from bodyschema.fleet.recordings import Job, jobs
-from bodyschema.fleet.summary import summary
-from bodyschema.fleet.summary_view import sentences
+from bodyschema.fleet.diagnosing import Diagnosed, Job, jobs
+from bodyschema.fleet.summary import sentences, summary
 from bodyschema.interfaces.errors import RecordingError, RequestError
 from bodyschema.robot.description import RobotDescription
 

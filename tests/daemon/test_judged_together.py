@@ -43,13 +43,13 @@ def with_outliers(pairs: list[Pair], places: list[int]) -> list[Pair]:
 def test_the_instant_learner_knows_a_pair_before_it_is_judged() -> None:
     scene = Scene.draw(0, 20)
     era = Regime(
-        NOMINAL.prior(),
+        NOMINAL.prior,
         KnownArm(NOMINAL.belief(NOMINAL.chain, TOLERANCES), TOLERANCES),
         UncertaintyTracker(NOMINAL.bases, 0.1),
         SETTINGS,
         itertools.count(),
     )
-    reference = NLMS(NOMINAL.prior())
+    reference = NLMS(NOMINAL.prior)
     for pair in scene.pairs:
         era.meet(pair)
         reference.learn(pair.q, pair.x)

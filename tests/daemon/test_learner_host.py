@@ -37,7 +37,7 @@ from kbmaps import ChainTolerances
 
 NOMINAL = nominal_model()
 LIMIT_S = 500.0
-TASK = Task(1, NOMINAL.prior(), NOMINAL.belief(NOMINAL.chain, ChainTolerances()))
+TASK = Task(1, NOMINAL.prior, NOMINAL.belief(NOMINAL.chain, ChainTolerances()))
 
 
 def described(folder: Path, name: str, learner: str, more: str = "") -> Path:

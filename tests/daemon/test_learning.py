@@ -54,7 +54,7 @@ def test_the_online_pass_takes_one_step_for_each_pair() -> None:
     scene = Scene.draw(0, 60)
     learning = new_learning()
     teach(learning, scene.pairs, background=False)
-    reference = NLMS(nominal_model().prior())
+    reference = NLMS(nominal_model().prior)
     for pair in scene.pairs:
         reference.learn(pair.q, pair.x)
     np.testing.assert_allclose(learning.state().arrays["net_nlms"], reference.map.net, atol=1e-10)

@@ -12,7 +12,7 @@ X = np.array([pair.x for pair in SCENE.pairs])
 
 @pytest.fixture
 def members() -> ModelBank:
-    members = ModelBank(nominal_model().prior())
+    members = ModelBank(nominal_model().prior)
     members.replay(SCENE.q, X)
     return members
 

@@ -117,7 +117,7 @@ def test_another_tool_is_found_while_it_answers(arm: SaggingArm, taught: OnlineL
 def test_the_solver_s_process_gives_the_solution_that_a_direct_one_gives(arm: SaggingArm) -> None:
     nominal = nominal_model()
     tolerances = ChainTolerances(axes=0.05, points=0.015, tool=0.03)
-    task = Task(1, nominal.prior(), nominal.belief(nominal.chain, tolerances))
+    task = Task(1, nominal.prior, nominal.belief(nominal.chain, tolerances))
     q = arm.q[:60]
     found: list[str] = []
     with SolverProcess() as process:

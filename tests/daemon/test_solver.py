@@ -13,7 +13,7 @@ from kbmaps import ChainTolerances, RigidChain
 NOMINAL = nominal_model()
 TOLERANCES = ChainTolerances(axes=0.05, points=0.015, zeros=0.05, tool=0.03)
 BELIEF = NOMINAL.belief(NOMINAL.chain, TOLERANCES)
-TASK = Task(1, NOMINAL.prior(), BELIEF)
+TASK = Task(1, NOMINAL.prior, BELIEF)
 SIGMA_M = 0.002
 # A tenth of the solver's own numbers.
 KEPT, FOLDED = 400, 200
@@ -87,7 +87,7 @@ def rigid_error_m(real: RigidChain, seed: int, tolerances: ChainTolerances | Non
     """Return the mean error of the solved chain near a path of 150 pairs with 20 mm of noise."""
     rng, solver = np.random.default_rng(seed), DirectSolver()
     q = path(rng, 150)
-    solver.start(Task(1, NOMINAL.prior(), BELIEF, tolerances=tolerances))
+    solver.start(Task(1, NOMINAL.prior, BELIEF, tolerances=tolerances))
     solver.learn(q, real.positions(q) + 0.02 * rng.normal(size=(len(q), 3)))
     chain = next(solved.model for solved in solver.solutions() if solved.name == RIGID and solved.pairs == len(q))
     assert chain is not None

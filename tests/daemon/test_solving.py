@@ -15,7 +15,7 @@ from bodyschema.learning.solvers.solver import Solved, SolverClient, Task
 from kbmaps import ChainTolerances
 
 NOMINAL = nominal_model()
-PRIOR = NOMINAL.prior()
+PRIOR = NOMINAL.prior
 TASK = Task(1, PRIOR, NOMINAL.belief(NOMINAL.chain, ChainTolerances()))
 Q, X = np.zeros((10, JOINTS)), np.zeros((10, 3))
 

@@ -8,7 +8,7 @@ from planted_cases import motion_of, seen, surveyed_arm
 
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.observations import Observations
-from bodyschema.diagnosis.search.aliases import alias_sentences, aliases
+from bodyschema.diagnosis.search.drives import alias_sentences, aliases
 from bodyschema.effects import Effect, Simulation
 
 GRID_RAD = np.radians(5.0)  # 72 angles a turn

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from planted_cases import BASE, ELBOW, SHOULDER, desk_arm, scattered
 
-from bodyschema.diagnosis.unnamed.families import Family
-from bodyschema.diagnosis.unnamed.sensitivity import joints_of
+from bodyschema.diagnosis.unnamed.families import Family, joints_of
 from bodyschema.effects import Simulated, Simulation
 from bodyschema.interfaces.records import FloatArray
 

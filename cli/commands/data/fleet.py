@@ -19,7 +19,7 @@ from bodyschema.interfaces.waits import STATUS_EVERY_S
 
 if TYPE_CHECKING:
     from bodyschema.cli.recordings.diagnosis import Asked
-    from bodyschema.fleet.recordings import Job
+    from bodyschema.fleet.diagnosing import Job
     from bodyschema.fleet.roster import Place
 
 
@@ -78,7 +78,7 @@ def fleet(
             raise RequestError("recordings do not go with --connect, --compare or --watch")
         if len(robot) > 1:
             raise RequestError("recordings take one --robot, that of all")
-        from bodyschema.fleet.recordings import jobs
+        from bodyschema.fleet.diagnosing import jobs
         from bodyschema.interfaces.extras import require_extra
 
         require_extra("fleet", "diagnosing many recordings")
@@ -138,8 +138,7 @@ def _diagnose(
 ) -> None:
     from bodyschema.fleet.diagnosing import diagnose_all
     from bodyschema.fleet.diagnosing import workers as cluster
-    from bodyschema.fleet.summary import summary
-    from bodyschema.fleet.summary_view import progress, view
+    from bodyschema.fleet.summary import progress, summary, view
 
     with (
         progress(Console(stderr=True, highlight=False), len(wanted)) as (told, done),

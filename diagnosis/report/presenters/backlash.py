@@ -30,7 +30,6 @@ class Backlash(Presenter):
         )
 
     def panel(self, residuals: Residuals, effect: Effect) -> Panel:
-        """Plot both directions of motion separately."""
         k = residuals.run.simulation.place(effect).joint
         partial, _ = attributed(residuals, effect)
         rows, x, y = residuals.telling(k), residuals.angles(k), residuals.as_angle(k, partial)

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from bodyschema.diagnosis.report.panels import Panel
-from bodyschema.diagnosis.report.residuals import Residuals
-from bodyschema.effects import Effect
-
 from .evidence import by_distance
 from .presenter import FoundCause, Presenter, Workshop
 
@@ -15,6 +11,7 @@ class CameraFocal(Presenter):
 
     effect = "camera_focal"
     noun = "a wrong focal length"
+    plot = staticmethod(by_distance)
 
     def finding(self, found: FoundCause) -> str:
         return f"the focal length is {100 * found.numbers['focal_error']:+.3g} % off: depth is scaled"
@@ -23,6 +20,3 @@ class CameraFocal(Presenter):
         assert workshop.robot.calibration is not None
         focal = workshop.robot.calibration.focal_px * (1.0 + found.numbers["focal_error"])
         return f"Calibrate the cameras again; or set focal_px = {focal:.6g} in robot.toml."
-
-    def panel(self, residuals: Residuals, effect: Effect) -> Panel:
-        return by_distance(residuals, effect)

@@ -28,7 +28,6 @@ class CameraLatency(Presenter):
         return f"{what} {1e3 * abs(late):.3g} ms {where} the images' time stamps, or stop the arm for each pair."
 
     def panel(self, residuals: Residuals, effect: Effect) -> Panel:
-        """Plot along the way of motion, over the speed."""
         partial, own = attributed(residuals, effect)
         velocity = -residuals.run.columns(effect)[:, :, 0]
         speed = np.linalg.norm(velocity, axis=1)

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from bodyschema.diagnosis.report.panels import Panel
-from bodyschema.diagnosis.report.residuals import Residuals
-from bodyschema.effects import Effect
-
 from .evidence import over_time_since
 from .presenter import FoundCause, Presenter, Workshop, pose, toml_pose
 
@@ -15,6 +11,7 @@ class CameraMoved(Presenter):
 
     effect = "camera_moved"
     noun = "the {seen_by} having moved"
+    plot = staticmethod(over_time_since)
 
     def finding(self, found: FoundCause) -> str:
         moved = "was bumped" if found.seen_by == "camera" else "moved"
@@ -28,6 +25,3 @@ class CameraMoved(Presenter):
             return f"{advice} Calibrate its pose again with what was measured since."
         T = camera.pose @ workshop.pose_of("camera_pose") @ pose(found.numbers)
         return f"{advice} Since then its pose in robot.toml is {toml_pose(T)}."
-
-    def panel(self, residuals: Residuals, effect: Effect) -> Panel:
-        return over_time_since(residuals, effect)

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from bodyschema.diagnosis.report.panels import Panel
-from bodyschema.diagnosis.report.residuals import Residuals
-from bodyschema.effects import Effect
-
 from .evidence import over_time_since
 from .presenter import FoundCause, Presenter, Workshop
 
@@ -15,12 +11,10 @@ class CameraRefocused(Presenter):
 
     effect = "camera_refocused"
     noun = "a lens that refocused"
+    plot = staticmethod(over_time_since)
 
     def finding(self, found: FoundCause) -> str:
         return f"a lens refocused: its focal length changed by {100 * found.numbers['focal_error']:+.3g} %{found.when}"
 
     def remedy(self, workshop: Workshop, found: FoundCause) -> str:
         return "Switch autofocus off: set focus in [vision.cameras.…]. Then calibrate the cameras again."
-
-    def panel(self, residuals: Residuals, effect: Effect) -> Panel:
-        return over_time_since(residuals, effect)

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from bodyschema.diagnosis.report.panels import Panel
-from bodyschema.diagnosis.report.residuals import Residuals
-from bodyschema.effects import Effect
-
 from .evidence import by_distance
 from .presenter import FoundCause, Presenter, Workshop
 
@@ -15,6 +11,7 @@ class CameraScale(Presenter):
 
     effect = "camera_scale"
     noun = "a wrong scale of all that is measured"
+    plot = staticmethod(by_distance)
 
     def finding(self, found: FoundCause) -> str:
         error = found.numbers["scale_error"]
@@ -36,6 +33,3 @@ class CameraScale(Presenter):
             f"Measure the squares of the calibration board and calibrate the stereo pair again; or set baseline_m = "
             f"{calibration.baseline_m / factor:.6g} in robot.toml."
         )
-
-    def panel(self, residuals: Residuals, effect: Effect) -> Panel:
-        return by_distance(residuals, effect)

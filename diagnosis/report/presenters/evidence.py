@@ -14,8 +14,7 @@ from bodyschema.effects.moments import after
 from bodyschema.interfaces.records import FloatArray
 
 _FINE = 500
-# A ripple with more cycles is plotted over its phase.
-_MANY_CYCLES = 4.0
+_MANY_CYCLES = 4.0  # a ripple with more cycles is plotted over its phase
 
 
 def attributed(residuals: Residuals, effect: Effect) -> tuple[FloatArray, FloatArray]:
@@ -32,7 +31,6 @@ def scatter_plot(
     title: str,
     axes: tuple[str, str],
 ) -> Panel:
-    """Plot single samples, their means, and the fitted curve."""
     x, y = points
     some = residuals.some(POINTS, rows)
     bins = binned(x[rows], y[rows])
@@ -104,7 +102,6 @@ def remembered(residuals: Residuals, effect: Effect) -> FloatArray:
 
 
 def over_time_since(residuals: Residuals, effect: Effect) -> Panel:
-    """Plot the displacement along a jump, over time."""
     begins = float(residuals.clock[0]) - 1.0
     always = residuals.instead(effect, np.append(effect.values[:-1], begins))
     partial, _ = attributed(residuals, effect)

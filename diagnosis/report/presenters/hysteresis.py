@@ -28,7 +28,6 @@ class Hysteresis(Presenter):
         )
 
     def panel(self, residuals: Residuals, effect: Effect) -> Panel:
-        """Plot over the strain of the friction."""
         correction = remembered(residuals, effect)
         strained = -correction / max(float(effect.values[0]), 1e-12)
         return over_quantity(residuals, effect, strained, f"direction of the last moves of {effect.where}", correction)

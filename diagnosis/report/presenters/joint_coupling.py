@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from bodyschema.diagnosis.report.panels import Panel
-from bodyschema.diagnosis.report.residuals import Residuals
-from bodyschema.effects import Effect
-
 from .evidence import over_reading
 from .presenter import FoundCause, Presenter, Workshop
 
@@ -15,6 +11,7 @@ class JointCoupling(Presenter):
 
     effect = "joint_coupling"
     noun = "joint {joint} moving with joint {source}"
+    plot = staticmethod(over_reading)
 
     def finding(self, found: FoundCause) -> str:
         return f"{found.at} moves by {100 * found.numbers['ratio']:+.3g} % of joint {found.source}'s angle"
@@ -25,6 +22,3 @@ class JointCoupling(Presenter):
             f"In the driver, add {ratio} times the reading of {found.source} to that of {found.where}: "
             f"a tendon or a differential carries {found.source}'s motion on."
         )
-
-    def panel(self, residuals: Residuals, effect: Effect) -> Panel:
-        return over_reading(residuals, effect)

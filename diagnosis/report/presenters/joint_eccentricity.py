@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from bodyschema.diagnosis.report.panels import Panel
-from bodyschema.diagnosis.report.residuals import Residuals
-from bodyschema.effects import Effect
-
 from .evidence import over_reading
 from .presenter import DEG, FoundCause, Presenter, Workshop, with_sign
 
@@ -15,6 +11,7 @@ class JointEccentricity(Presenter):
 
     effect = "joint_eccentricity"
     noun = "an eccentric encoder of joint {joint}"
+    plot = staticmethod(over_reading)
 
     def finding(self, found: FoundCause) -> str:
         return f"the encoder of {found.at} sits off its axis: ±{found.numbers['amplitude_rad'] * DEG:.2g}° once a turn"
@@ -25,6 +22,3 @@ class JointEccentricity(Presenter):
             f"Centre the encoder's magnet of {found.where} on the axis. Until then add "
             f"{amplitude:.3g}°·sin(q {with_sign(phase)}°) to its reading q."
         )
-
-    def panel(self, residuals: Residuals, effect: Effect) -> Panel:
-        return over_reading(residuals, effect)

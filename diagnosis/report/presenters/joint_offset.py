@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from bodyschema.diagnosis.report.panels import Panel
-from bodyschema.diagnosis.report.residuals import Residuals
-from bodyschema.effects import Effect
-
 from .evidence import over_reading
 from .presenter import FoundCause, Presenter, Workshop
 
@@ -17,6 +13,7 @@ class JointOffset(Presenter):
 
     effect = "joint_offset"
     noun = "a wrong zero of joint {joint}"
+    plot = staticmethod(over_reading)
 
     def finding(self, found: FoundCause) -> str:
         return f"the zero of {found.at} is off by {found.signed('offset')}"
@@ -27,6 +24,3 @@ class JointOffset(Presenter):
             f"Add {workshop.amount(found, 'offset')} to what the encoder of {found.where} reads, in its homing "
             f"offset or in the driver. Or in the URDF: {move.format(found.where)} its axis{workshop.in_urdf}."
         )
-
-    def panel(self, residuals: Residuals, effect: Effect) -> Panel:
-        return over_reading(residuals, effect)

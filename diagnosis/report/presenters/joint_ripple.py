@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from bodyschema.diagnosis.report.panels import Panel
-from bodyschema.diagnosis.report.residuals import Residuals
-from bodyschema.effects import Effect
-
 from .evidence import over_reading
 from .presenter import DEG, FoundCause, Presenter, Workshop, with_sign
 
@@ -15,6 +11,7 @@ class JointRipple(Presenter):
 
     effect = "joint_ripple"
     noun = "a ripple of joint {joint}"
+    plot = staticmethod(over_reading)
 
     def finding(self, found: FoundCause) -> str:
         numbers = found.numbers
@@ -35,6 +32,3 @@ class JointRipple(Presenter):
             wave = f"{numbers['amplitude_rad'] * DEG:.2g}°·sin({cycles:.4g}·q {phase})"
             part = f"comes round {cycles:.3g} times a turn: teeth, a strain wave, pole pairs"
         return f"Look in the drive of {found.where} for what {part}. Or add {wave} to its reading q."
-
-    def panel(self, residuals: Residuals, effect: Effect) -> Panel:
-        return over_reading(residuals, effect)

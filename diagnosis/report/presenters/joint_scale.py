@@ -2,15 +2,10 @@
 
 from __future__ import annotations
 
-from bodyschema.diagnosis.report.panels import Panel
-from bodyschema.diagnosis.report.residuals import Residuals
-from bodyschema.effects import Effect
-
 from .evidence import over_reading
 from .presenter import FoundCause, Presenter, Workshop
 
-# A scale error below this reverses the joint's direction.
-_BACKWARDS = -1.0
+_BACKWARDS = -1.0  # a scale error below this reverses the joint's direction
 
 
 class JointScale(Presenter):
@@ -18,6 +13,7 @@ class JointScale(Presenter):
 
     effect = "joint_scale"
     noun = "a wrong ratio of joint {joint}"
+    plot = staticmethod(over_reading)
 
     def finding(self, found: FoundCause) -> str:
         error = found.numbers["scale_error"]
@@ -33,6 +29,3 @@ class JointScale(Presenter):
             f"Multiply what the encoder of {found.where} reads by {1.0 + error:.5f}: check its gear "
             "ratio and its counts per turn."
         )
-
-    def panel(self, residuals: Residuals, effect: Effect) -> Panel:
-        return over_reading(residuals, effect)

@@ -33,7 +33,6 @@ class Outliers(Presenter):
 
 
 def outlier_panel(residuals: Residuals) -> Panel:
-    """Plot outliers beside the other fixes, over time."""
     length = 1e3 * np.linalg.norm(residuals.after, axis=1)
     away = np.flatnonzero(~residuals.diagnosis.markers)
     plot = Plot(residuals.clock_label, "error [mm]", span(residuals.clock), (0.0, 1.05 * float(length.max())))

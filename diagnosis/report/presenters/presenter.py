@@ -23,34 +23,25 @@ from bodyschema.robot.rpy import rpy_of
 from .evidence import measured_against_predicted
 
 DEG = math.degrees(1.0)
-# Ticks that divide a turn to within this share are counted per turn.
-_WHOLE_TURN = 0.01
-# A step is one decimal of a file, and no tick, if its logarithm is a whole number to this.
-_DECIMAL = 1e-3
+_WHOLE_TURN = 0.01  # ticks that divide a turn to within this share are counted per turn
+_DECIMAL = 1e-3  # a step is one decimal of a file, and no tick, if its logarithm is a whole number to this
 
 
 @dataclass(frozen=True)
 class FoundCause:
-    """A cause with its numbers.
+    """A cause with its numbers."""
 
-    Attributes:
-        where, source: the joint it acts on, and the joint that causes it; None where there is none.
-        numbers: of shifts and turns, only those given count.
-        seen_by: the kind of measuring device, as in `DiagnosisFile`.
-        timed: True if the recording has times; otherwise a moment is a row number.
-        weighed: True if the URDF states masses; otherwise compliances are those of links of an assumed weight.
-    """
-
+    # where, source: the joint it acts on, and the joint that causes it; None where there is none
     where: str | None
     source: str | None
-    numbers: Mapping[str, float]
-    seen_by: str = "camera"
-    timed: bool = True
+    numbers: Mapping[str, float]  # of shifts and turns, only those given count
+    seen_by: str = "camera"  # the kind of measuring device, as in `DiagnosisFile`
+    timed: bool = True  # True if the recording has times; otherwise a moment is a row number
+    # True if the URDF states masses; otherwise compliances are those of links of an assumed weight
     weighed: bool = True
 
     @classmethod
     def of(cls, cause: Cause) -> FoundCause:
-        """Return a cause with all of its numbers."""
         return cls(cause.where, cause.source, {name: interval.value for name, interval in cause.parameters.items()})
 
     @property
@@ -60,27 +51,22 @@ class FoundCause:
 
     @property
     def shift(self) -> str:
-        """Length of its shift."""
         return f"{1e3 * self._size('x_m', 'y_m', 'z_m'):.3g} mm"
 
     @property
     def turn(self) -> str:
-        """Angle of its turn."""
         return f"{self._size('rx_rad', 'ry_rad', 'rz_rad') * DEG:.2g}°"
 
     @property
     def shifts(self) -> list[str]:
-        """Axes of its shift."""
         return [axis for axis in "xyz" if f"{axis}_m" in self.numbers]
 
     @property
     def turns(self) -> list[str]:
-        """Axes of its turn."""
         return [axis for axis in "xyz" if f"r{axis}_rad" in self.numbers]
 
     @property
     def moved(self) -> str:
-        """Its shift and its turn."""
         return " and ".join(said for said, axes in ((self.shift, self.shifts), (self.turn, self.turns)) if axes)
 
     @property
@@ -95,7 +81,6 @@ class FoundCause:
         return self.signed(base).lstrip("+")
 
     def signed(self, base: str) -> str:
-        """Return such a number with its sign."""
         if f"{base}_rad" in self.numbers:
             return f"{self.numbers[f'{base}_rad'] * DEG:+.3g}°"
         return f"{self.numbers[f'{base}_m'] * 1e3:+.3g} mm"
@@ -106,23 +91,15 @@ class FoundCause:
 
 @dataclass(frozen=True)
 class Workshop:
-    """What is known of the robot to which a remedy is applied.
+    """What is known of the robot to which a remedy is applied."""
 
-    Attributes:
-        robot: the robot as described.
-        steps: encoder step of each joint (d,) [rad, m]; 0 where it is unknown.
-        torques: the largest torque of gravity on each joint (d,) [N·m, N].
-        causes: all causes, by effect.
-    """
-
-    robot: RobotDescription
-    steps: FloatArray
-    torques: FloatArray
-    causes: Mapping[str, Cause] = field(default_factory=dict)
+    robot: RobotDescription  # the robot as described
+    steps: FloatArray  # encoder step of each joint (d,) [rad, m]; 0 where it is unknown
+    torques: FloatArray  # the largest torque of gravity on each joint (d,) [N·m, N]
+    causes: Mapping[str, Cause] = field(default_factory=dict)  # all causes, by effect
 
     @property
     def in_urdf(self) -> str:
-        """Hint at the corrected URDF."""
         return f" (--out writes {corrected_file(self.robot)}, which has it)"
 
     def joint(self, found: FoundCause) -> int:
@@ -130,7 +107,6 @@ class Workshop:
         return self.robot.joints.index(found.where or "")
 
     def slides(self, found: FoundCause) -> bool:
-        """Return True for a cause at a prismatic joint."""
         return bool(self.robot.chain.prismatic[self.joint(found)])
 
     def amount(self, found: FoundCause, base: str) -> str:
@@ -159,15 +135,12 @@ class Workshop:
 
 
 class Presenter(ABC):
-    """Sentences and a plot for one effect.
+    """Sentences and a plot for one effect."""
 
-    Attributes:
-        effect: name of the effect.
-        noun: the cause in a few words without figures, with {joint}, {source} and {seen_by} to fill in.
-    """
-
-    effect: ClassVar[str]
-    noun: str
+    effect: ClassVar[str]  # name of the effect
+    noun: str  # the cause in a few words without figures, with {joint}, {source} and {seen_by} to fill in
+    # plots the evidence for a cause; `panel` may do it instead
+    plot: ClassVar[staticmethod[[Residuals, Effect], Panel]] = staticmethod(measured_against_predicted)
 
     @abstractmethod
     def finding(self, found: FoundCause) -> str:
@@ -178,8 +151,7 @@ class Presenter(ABC):
         """Return what to do about a cause."""
 
     def panel(self, residuals: Residuals, effect: Effect) -> Panel:
-        """Plot the evidence for a cause."""
-        return measured_against_predicted(residuals, effect)
+        return self.plot(residuals, effect)
 
 
 class PlainPresenter(Presenter):
@@ -213,7 +185,6 @@ def toml_pose(T: FloatArray) -> str:
 
 
 def short(value: float, digits: int) -> str:
-    """Return a number without trailing zeros."""
     return f"{round(value, digits) + 0.0:.{digits}f}".rstrip("0").rstrip(".")
 
 

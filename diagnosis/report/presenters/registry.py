@@ -27,7 +27,6 @@ def named(effect: str, where: str | None, source: str | None, seen_by: str = "ca
 
 
 def rival_named(rival: Indistinguishable, seen_by: str = "camera") -> str:
-    """Return a rival in a few words."""
     return rival.what or named(rival.effect, rival.where, rival.source, seen_by)
 
 

@@ -11,8 +11,7 @@ from bodyschema.effects import Effect
 from .evidence import over_quantity, remembered
 from .presenter import FoundCause, Presenter, Workshop
 
-# Remaining share at which a move has ended.
-_ENDED = 0.001
+_ENDED = 0.001  # remaining share at which a move has ended
 
 
 class Settling(Presenter):

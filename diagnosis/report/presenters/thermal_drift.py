@@ -13,8 +13,7 @@ from bodyschema.effects import Effect
 from .evidence import attributed, scatter_plot
 from .presenter import FoundCause, Presenter, Workshop
 
-# Remaining share at which a drift is over.
-_OVER = 0.05
+_OVER = 0.05  # remaining share at which a drift is over
 
 
 class ThermalDrift(Presenter):

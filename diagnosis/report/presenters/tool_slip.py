@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from bodyschema.diagnosis.report.panels import Panel
-from bodyschema.diagnosis.report.residuals import Residuals
-from bodyschema.effects import Effect
-
 from .evidence import over_time_since
 from .presenter import FoundCause, Presenter, Workshop, listed, pose
 
@@ -17,6 +13,7 @@ class ToolSlip(Presenter):
 
     effect = "tool_slip"
     noun = "a marker that slipped"
+    plot = staticmethod(over_time_since)
 
     def finding(self, found: FoundCause) -> str:
         return f"the marker slipped by {found.shift}{found.when}"
@@ -28,6 +25,3 @@ class ToolSlip(Presenter):
         shift = pose(found.numbers)[:3, 3] + workshop.pose_of("tool_offset")[:3, 3]
         marker = listed(np.array(robot.marker_xyz) + shift)
         return f"Fasten the marker: it slipped on the hand. What was measured since needs marker_xyz = {marker}."
-
-    def panel(self, residuals: Residuals, effect: Effect) -> Panel:
-        return over_time_since(residuals, effect)
