@@ -209,6 +209,7 @@ def is_told(made: Sequence[tuple[float, float]]) -> bool:
 
 
 def _spread(belief: ChainBelief, which: IntArray) -> FloatArray:
+    """Return 1-sigma (k,) of some of the parameters."""
     return np.sqrt(np.square(belief.root[which]).sum(axis=1))
 
 

@@ -172,6 +172,7 @@ class _Fit:
 
     @property
     def unknowns(self) -> int:
+        """Number of fitted parameters."""
         return 3 * self.terms(0.0).shape[1]
 
     @property
@@ -187,6 +188,7 @@ class _Fit:
         return np.hstack([np.ones((len(q), 1)), u, u[:, rows] * u[:, columns], nominal - nominal.mean(axis=0)])
 
     def residual(self, lag: float, keep: NDArray[np.bool_] | slice = slice(None)) -> FloatArray:
+        """Return the residual of the fitted smooth function, shape (m, 3) [m]."""
         A, x = self.terms(lag)[keep], self.x[keep]
         scale = np.linalg.norm(A, axis=0) + np.finfo(float).tiny
         A = A / scale
@@ -194,6 +196,7 @@ class _Fit:
         return x - A @ weights
 
     def whitened(self, lag: float) -> _Fit:
+        """Return the same fit with positions whitened by the covariance of the residual at `lag` (larger in depth)."""
         return replace(self, x=self.x @ _whitening(self.residual(lag)).T)
 
     def cost(self, lag: float, keep: NDArray[np.bool_] | slice = slice(None)) -> float:
@@ -228,6 +231,7 @@ class _RigidFit:
 
     @property
     def unknowns(self) -> int:
+        """Number of fitted parameters."""
         return self.parameters.size
 
     def fitted(
@@ -252,6 +256,7 @@ class _RigidFit:
         return self.fitted(lag, keep)[1] @ self.white.T
 
     def whitened(self, lag: float) -> _RigidFit:
+        """Return the same fit with residuals whitened by their covariance at `lag` (larger in depth)."""
         start, left = self.fitted(lag, steps=_Settings.settling)
         return replace(self, start=start, white=_whitening(left))
 
@@ -287,6 +292,7 @@ def _nearest(smooth: _Fit, lag: float) -> tuple[_AnyFit, float, float]:
 
 
 def _rms(left: FloatArray) -> float:
+    """Return the RMS length of vectors (m, 3)."""
     return math.sqrt(float(np.mean(np.sum(left**2, axis=1))))
 
 
@@ -334,6 +340,7 @@ def _require_following(fit: _Fit, cost: float) -> None:
 
 
 def _strange(fit: _Fit, cost: float) -> str:
+    """Return the message for a marker that does not move with the joints."""
     moved_m, residual_m = fit.motion_m, math.sqrt(cost / len(fit.x))
     return (
         f"the marker does not follow the joints: of {1e3 * moved_m:.0f} mm of motion (RMS) {1e3 * residual_m:.0f} mm "

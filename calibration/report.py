@@ -262,6 +262,7 @@ def _zeros(calibration: Calibration, values: FloatArray, halves: FloatArray) -> 
 
 
 def _far_off(calibration: Calibration, zeros: list[Zero], times: float) -> list[str]:
+    """Return messages about joint offsets larger than `times` their tolerance."""
     told = calibration.learner.tolerances
     said: list[str] = []
     for zero, slides in zip(zeros, calibration.robot.chain.prismatic, strict=True):
@@ -323,6 +324,7 @@ def _many_left_out(calibration: Calibration, first: int) -> list[str]:
 
 
 def _badly_made(calibration: Calibration) -> list[str]:
+    """Return a message if the geometric errors reach the largest that are considered; else an empty list."""
     made, (axes, points) = calibration.workmanship, WORKMANSHIP[-1]
     if made is None or made.axes < axes:
         return []

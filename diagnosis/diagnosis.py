@@ -547,6 +547,7 @@ def _searched(begun: Fit, search: Search) -> Fit:
 
 
 def _with_small_ones_tolerated(fit: Fit) -> Fit:
+    """Refit with the periodic errors of drives that are no larger than those of other drives as tolerances."""
     fit = with_small_ripples(fit)
     small = _small_ones(fit)
     return fit.tolerating(tolerated(fit).scales, small) if small else fit

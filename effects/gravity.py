@@ -213,6 +213,7 @@ class _Turn:
 
     @classmethod
     def of(cls, body: Body, q: FloatArray) -> _Turn:
+        """Build the motion at q (n,)."""
         assert body.joint is not None
         T = body.T_carrier_joint
         if body.joint.kind in REVOLUTE:
@@ -221,6 +222,7 @@ class _Turn:
         return cls(body.turns, np.zeros(1), np.ones(1), T[:3, 3:] + slid[:, None] * q)
 
     def apply(self, vectors: FloatArray) -> FloatArray:
+        """Return vectors (3, n) in the carrier's frame."""
         return self._mixed(self.turns, vectors)
 
     def inverse(self, vectors: FloatArray) -> FloatArray:
@@ -233,4 +235,5 @@ class _Turn:
 
 
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return a × b (3, n)."""
     return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])

@@ -135,6 +135,7 @@ class Motion:
 
 @lru_cache(maxsize=_EARLIER_KEPT)
 def _earlier(motion: Motion, lag_s: float) -> Motion:
+    """Return the earlier readings; cached, since a search repeats the same lags."""
     assert motion.t is not None
     return _asked(motion, motion.t - lag_s)
 

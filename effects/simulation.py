@@ -491,6 +491,7 @@ class Simulated:
 
     @cached_property
     def _by_point(self) -> FloatArray:
+        """Derivatives (n, 3, 3) of the reported position by the point."""
         reported = self.simulation.reported
         changes = [
             reported(self.x_camera + step, self.motion) - reported(self.x_camera - step, self.motion)

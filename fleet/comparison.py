@@ -199,6 +199,7 @@ def _spread(values: FloatArray) -> float:
 
 
 def _camera_moved(found: ChainCalibration | None) -> tuple[float, float] | tuple[None, None]:
+    """Return the distance [mm] and the turn [°] from the camera pose in robot.toml."""
     if found is None:
         return None, None
     moved = math.dist([each.drawn for each in found.camera_xyz], [each.learnt for each in found.camera_xyz])

@@ -208,6 +208,7 @@ def _client_of(scheduler: str) -> Client:
 
 
 def _leave_ctrl_c() -> None:
+    """Ignore Ctrl-C on a worker of our terminal: the parent process handles it and ends the worker."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 

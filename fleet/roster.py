@@ -67,6 +67,7 @@ class Member:
 
     @property
     def health(self) -> list[str]:
+        """Problems, as sentences; empty if all is well."""
         said = [sentence for status in (self.sampler, self.learner) if status is not None for sentence in status.health]
         if not self.alive:
             return ["neither its sampler nor its learner is alive"]
@@ -132,6 +133,7 @@ class Fleet:
         return [members[name] for name in sorted(members)]
 
     def bus(self, route: Route) -> ZenohSession:
+        """Return the session of a route; BusError if no process answers there."""
         if route not in self._sessions:
             self._sessions[route] = self._open.enter_context(ZenohSession(connect=route, client=True))
         return self._sessions[route]

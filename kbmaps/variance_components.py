@@ -100,6 +100,7 @@ def _inverse_root(covariances: FloatArray) -> FloatArray:
 
 
 def _turned(root: FloatArray, vectors: FloatArray) -> FloatArray:
+    """Return lower triangles (6, n) times vectors (3, n)."""
     (a, b, c, d, e, f), (x, y, z) = root, vectors
     return np.stack([a * x, b * x + c * y, d * x + e * y + f * z])
 

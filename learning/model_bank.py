@@ -60,6 +60,7 @@ class ModelBank:
         return self._fixed[PRIOR]
 
     def model(self, name: str) -> LearntModel:
+        """Return one of the current models; later learning does not change it."""
         return self._residual if name == RESIDUAL and self._residual is not None else self.map(name)
 
     def map(self, name: str) -> KBMap:

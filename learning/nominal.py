@@ -144,6 +144,7 @@ class NominalModel:
         return ChainBelief.from_tolerances(ChainParameters(chain), self.tolerances(tolerances))
 
     def tolerances(self, known: ChainTolerances) -> ChainTolerances:
+        """Return the tolerances of the nominal chain, given those of one whose frame and marker are known."""
         if not self.pose_known:
             known = replace(known, base_rotation=math.inf, base_translation=math.inf)
         if not self.marker_known:

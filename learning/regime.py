@@ -96,6 +96,7 @@ class Regime:
 
     @property
     def owes_replays(self) -> bool:
+        """True if replay steps are due."""
         return self._replays_due >= 1.0 and len(self.memory) > 0
 
     @property

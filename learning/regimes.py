@@ -49,6 +49,7 @@ class Fitting:
         self.is_first = True  # true if nothing has been fitted yet
 
     def due(self, pairs: int) -> bool:
+        """Return True if it is time to fit."""
         return self.due_at is not None and pairs >= self.due_at
 
     def change_tool(self, before: KBMap, hand: RigidChain, first_at: int = PAIRS_TO_REFIT) -> None:

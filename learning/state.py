@@ -82,6 +82,7 @@ class LearningState:
 
     @property
     def before(self) -> LearningState | None:
+        """State before the last change; None if there is none."""
         if self.header.before is None:
             return None
         arrays = {name.removeprefix(BEFORE): each for name, each in self.arrays.items() if name.startswith(BEFORE)}

@@ -116,6 +116,8 @@ class Recording:
 
     @classmethod
     def from_table(cls, table: Table, joints: tuple[str, ...], file: Path | None = None) -> Self:
+        """Build the recording from a table with a checked header."""
+
         def optional(names: tuple[str, ...]) -> FloatArray | None:
             return table.columns(names) if table.has(names) else None
 
@@ -245,6 +247,7 @@ def joints_in(file: Path) -> tuple[str, ...]:
 
 @contextmanager
 def _explained(file: Path) -> Iterator[None]:
+    """Convert errors of reading `file` to RecordingError, after a look at its ending."""
     try:
         if file.suffix.lower() not in (CSV, PARQUET):
             file.stat()  # a wrong path is the likelier mistake

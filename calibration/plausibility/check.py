@@ -138,6 +138,7 @@ class _Check:
 
     @property
     def _before(self) -> float:
+        """Distance of the pairs as they are [m]."""
         return self.search.fits[self.as_it_is].error
 
     @property

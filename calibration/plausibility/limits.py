@@ -71,6 +71,7 @@ def beyond_limits(robot: RobotDescription, q: FloatArray, by: float = 0.0) -> Bo
 
 
 def limits_text(robot: RobotDescription, joint: int) -> str:
+    """Return a joint's limits for people, as in `-2.6 to 2.6 rad (-149° to 149°)`."""
     lower, upper = robot.lower[joint], robot.upper[joint]
     if robot.tree.joint(robot.joints[joint]).kind not in REVOLUTE:
         return f"{lower:.4g} to {upper:.4g} m"

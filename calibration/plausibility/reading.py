@@ -132,6 +132,7 @@ class Reading:
         return _listed([looks for looks, _ in self._said(joints, zeros)])
 
     def remedy(self, joints: Sequence[str], zeros: FloatArray) -> str:
+        """Return what to do; arguments as in `looks`."""
         remedies = "; ".join(remedy for _, remedy in self._said(joints, zeros))
         return f"{remedies[0].upper()}{remedies[1:]}"
 

@@ -275,6 +275,7 @@ class ReadingSearch:
         return tuple(name for name, error in zip(names, others, strict=True) if error < THRESHOLDS.much_better * own)
 
     def _whole_error(self, reading: Reading) -> float:
+        """Return the RMS distance [m] of all rows, outliers included."""
         q, x = reading.angles(self.q, self.chain.prismatic), reading.positions(self.x)
         return max(float(np.sqrt(np.square(self.distances(q, x, [(q, x)])).mean())), self.exact_m)
 

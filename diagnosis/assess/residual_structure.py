@@ -34,6 +34,7 @@ class ResidualStructure:
 
     @property
     def is_there(self) -> bool:
+        """True if there is any structure."""
         return bool(self.what)
 
     @property

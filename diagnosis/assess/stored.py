@@ -89,6 +89,7 @@ class _Elsewhere:
         return cls(fit, _sums(errors, markers), variance)
 
     def is_better_than(self, simpler: _Elsewhere) -> bool:
+        """Return True if this fit is surely better elsewhere."""
         gains = simpler.squares - self.squares
         unsure = float(np.std(gains, ddof=1)) * np.sqrt(len(gains)) * stdtrit(len(gains) - 1, _SURELY)
         return float(gains.sum()) - unsure > max(self.variance - simpler.variance, 0.0)

@@ -37,6 +37,7 @@ class Scales(NamedTuple):
 
     @property
     def no_larger(self) -> Scales:
+        """Return these scales, each limited to 1 (a workshop's tolerance)."""
         return Scales(*np.minimum(self, 1.0).tolist())
 
     @property

@@ -415,6 +415,7 @@ class Fit:
         return _at(observations, simulation, self.nuisances, self.noise, background, run=run)
 
     def to(self, observations: Observations, start: Simulation | None = None) -> Fit:
+        """Refit to other observations of the same motion, optionally from another simulation."""
         simulation = start or self.simulation
         fit = _at(observations, simulation, self.nuisances, self.noise, self.background, self.tolerated)
         return improved(replace(fit, tangent=self.own_tangent))
@@ -463,6 +464,7 @@ class Fit:
         return improved(self._about(self.settled_simulation, None, observations)).simulation
 
     def untolerated(self) -> Fit:
+        """Refit without any tolerance."""
         if self.background.scales is None:
             return self
         return improved(self._about(self.simulation.with_background(self.background.given), None))
@@ -474,6 +476,7 @@ class Fit:
         return improved(self.starting(causes))
 
     def starting(self, causes: Sequence[Effect]) -> Fit:
+        """Replace the causes, without fitting."""
         started = self.at(self.simulation.with_effects((*self.simulation.effects[: self.nuisances], *causes)))
         return replace(started, tangent=self.own_tangent)
 

@@ -85,7 +85,11 @@ class Noise:
 
 
 def correlation(left: FloatArray, begins: NDArray[np.bool_]) -> float:
-    """Return the correlation [0, 1) of residuals (n, 3) of neighbouring rows; 0 within two errors of white rows."""
+    """Return the correlation [0, 1) of residuals (n, 3) of neighbouring rows; 0 within two errors of white rows.
+
+    Args:
+        begins: (n,), True in the first row after each break.
+    """
     follows = ~begins[1:]
     agree = float((left[1:][follows] * left[:-1][follows]).sum())
     squares = float(np.square(left[1:][follows]).sum())

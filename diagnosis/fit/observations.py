@@ -91,6 +91,7 @@ class Observations:
         return replace(self, doubtful=None, rattling=None, is_whole=True)
 
     def with_factor(self, stated_factor: float) -> Observations:
+        """Return the same observations with another factor on the instrument's noise."""
         return replace(self, stated_factor=stated_factor)
 
     def __len__(self) -> int:

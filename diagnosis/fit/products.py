@@ -169,4 +169,5 @@ class Rows:
 
 
 def _summed(factors: FloatArray, rows: FloatArray) -> FloatArray:
+    """Return sums (m, ...) of rows (n, ...) times factors (n, m)."""
     return (factors.T @ rows.reshape(len(rows), -1)).reshape(factors.shape[1], *rows.shape[1:])

@@ -73,7 +73,11 @@ class Number:
 
 
 def numbers_of(cause: Cause, *, timed: bool) -> list[Number]:
-    """Return the formatted numbers of a cause."""
+    """Return the formatted numbers of a cause.
+
+    Args:
+        timed: True if the recording has times; otherwise a moment is a row number.
+    """
     names = [name for name in cause.parameters if name not in _SAID_AGAIN or not _has_amplitude(cause)]
     return [number(name, cause.parameters[name], timed=timed) for name in names]
 

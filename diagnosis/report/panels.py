@@ -25,6 +25,7 @@ class Panel:
 
     @property
     def is_telling(self) -> bool:
+        """True if the plot shows a clear dependence."""
         return self.tells >= Layout.telling
 
     def html(self) -> str:
@@ -171,6 +172,7 @@ def _cell_means(cells: NDArray[np.intp], at: FloatArray, error: FloatArray) -> F
 
 
 def histogram(residuals: Residuals) -> Panel:
+    """Plot lengths of the errors before and after, beside those of noise alone."""
     before, after = (1e3 * np.linalg.norm(e[residuals.rows], axis=1) for e in (residuals.before, residuals.after))
     noise = 1e3 * _noise(residuals)
     end = float(np.quantile(np.concatenate([before, after]), Layout.shown)) or 1.0

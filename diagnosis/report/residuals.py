@@ -61,6 +61,7 @@ class Residuals:
 
     @property
     def timed(self) -> bool:
+        """True if the recording has times."""
         return self.motion.t is not None
 
     @cached_property
@@ -73,6 +74,7 @@ class Residuals:
         return "time [s]" if self.timed else "row"
 
     def slides(self, joint: int) -> bool:
+        """Return True if a joint is prismatic."""
         return bool(self.robot.chain.prismatic[joint])
 
     def angles(self, joint: int) -> FloatArray:

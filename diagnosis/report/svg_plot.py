@@ -54,9 +54,11 @@ class Plot:
         return f'<svg viewBox="{size}" role="img" aria-label="{label}">{self._grid()}{inside}</svg>'
 
     def dots(self, x: FloatArray, y: FloatArray, look: str) -> str:
+        """Draw the points inside the axes, as one path to keep the file small."""
         return f'<path class="dots {look}" d="{self._points(x, y)}"/>'
 
     def line(self, x: FloatArray, y: FloatArray, look: str) -> str:
+        """Draw a curve through points in their order."""
         left, top = self._at(x, y)
         points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(left, top, strict=True))
         return f'<polyline class="line {look}" points="{points}"/>'

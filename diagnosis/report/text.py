@@ -190,6 +190,7 @@ def _head(causes: Sequence[Cause], tolerances: Tolerances | None, seen_by: str, 
 
 
 def _shows(tolerances: Tolerances | None) -> bool:
+    """Return True if small errors everywhere have more than a small share of the gain."""
     return tolerances is not None and tolerances.share_percent >= SMALL
 
 
@@ -201,6 +202,7 @@ def _or(cause: Cause, seen_by: str) -> str:
 
 
 def _or_a_cause(tolerances: Tolerances | None, seen_by: str) -> str:
+    """Return the most probable cause that may be there in the place of large tolerances, in parentheses."""
     if tolerances is None or not tolerances.leaves_open:
         return ""
     rival = tolerances.rivals[0]
@@ -238,6 +240,7 @@ def made_to(tolerances: Tolerances, seen_by: str) -> str:
 
 
 def _instead(tolerances: Tolerances, seen_by: str) -> str:
+    """Return a sentence on what may be there in the place of large tolerances."""
     told = [f"{rival_named(rival, seen_by)} ({100.0 * rival.probability:.0f} %)" for rival in tolerances.rivals]
     if not told:
         return ""

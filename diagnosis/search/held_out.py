@@ -149,6 +149,7 @@ class _Products:
 
     @classmethod
     def of(cls, fit: Fit, columns: FloatArray, blocks: Blocks) -> _Products:
+        """Form the products of columns (n, 3, p)."""
         rows = []
         for fold in range(_Settings.folds):
             own = np.flatnonzero(blocks.fold == fold)
@@ -198,6 +199,7 @@ def beside_fit(fit: Fit, columns: FloatArray) -> FloatArray:
 
 
 def _p_value(fit: Fit, beside: FloatArray, blocks: Blocks) -> float:
+    """Return the `block_p_value` of columns from what they change beside the fit (n, 3, k)."""
     flat = beside.reshape(fit.left.size, -1)
     inner = flat.T @ flat
     scales = np.sqrt(np.maximum(np.diag(inner), 1e-300))

@@ -192,6 +192,7 @@ class Scan:
         return Candidate(effect.with_values(values), float(gains[best]), int(dofs[best]), trials)
 
     def _each(self, effect: Effect, shapes: FloatArray) -> System:
+        """Return the system of each shape (m,), which scales the same columns row by row."""
         run = self._fit.run
         if not isinstance(effect.kind, EncoderEffect):
             constant = np.broadcast_to(np.eye(3), (len(run.motion), 3, 3))
@@ -274,6 +275,7 @@ class Scan:
         return self._best(self._products.kept(begun, lambda: self._rippled(effect, cycles)), effect)
 
     def _rippled(self, effect: Effect, cycles: FloatArray) -> System:
+        """Return the system of equally spaced numbers of cycles (m,)."""
         place = self._fit.simulation.place(effect)
         angle = self._fit.run.readings.q[:, place.joint] * (2.0 * np.pi if place.prismatic else 1.0)
         # Compute exp(i cycles angle), each from the one before.
@@ -314,6 +316,8 @@ class Scan:
         return Candidate(effect.with_values(values), float(gains.max()), dof, n - 2 * _Settings.beside, interval)
 
     def _linear(self, effect: Effect) -> System:
+        """Return the system of an effect that has amounts only."""
+
         def linear() -> System:
             encoder = effect.kind
             if not isinstance(encoder, EncoderEffect):
@@ -330,12 +334,14 @@ class Scan:
         return float(self._solved(self._products.of(columns), effect)[0][0])
 
     def _solved(self, system: System, effect: Effect) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return gains (m,), amounts (m, k) and degrees of freedom (m,) of m systems."""
         inner, gradient, raw = system.at(self._state)
         gains, amounts = self._gains(inner, gradient, effect)
         dofs = self._dofs(inner, raw, effect)
         return np.where(dofs > 0, gains, 0.0), amounts, dofs
 
     def _best(self, system: System, effect: Effect) -> _Tried:
+        """Return the index of the best of many systems, gains (m,), its amounts (k,) and degrees of freedom."""
         inner, gradient, raw = system.at(self._state)
         gains, amounts = self._gains(inner, gradient, effect)
         best = int(np.argmax(gains))
@@ -348,6 +354,7 @@ class Scan:
         return best, gains, amounts[best], dof
 
     def _gains(self, inner: FloatArray, gradient: FloatArray, effect: Effect) -> tuple[FloatArray, FloatArray]:
+        """Return gains (m,) and amounts (m, k)."""
         sigma2, unit = self._fit.noise.sigma**2, _units(effect)
         scaled = inner * unit[:, None] * unit
         if len(unit) == 1:
@@ -360,6 +367,7 @@ class Scan:
         return -3.0 * self._products.rows * np.log1p(-explained / square), amounts
 
     def _dofs(self, inner: FloatArray, raw: FloatArray, effect: Effect) -> FloatArray:
+        """Return degrees of freedom (m,)."""
         unit = _units(effect)
         shares = _eigenvalues(inner / np.sqrt(np.maximum(raw[:, :, None] * raw[:, None, :], 1e-300)))
         told = _eigenvalues(inner * unit[:, None] * unit) > 10.0 * self._fit.noise.sigma**2
@@ -379,6 +387,7 @@ def moment_again(fit: Fit, cause: Effect, doubted: NDArray[np.bool_]) -> Candida
 
 @cache
 def _subsets(count: int) -> NDArray[np.bool_]:
+    """Return all sets of some of `count` amounts (m, count)."""
     chosen = (np.arange(1, 2**count)[:, None] >> np.arange(count)) & 1
     return np.asarray(chosen, dtype=np.bool_)
 
@@ -389,6 +398,7 @@ def _units(effect: Effect) -> FloatArray:
 
 
 def _eigenvalues(matrices: FloatArray) -> FloatArray:
+    """Return the eigenvalues (m, k) of symmetric matrices (m, k, k), in increasing order."""
     values = matrices[:, 0] if matrices.shape[1] == 1 else np.linalg.eigvalsh(matrices)
     return np.asarray(values, dtype=np.float64)
 

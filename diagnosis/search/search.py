@@ -385,6 +385,7 @@ class Search:
 
 
 def _near_moment(fit: Fit, cause: Effect) -> NDArray[np.bool_]:
+    """Return the rows (n,) near the moment at which a cause begins."""
     row = int(np.searchsorted(fit.observations.motion.clock, cause.values[-1]))
     return np.abs(np.arange(len(fit.left)) + 0.5 - row) < _Settings.near_a_moment
 

@@ -202,6 +202,7 @@ class Sets:
         return here
 
     def _without_one(self, here: Together) -> Together | None:
+        """Remove one cause or a part of one, where that is more probable."""
         present = frozenset(here.chosen)
         groups = [group for group in self._groups if present.issuperset(group)]
         losses = self._losses(here, groups)
@@ -259,6 +260,7 @@ class Sets:
         return squares + volumes - self._costs_of(here.chosen, groups, are_in=True)
 
     def _cost(self, chosen: Sequence[int]) -> float:
+        """Return the cost of naming the causes of a set [nats]."""
         total, kinds = 0.0, set[EffectType]()
         numbers: Counter[Key] = Counter()
         for k in chosen:
@@ -457,6 +459,7 @@ class Sets:
 
 
 def _usual(effects: Sequence[Effect]) -> FloatArray:
+    """Return the usual sizes of the amounts of effects (p,)."""
     return np.array([effect.parameters[k].usual for effect in effects for k in effect.amounts])
 
 

@@ -98,6 +98,7 @@ def in_place_of_tolerances(fit: Fit, hypotheses: Sequence[Effect]) -> list[tuple
 
 
 def tolerated(fit: Fit) -> Tolerated:
+    """Return the scales of tolerances with the most evidence beside the causes of a fit."""
     if fit.background.scales is None:
         unseen = np.zeros(SCALES, dtype=np.bool_)
         return Tolerated(Scales(), np.full(SCALES, SPREAD), unseen, np.full(SCALES, MOST))
@@ -192,6 +193,7 @@ class _Place:
         return best if best is not None and self._worth(best) > self.here.worth + STILL else None
 
     def numbers_of(self, one: Together) -> list[Effect]:
+        """Return the causes of a set, those of which some numbers may be free once for each."""
         return [self._sets.effects[k] for k in one.chosen]
 
     def refitted(self, one: Together) -> Fit:
@@ -208,11 +210,16 @@ class _Place:
         return max(fits, key=self._worth)
 
     def _worth(self, fit: Fit) -> float:
+        """Return the evidence of a fit's own causes less the cost of naming them [nats]."""
         return _own(fit, self._doubt).worth
 
 
 def _own(fit: Fit, doubt: float) -> Together:
-    """Return the set of a fit's own causes."""
+    """Return the set of a fit's own causes.
+
+    Args:
+        doubt: minimum cost of naming one of them [nats].
+    """
     parts = [part for cause in fit.causes for part in _in_parts(Candidate(cause, 0.0, 1))]
     sets = Sets(fit, parts, doubt)
     return sets.of(sets.again(fit.causes))

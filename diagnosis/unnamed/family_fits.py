@@ -173,6 +173,7 @@ class UnnamedFamilies:
 
     @cached_property
     def _by_joint(self) -> list[FloatArray]:
+        """Displacements (n, 3, 1) by each joint, whitened."""
         moved = self._start.observations.whitened(self._run.by_joint)
         return [moved[:, :, [k]] for k in range(moved.shape[2])]
 

@@ -42,6 +42,7 @@ def sentences(left_out: Iterable[LeftOut]) -> list[str]:
 
 
 def numbers(effect: Effect) -> str:
+    """Return the values of an effect with their names, in readable form."""
     return ", ".join(f"{p.name} = {value:.4g}" for p, value in zip(effect.parameters, effect.values, strict=True))
 
 
@@ -93,6 +94,7 @@ def residual_note(simulation: Simulation) -> list[str]:
 
 
 def moment_notes(simulation: Simulation) -> Iterator[str]:
+    """Yield a sentence on each effect that began at a moment and stays."""
     for effect in simulation.all_effects:
         if effect.kind.stays_as is not None:
             at = "" if effect.where is None else f" at {effect.where}"
@@ -107,6 +109,7 @@ def geometry_of(simulation: Simulation) -> CalibratedGeometry:
 
 
 def geometry_without_zeros(simulation: Simulation) -> CalibratedGeometry:
+    """Return the geometry without joint offsets."""
     own, background = (
         [effect for effect in effects if not effect.kind.is_zero]
         for effects in (simulation.effects, simulation.background)

@@ -352,6 +352,7 @@ class _Document:
         return total
 
     def _keep_left_out(self) -> None:
+        """Store the numbers of effects that the file cannot hold, for programs that know them."""
         for count, left_out in enumerate(self._errors.left_out):
             effect = left_out.effect
             name = f"{'_'.join(filter(None, effect.key))}_{count}"

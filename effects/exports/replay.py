@@ -19,6 +19,7 @@ _SPRING_ROUNDS = 5  # a spring's deflection changes its own load; each round add
 
 
 def mujoco_version() -> str | None:
+    """Return the version of the installed MuJoCo; None without it."""
     try:
         import mujoco
     except ImportError:
@@ -92,6 +93,7 @@ class _Statics:
         self._loose = [k for k in range(model.njnt) if model.joint(k).name.endswith(LOOSE)]
 
     def positions(self, readings: FloatArray) -> FloatArray:
+        """Return positions at readings (n, d), in their order."""
         mujoco, model, data = self._mujoco, self._model, self._data
         qpos, springs = data.qpos, model.jnt_qposadr[self._springs]
         loads, stiffness = model.jnt_dofadr[self._springs], model.jnt_stiffness[self._springs]

@@ -63,6 +63,7 @@ class _Fit:
     shift: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     def markers(self) -> FloatArray:
+        """Return the marker positions (n, 3) in the nominal frame."""
         return self.nominal_positions + self.nominal_rotations @ self.shift
 
     def errors(self) -> FloatArray:

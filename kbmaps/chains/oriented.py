@@ -192,6 +192,7 @@ class _Fit:
         return OrientedChain(self._belief.parameters, self._mean, turn, outward @ self._root, noise)
 
     def _linearised(self) -> tuple[FloatArray, FloatArray]:
+        """Return the errors (n, 3) [rad] and their derivatives by the unknowns (n, 3, k + 3)."""
         hand, omega = self._belief.parameters.turned(self._mean, self._q)
         errors = rotation_vectors(self._measured @ (hand @ self._turn).swapaxes(1, 2))
         return errors, np.concatenate([omega @ self._belief.root, hand], axis=2)

@@ -176,6 +176,7 @@ class RigidFilter:
             raise np.linalg.LinAlgError("Singular matrix")
 
     def _linearised(self, change: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return positions (n, 3) of the chain at `change`, and their derivatives (n, 3, p) at the origin."""
         x, jacobian = self.parameters.linearised(change if self.origin is None else self.origin, q)
         if self.origin is not None:
             x = self.parameters.positions(change, q)

@@ -411,4 +411,5 @@ def _same(x: FloatArray, other: FloatArray) -> bool:
 
 
 def _parse_precision(value: Any) -> Precision:
+    """Return a stored precision. Raises ModelFormatError."""
     return value if value is None or value == "evidence" else number(value, "the precision")

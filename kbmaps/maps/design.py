@@ -95,6 +95,7 @@ def _full_products(polynomials: FloatArray, size: int) -> FloatArray:
 
 
 def _kronecker(factors: Sequence[FloatArray]) -> FloatArray:
+    """Return row-wise Kronecker products: (n, product of the widths)."""
     product = factors[-1]
     for factor in reversed(factors[:-1]):
         product = (factor[:, :, None] * product[:, None, :]).reshape(len(product), -1)

@@ -340,6 +340,7 @@ class ExactLearner:
         return [positions] if self._outputs == POSITION_OUTPUTS else [positions, slice(POSITION_OUTPUTS, POSE_OUTPUTS)]
 
     def _most_evident(self, gram: ShiftedGram, errors: FloatArray, rhs: FloatArray) -> _Fit:
+        """Return the fit at λ of the greatest evidence, searched from the last λ on."""
         mean = gram.trace / gram.size
         low, high = (limit * mean for limit in SEARCH_LIMITS)
         fits: dict[float, _Fit] = {}

@@ -180,6 +180,7 @@ class ResidualLearner(Model):
 
 
 def _stored_prior(value: Any) -> ChainBelief | ResidualModel | None:
+    """Return the prior among the fields of stored bytes. Raises ModelFormatError, TypeError, ValueError."""
     if value is None:
         return None
     if isinstance(value, dict) and "belief" in value:

@@ -462,6 +462,7 @@ class TensorLearner(Model):
 
 
 def _of_rows(name: str, values: FloatArray, length: int, width: int) -> FloatArray:
+    """Return finite `values` of shape (length, width). Raises ShapeError, NonFiniteError."""
     if len(values) != length:
         raise ShapeError(name, f"({length}, {width})", values.shape)
     return rows(name, values, width)

@@ -113,6 +113,7 @@ class DirectSolver:
         self._q = self._x = self._cov = np.empty((0, 0))
 
     def start(self, task: Task) -> None:
+        """Forget all pairs and begin a new task."""
         self._solved_at = 0
         self._task, self._folded, self._folded_residual = task, task.belief, task.residual or task.belief
         within = Memory(window=WINDOW)
@@ -299,6 +300,7 @@ class SolverClient:
 
     @property
     def due(self) -> bool:
+        """True if it is time to ask."""
         enough = min(self._every, max(_Settings.growth * self._solved_at, 1.0))
         return self.fed > 0 and (self._soon or self.fed - self._solved_at >= enough)
 
@@ -341,6 +343,7 @@ class SolverClient:
         self.busy, self._soon, self._solved_at = True, False, self.fed
 
     def poll(self) -> Solved | None:
+        """Return the next answer if there is one, without waiting."""
         solved = self._solver.poll()
         if solved is not None:
             self.busy = not solved.last

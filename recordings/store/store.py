@@ -185,6 +185,7 @@ class PairReader:
             return max(newest + behind, self._given_up_to)
 
     def first_seq(self) -> int:
+        """Return the sequence number of the oldest pair; 1 if there is none."""
         with self._reading() as connection:
             return oldest(connection)
 

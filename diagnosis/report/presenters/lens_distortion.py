@@ -26,6 +26,7 @@ class LensDistortion(Presenter):
         return f"Calibrate the lenses again: the images that are called rectified have {left}."
 
     def panel(self, residuals: Residuals, effect: Effect) -> Panel:
+        """Plot radially in the image, over the distance from its centre."""
         assert residuals.calibration is not None
         partial, own = attributed(residuals, effect)
         x = residuals.diagnosis.extended.observations.x

@@ -185,6 +185,7 @@ def toml_pose(T: FloatArray) -> str:
 
 
 def short(value: float, digits: int) -> str:
+    """Return a number without trailing zeros."""
     return f"{round(value, digits) + 0.0:.{digits}f}".rstrip("0").rstrip(".")
 
 
