@@ -52,6 +52,14 @@ def rows(name: str, values: ArrayLike, width: int) -> FloatArray:
     return array
 
 
+def matching_rows(q: ArrayLike, x: ArrayLike, joints: int) -> tuple[FloatArray, FloatArray]:
+    """Return pairs as finite float64 rows q (n, joints) and x (n, 3)."""
+    angles, positions = rows("q", q, joints), rows("x", x, 3)
+    if len(angles) != len(positions):
+        raise ShapeError("x", f"({len(angles)}, 3) to go with q", positions.shape)
+    return angles, positions
+
+
 def rows_or_vector(name: str, values: ArrayLike, width: int) -> FloatArray:
     """Return `values` as a finite vector (width,) or finite rows (n, width), whichever they were."""
     array = numbers(name, values)

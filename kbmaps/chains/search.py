@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import BoolArray, FloatArray, IntArray, rows
+from kbmaps.arrays import BoolArray, FloatArray, IntArray, matching_rows
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.parameters import tangents
 from kbmaps.errors import DegenerateDataError, SettingError, ShapeError
@@ -236,10 +236,8 @@ def find_chain(
     if not isinstance(rng, np.random.Generator):  # pyright: ignore[reportUnnecessaryIsInstance]
         raise SettingError(f"rng must be a generator, as numpy.random.default_rng(0) makes one; got {rng!r}")
     width = np.shape(q)[-1] if np.ndim(q) == 2 else 0
-    angles, positions = rows("q", q, max(width, 1)), rows("x", x, 3)
+    angles, positions = matching_rows(q, x, max(width, 1))
     slides = np.zeros(angles.shape[1], dtype=np.bool_) if prismatic is None else np.array(prismatic, dtype=np.bool_)
-    if len(angles) != len(positions):
-        raise ShapeError("x", f"({len(angles)}, 3) to go with q", positions.shape)
     if slides.shape != (angles.shape[1],):
         raise ShapeError("prismatic", f"({angles.shape[1]},)", slides.shape)
     if starts < 1:
