@@ -9,7 +9,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kbmaps.errors import NonFiniteError, NotNumbersError, ShapeError
+from kbmaps.errors import NonFiniteError, NotNumbersError, SettingError, ShapeError
 
 FloatArray: TypeAlias = NDArray[np.float64]
 BoolArray: TypeAlias = NDArray[np.bool_]
@@ -70,6 +70,12 @@ def rows_or_vector(name: str, values: ArrayLike, width: int) -> FloatArray:
     if not np.isfinite(array).all():
         raise NonFiniteError(name)
     return array
+
+
+def require_positive(name: str, value: float, unit: str = "") -> None:
+    """Raise SettingError unless the value is finite and greater than 0."""
+    if not (value > 0.0 and math.isfinite(value)):
+        raise SettingError(f"{name} must be finite and greater than 0{unit}, got {value!r}")
 
 
 _BATCH_ROWS = 1024  # small enough to stay in the cache

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import BoolArray, FloatArray, IntArray, matching_rows
+from kbmaps.arrays import BoolArray, FloatArray, IntArray, matching_rows, require_positive
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.parameters import tangents
 from kbmaps.errors import DegenerateDataError, SettingError, ShapeError
@@ -242,8 +242,8 @@ def find_chain(
         raise ShapeError("prismatic", f"({angles.shape[1]},)", slides.shape)
     if starts < 1:
         raise SettingError(f"starts must be 1 or greater, got {starts!r}")
-    if sigma is not None and not (sigma > 0.0 and math.isfinite(sigma)):
-        raise SettingError(f"sigma must be finite and greater than 0, got {sigma!r}")
+    if sigma is not None:
+        require_positive("sigma", sigma)
     unknowns = 3 + 4 * int((~slides).sum()) + 2 * int(slides.sum())
     if 3 * len(angles) < unknowns:
         raise DegenerateDataError(
