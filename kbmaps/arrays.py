@@ -9,7 +9,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from kbmaps.errors import NonFiniteError, NotNumbersError, ShapeError
+from kbmaps.errors import NonFiniteError, NotNumbersError, SettingError, ShapeError
 
 FloatArray: TypeAlias = NDArray[np.float64]
 BoolArray: TypeAlias = NDArray[np.bool_]
@@ -52,6 +52,14 @@ def rows(name: str, values: ArrayLike, width: int) -> FloatArray:
     return array
 
 
+def matching_rows(q: ArrayLike, x: ArrayLike, joints: int) -> tuple[FloatArray, FloatArray]:
+    """Return pairs as finite float64 rows q (n, joints) and x (n, 3)."""
+    angles, positions = rows("q", q, joints), rows("x", x, 3)
+    if len(angles) != len(positions):
+        raise ShapeError("x", f"({len(angles)}, 3) to go with q", positions.shape)
+    return angles, positions
+
+
 def rows_or_vector(name: str, values: ArrayLike, width: int) -> FloatArray:
     """Return `values` as a finite vector (width,) or finite rows (n, width), whichever they were."""
     array = numbers(name, values)
@@ -62,6 +70,12 @@ def rows_or_vector(name: str, values: ArrayLike, width: int) -> FloatArray:
     if not np.isfinite(array).all():
         raise NonFiniteError(name)
     return array
+
+
+def require_positive(name: str, value: float, unit: str = "") -> None:
+    """Raise SettingError unless the value is finite and greater than 0."""
+    if not (value > 0.0 and math.isfinite(value)):
+        raise SettingError(f"{name} must be finite and greater than 0{unit}, got {value!r}")
 
 
 _BATCH_ROWS = 1024  # small enough to stay in the cache

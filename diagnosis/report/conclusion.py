@@ -61,7 +61,10 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
     gain = Gain(percent, interval, with_outliers_percent=counted[0], with_outliers_ci95=counted[1])
     timed = diagnosis.aligned.observations.motion.t is not None
     weighed = diagnosis.aligned.simulation.gravity.known
-    named_mm, tolerated_mm = _named_mm(diagnosis), _tolerated_mm(diagnosis)
+    named_mm, tolerated_mm = (
+        None if d is None else 1e3 * float(np.sqrt(np.square(d[kept]).mean()))
+        for d in (diagnosis.without_model, diagnosis.with_tolerances_alone)
+    )
     return DiagnosisFile(
         verdict=verdict,
         sentence=sentence(
@@ -110,16 +113,6 @@ def _verdict(diagnosis: Diagnosis, causes: tuple[Cause, ...], gain_percent: floa
         return "undecided" if tolerances.leaves_open else "nothing_found"
     is_open = any(cause.leaves_open for cause in causes) or tolerances.leaves_open or gain_percent <= 0.0
     return "undecided" if is_open else "explained"
-
-
-def _named_mm(diagnosis: Diagnosis) -> float | None:
-    alone = diagnosis.without_model
-    return None if alone is None else 1e3 * float(np.sqrt(np.square(alone[diagnosis.markers]).mean()))
-
-
-def _tolerated_mm(diagnosis: Diagnosis) -> float | None:
-    alone = diagnosis.with_tolerances_alone
-    return None if alone is None else 1e3 * float(np.sqrt(np.square(alone[diagnosis.markers]).mean()))
 
 
 def _mean_mm(diagnosis: Diagnosis) -> Errors:

@@ -9,10 +9,10 @@ from typing import cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import BoolArray, FloatArray, evenly_spread, frozen, numbers, rows
+from kbmaps.arrays import BoolArray, FloatArray, evenly_spread, frozen, matching_rows, numbers, require_positive
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.parameters import ChainParameters, ChainTolerances
-from kbmaps.errors import DegenerateDataError, SettingError, ShapeError
+from kbmaps.errors import DegenerateDataError, ShapeError
 from kbmaps.maps.kbmap import POSITION_OUTPUTS, KBMap
 from kbmaps.pairs import checked_pairs
 from kbmaps.robust import ROUNDING_M, UNCALIBRATED_SIGMAS, middle_sigma
@@ -141,11 +141,9 @@ def align(
         >>> align(arm, q, x, pose_known=False, marker_known=True).T_measured_nominal[:3, 3].round(6) + 0.0
         array([0., 0., 1.])
     """
-    angles, positions = rows("q", q, chain.joints), rows("x", x, 3)
-    if len(angles) != len(positions):
-        raise ShapeError("x", f"({len(angles)}, 3) to go with q", positions.shape)
-    if sigma is not None and not (sigma > 0.0 and math.isfinite(sigma)):
-        raise SettingError(f"sigma must be finite and greater than 0, got {sigma!r}")
+    angles, positions = matching_rows(q, x, chain.joints)
+    if sigma is not None:
+        require_positive("sigma", sigma)
     pairs = len(angles)
     needed = 1 if pose_known else 3 if marker_known else 4
     if pairs < needed:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Self, cast
@@ -10,7 +9,7 @@ from typing import Self, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import FloatArray, IntArray, batches, frozen, rows, rows_or_vector
+from kbmaps.arrays import FloatArray, IntArray, batches, frozen, require_positive, rows, rows_or_vector
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.parameters import CHAIN, WIDE, ChainParameters, ChainTolerances, chain_arrays, chain_from_arrays
 from kbmaps.errors import NonFiniteError, SettingError, ShapeError
@@ -158,8 +157,7 @@ class ChainBelief:
         Raises:
             SettingError: the tolerance is not positive.
         """
-        if not (tolerance > 0.0 and math.isfinite(tolerance)):
-            raise SettingError(f"tolerance must be finite and greater than 0 m, got {tolerance!r}")
+        require_positive("tolerance", tolerance, unit=" m")
         size = self.parameters.size
         return self.widened(np.arange(size)[self.parameters.tool], np.full(3, tolerance))
 

@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import FloatArray, frozen, rows_or_vector, vector
+from kbmaps.arrays import FloatArray, frozen, require_positive, rows_or_vector, vector
 from kbmaps.chains.align import PlacedStart
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.chain import RigidChain
@@ -217,8 +217,7 @@ class RecursiveRigidLearner(Model):
     def __init__(
         self, nominal: RigidChain, tolerances: ChainTolerances, *, noise: float = 0.01, window: int = 1000
     ) -> None:
-        if not (noise > 0.0 and math.isfinite(noise)):
-            raise SettingError(f"noise must be finite and greater than 0 m, got {noise!r}")
+        require_positive("noise", noise, unit=" m")
         self._parameters = ChainParameters(nominal)
         self._tolerances = tolerances
         self._filter = RigidFilter(self._parameters, tolerances, noise)
@@ -299,8 +298,7 @@ class RecursiveRigidLearner(Model):
         Raises:
             SettingError: the tolerance is not positive.
         """
-        if not (tolerance > 0.0 and math.isfinite(tolerance)):
-            raise SettingError(f"tolerance must be finite and greater than 0 m, got {tolerance!r}")
+        require_positive("tolerance", tolerance, unit=" m")
         if self.kept >= _Settings.first:
             self._window.fold(self._set_right(), self.kept)
         before = ChainBelief.from_covariance(self._parameters, self._filter.change, self._filter.covariance)

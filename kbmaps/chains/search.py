@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import BoolArray, FloatArray, IntArray, rows
+from kbmaps.arrays import BoolArray, FloatArray, IntArray, matching_rows, require_positive
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.parameters import tangents
 from kbmaps.errors import DegenerateDataError, SettingError, ShapeError
@@ -236,16 +236,14 @@ def find_chain(
     if not isinstance(rng, np.random.Generator):  # pyright: ignore[reportUnnecessaryIsInstance]
         raise SettingError(f"rng must be a generator, as numpy.random.default_rng(0) makes one; got {rng!r}")
     width = np.shape(q)[-1] if np.ndim(q) == 2 else 0
-    angles, positions = rows("q", q, max(width, 1)), rows("x", x, 3)
+    angles, positions = matching_rows(q, x, max(width, 1))
     slides = np.zeros(angles.shape[1], dtype=np.bool_) if prismatic is None else np.array(prismatic, dtype=np.bool_)
-    if len(angles) != len(positions):
-        raise ShapeError("x", f"({len(angles)}, 3) to go with q", positions.shape)
     if slides.shape != (angles.shape[1],):
         raise ShapeError("prismatic", f"({angles.shape[1]},)", slides.shape)
     if starts < 1:
         raise SettingError(f"starts must be 1 or greater, got {starts!r}")
-    if sigma is not None and not (sigma > 0.0 and math.isfinite(sigma)):
-        raise SettingError(f"sigma must be finite and greater than 0, got {sigma!r}")
+    if sigma is not None:
+        require_positive("sigma", sigma)
     unknowns = 3 + 4 * int((~slides).sum()) + 2 * int(slides.sum())
     if 3 * len(angles) < unknowns:
         raise DegenerateDataError(

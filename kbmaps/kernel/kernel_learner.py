@@ -12,7 +12,7 @@ from typing import Any, Protocol, Self, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import FloatArray, rows_or_vector
+from kbmaps.arrays import FloatArray, require_positive, rows_or_vector
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.parameters import chain_arrays, chain_from_arrays
 from kbmaps.errors import DegenerateDataError, ModelFormatError, SettingError
@@ -248,8 +248,7 @@ class KernelLearner(Model):
         memory: Memory | None = None,
     ) -> None:
         if isinstance(precision, float | int):
-            if not (precision > 0.0 and math.isfinite(precision)):
-                raise SettingError(f"precision must be finite and greater than 0, got {precision!r}")
+            require_positive("precision", precision)
         elif precision not in (None, "evidence"):
             raise SettingError(f'precision must be None, "evidence" or a number, got {precision!r}')
         self._kernel = ProductKernel(bases)

@@ -13,9 +13,8 @@ from typing import cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import FloatArray, rows
-from kbmaps.errors import ShapeError
-from kbmaps.maps.kbmap import POSITION_OUTPUTS, KBMap
+from kbmaps.arrays import FloatArray, matching_rows, rows
+from kbmaps.maps.kbmap import KBMap
 from kbmaps.maps.stack import BasisStack
 
 
@@ -57,9 +56,7 @@ def blockwise_precision(prior: KBMap, q: ArrayLike, x: ArrayLike) -> float:
     Returns:
         λ as in `ExactLearner.solve`; with too few pairs for `FEWEST_BLOCKS`, one that trusts the prior.
     """
-    angles, positions = rows("q", q, len(prior.bases)), rows("x", x, POSITION_OUTPUTS)
-    if len(angles) != len(positions):
-        raise ShapeError("x", f"({len(angles)}, 3) to go with q", positions.shape)
+    angles, positions = matching_rows(q, x, len(prior.bases))
     count = min(len(angles) // BLOCK_PAIRS, _Settings.most_blocks)
     if count < FEWEST_BLOCKS:
         return (

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kbmaps import lapack
-from kbmaps.arrays import FloatArray, numbers, rows_or_vector
+from kbmaps.arrays import FloatArray, numbers
 from kbmaps.errors import BasisError, NonFiniteError, SettingError, ShapeError
 from kbmaps.maps.basis import JointBasis
 from kbmaps.maps.design import Design
@@ -19,6 +19,7 @@ from kbmaps.maps.evidence import most_evident
 from kbmaps.maps.factor import ShiftedGram
 from kbmaps.maps.kbmap import POSE_OUTPUTS, POSITION_OUTPUTS, KBMap, pose_targets
 from kbmaps.memory import Memory
+from kbmaps.pairs import checked_pairs
 from kbmaps.robust import VARIANCE_FLOOR
 
 
@@ -238,10 +239,7 @@ class ExactLearner:
         Raises:
             SettingError: a weight that is not positive, rotations missing or not expected. Nothing has changed.
         """
-        angles = np.atleast_2d(rows_or_vector("q", q, len(self._bases)))
-        positions = np.atleast_2d(rows_or_vector("x", x, POSITION_OUTPUTS))
-        if len(angles) != len(positions):
-            raise ShapeError("x", f"({len(angles)}, 3) to go with q", positions.shape)
+        angles, positions, _ = checked_pairs(q, x, None, len(self._bases))
         targets = pose_targets(positions, rotation, self._outputs)
         weights = _checked_weights(weight, len(angles))
         shares = self._memory.weights(len(angles) + 1)

@@ -12,7 +12,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import FloatArray, frozen, numbers, rows, rows_or_vector, vector
+from kbmaps.arrays import FloatArray, frozen, matching_rows, numbers, rows_or_vector, vector
 from kbmaps.errors import BasisError, NonFiniteError, SettingError, ShapeError
 from kbmaps.maps import serial
 from kbmaps.maps.basis import JointBasis
@@ -259,10 +259,7 @@ def prediction_errors(kbmap: KBMap, q: ArrayLike, x: ArrayLike) -> FloatArray:
         >>> prediction_errors(still, [[0.0]], [[0.0, 0.3, 0.4]])
         array([0.5])
     """
-    angles = rows("q", q, kbmap.joints)
-    positions = rows("x", x, POSITION_OUTPUTS)
-    if len(angles) != len(positions):
-        raise ShapeError("x", f"({len(angles)}, 3) to go with q", positions.shape)
+    angles, positions = matching_rows(q, x, kbmap.joints)
     return np.linalg.norm(kbmap.predict(angles) - positions, axis=1)
 
 

@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import FloatArray, IntArray, rows, rows_or_vector, vector
+from kbmaps.arrays import FloatArray, IntArray, matching_rows, rows_or_vector, vector
 from kbmaps.errors import ModelFormatError, SettingError, ShapeError
 from kbmaps.maps.basis import describe_bases, parse_bases
 from kbmaps.maps.code_path import net_kernel
@@ -161,10 +161,7 @@ class NLMS:
         Raises:
             SettingError: an index outside the pairs, rotations missing or not expected. Nothing has changed.
         """
-        angles = rows("q", q, self._stack.joints)
-        positions = rows("x", x, POSITION_OUTPUTS)
-        if len(angles) != len(positions):
-            raise ShapeError("x", f"({len(angles)}, 3) to go with q", positions.shape)
+        angles, positions = matching_rows(q, x, self._stack.joints)
         targets = pose_targets(positions, rotation, self._outputs)
         sequence = np.arange(len(angles)) if order is None else _checked_order(order, len(angles))
         steps = self._step_size.run(self._pairs, len(sequence))

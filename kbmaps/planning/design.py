@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg import solve_triangular  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
 from scipy.special import gammaln  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
 
-from kbmaps.arrays import FloatArray, rows, vector
+from kbmaps.arrays import FloatArray, require_positive, rows, vector
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.parameters import ChainParameters
@@ -61,8 +61,7 @@ class ChainPosterior:
     def __init__(
         self, nominal: RigidChain, change: FloatArray, covariance: FloatArray, *, noise: float, floor: float = 0.0
     ) -> None:
-        if not (noise > 0.0 and math.isfinite(noise)):
-            raise SettingError(f"noise must be finite and greater than 0 m, got {noise!r}")
+        require_positive("noise", noise, unit=" m")
         self._parameters = ChainParameters(nominal)
         size = self._parameters.size
         for name, array, shape in (("change", change, (size,)), ("covariance", covariance, (size, size))):

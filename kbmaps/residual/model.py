@@ -13,7 +13,7 @@ from typing import Self, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from kbmaps.arrays import FloatArray, IntArray, batches, frozen, rows, rows_or_vector
+from kbmaps.arrays import FloatArray, IntArray, batches, frozen, require_positive, rows, rows_or_vector
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.parameters import CHAIN, ChainParameters, chain_arrays, chain_from_arrays
@@ -156,8 +156,7 @@ class ResidualModel:
         Raises:
             SettingError: the tolerance is not positive.
         """
-        if not (tolerance > 0.0 and math.isfinite(tolerance)):
-            raise SettingError(f"tolerance must be finite and greater than 0 m, got {tolerance!r}")
+        require_positive("tolerance", tolerance, unit=" m")
         parameters, scaling = self.features.parameters, self.features.scaling
         widened = self.widened(np.arange(parameters.size)[parameters.tool], np.full(3, tolerance))
         if scaling.load is None:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from kbmaps import lapack
-from kbmaps.arrays import BoolArray, FloatArray, rows, rows_or_vector, vector
+from kbmaps.arrays import BoolArray, FloatArray, require_positive, rows, rows_or_vector, vector
 from kbmaps.chains.chain import RigidChain
 from kbmaps.errors import DegenerateDataError, ModelFormatError, SettingError, ShapeError
 from kbmaps.maps.basis import JointBasis, describe_bases, parse_bases
@@ -294,8 +294,7 @@ class TensorLearner(Model):
             SettingError: the tolerance is not positive.
             DegenerateDataError: there is neither a prior nor enough pairs.
         """
-        if not (tolerance > 0.0 and math.isfinite(tolerance)):
-            raise SettingError(f"tolerance must be finite and greater than 0 m, got {tolerance!r}")
+        require_positive("tolerance", tolerance, unit=" m")
         prior = self.posterior.with_other_tool(tolerance)
         self._keep(0)
         self.rebase(prior)
