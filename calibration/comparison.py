@@ -62,10 +62,10 @@ class LeftOut(msgspec.Struct, frozen=True):
     # first, second: number of rows of each recording without a match in the other
     first: int
     second: int
-    first_row: int | None  # number of the first such row of the first recording; None if there is none
-    second_row: int | None  # the same for the second
-    # joint, by: for a first such row, the joint that differs most from the row of the same number in the other
-    # recording, and the difference [rad, m]
+    first_row: int | None  # number of the first unmatched row of the first recording; None if all have a match
+    second_row: int | None  # the same for the second recording
+    # joint, by: the first unmatched row is compared with the row of the same number in the other recording; this joint
+    # differs most, by so much [rad, m]
     joint: str | None
     by: float | None
 

@@ -54,7 +54,7 @@ MODULES = {
 
 @cache
 def _section(title: str) -> cyclopts.Group:
-    """Return a group of commands: one object each, since two of the same name are refused and commands keep theirs."""
+    """Return the one group of this title: cyclopts refuses a second group with the same name."""
     import cyclopts
 
     return cyclopts.Group(title, sort_key=list(GROUPS).index(title))
@@ -161,7 +161,7 @@ def _print_front_page() -> None:
 
 
 def _told(error: OSError) -> BodyschemaError:
-    """Return an error of the system that no command expects in one line."""
+    """Convert an operating-system error that no command has handled to a message of one line."""
     said = error.strerror or str(error)
     if error.errno in (errno.EMFILE, errno.ENFILE):
         return BodyschemaError(f"too many files and connections are open. {RAISE_LIMIT}")

@@ -67,7 +67,7 @@ class Course:
             self._note_version(status, now, changed=changed)
 
     def _note_change(self, status: LearnerStatus, now: float) -> bool:
-        """Record the current change; those after it were rolled back. Return True if it is new."""
+        """Record the current change and delete the later ones, which were rolled back. Return True if it is new."""
         at, last = status.pairs - status.pairs_since_change, status.last_change
         key = (at, None) if last is None else (None, last.noticed_seq)
         if at <= 0:

@@ -39,13 +39,13 @@ class Stages:
         self._stage, self._done = SETS, 0.0
 
     def begin(self, stage: Stage, before: Stage | None = None) -> None:
-        """Tell that a stage begins, which is after another."""
+        """Report that a stage begins. With `before`, the percentage is at least that at the end of that stage."""
         self._stage = stage
         self._done = max(self._done, 0.0 if before is None else before.ends)
         self._say(stage.what)
 
     def __call__(self, said: str) -> None:
-        """Tell a step of the present stage."""
+        """Report a step of the present stage."""
         self._done += max(self._stage.ends - self._done, 0.0) * _OF_THE_REST
         self._say(f"{self._stage.what}: {said}")
 

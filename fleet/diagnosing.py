@@ -1,7 +1,7 @@
 """Diagnosis of many recordings on Dask: on this machine's cores, or on the workers of a scheduler.
 
-The recording and the robot's description are read here and sent to the worker. It needs this package, but none of our
-files.
+The recording and the robot's description are read here and sent to the worker. The worker needs this package
+installed, but no access to the files.
 """
 
 from __future__ import annotations

@@ -39,9 +39,9 @@ class LearnerEvidence:
     claim: PredictiveUncertainty  # uncertainty of the answering model
     solved: bool  # True if that model is a solution, whose error the belief describes
     pairs: int  # number of learnt pairs with the current tool
-    region: FloatArray  # poses (m, d) [rad, m] that represent the data's region
-    seen: FloatArray  # poses (n, d) [rad, m] of some of them, evenly spread
-    # q, x: the newest that the solver knows, (m, d) [rad, m] and (m, 3) [m]
+    region: FloatArray  # poses (m, d) [rad, m] that represent the region where there are pairs
+    seen: FloatArray  # poses (n, d) [rad, m] of some of the learnt pairs, evenly spread
+    # q, x: joint angles (m, d) [rad, m] and positions (m, 3) [m] of the newest pairs that the solver has
     q: FloatArray
     x: FloatArray
 

@@ -27,13 +27,13 @@ from .toml_text import toml_text
 CAMERA_LINK = "calibrated_camera"
 MARKER_LINK = "calibrated_marker"
 ROBOT_FILE = "robot.toml"
-# What an extended.toml adds to robot.toml: `bodyschema.effects.files` reads and writes it.
+# Tables that extended.toml has in addition to those of robot.toml; `bodyschema.effects.files` reads and writes them.
 EXTENSIONS = ("effects", "background", "unexplained")
-# What is next to nothing for a simulator, which would else give a link without a mass one of its own.
+# Negligible inertia: a simulator would give a link without inertia a default mass.
 _NO_MASS = (
     '<inertial><mass value="1e-6"/><inertia ixx="1e-9" ixy="0" ixz="0" iyy="1e-9" iyz="0" izz="1e-9"/></inertial>'
 )
-# Store and checkpoint of the nominal robot are not this one's: what they hold is what it was learnt from.
+# A folder of its own: the nominal robot's store and checkpoint hold the data that this robot was calibrated with.
 STATE_DIR = "state"
 
 

@@ -53,7 +53,7 @@ class CameraConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     light: Annotated[float, Meta(gt=0, le=1)] = 1.0
     ball_radius_m: Positive | None = None  # radius of the marker ball [m]; without this key, as [vision] has it
     ball_rgb: tuple[Fraction, Fraction, Fraction] | None = None  # its colour; without this key, as [vision] has it
-    # nothing in the background has a hue nearer to the ball's [deg]
+    # smallest difference in hue between the ball and anything in the background [deg]
     clutter_gap_deg: Annotated[float, Meta(ge=0, le=100)] = 36.0
     # what is in the hand instead of the ball; without this table, what [vision] looks for
     tags: tuple[SimTag, ...] = ()
@@ -109,8 +109,8 @@ class SimConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     camera: CameraConfig = CameraConfig()
     errors: ErrorConfig = ErrorConfig()
     guide: GuideConfig = GuideConfig()
-    # the joints are read from the servos, encoders or ROS 2 robot of [drivers], which stand on a bench where the
-    # simulated arm is: through their driver, with their resolution
+    # true: emulated servos, encoders or ROS 2 robot of [drivers] follow the simulated arm, and the joints are read from
+    # them through their driver, with their resolution; false: the joints are read from the simulation
     servo_bench: bool = False
     # tool changes at given simulated times, besides those that `SimWorld.change_tool` asks for
     tool_changes: tuple[ToolChange, ...] = ()

@@ -117,8 +117,8 @@ class CamerasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     # time from mid-exposure to the time stamp [s]; `bodyschema calibrate latency` measures it
     latency_s: Annotated[float, Meta(ge=-1, le=1)] = 0.0
     latency_sigma_s: NonNegative | None = None  # its 1-sigma; without it 15 ms for devices, 0 for files
-    # time from the first to the last row of a rolling shutter [s]; 0 is a global shutter. Without it any from 0 to the
-    # time of a frame is allowed for: moving markers are measured with wider claims.
+    # time from the exposure of the first row to that of the last [s]; 0 is a global shutter. Without it anything from 0
+    # to the time between frames is assumed possible, which increases the uncertainty of moving markers.
     readout_s: Annotated[float, Meta(ge=0, le=0.1)] | None = None
     one: OneConfig | None = None
     two: TwoConfig | None = None
