@@ -93,7 +93,10 @@ LARGEST_BALL_M = 0.5
 
 
 class Tables(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """All tables of robot.toml; `RobotDescription` checks [robot] and [camera], `effects` its own three."""
+    """All tables of robot.toml.
+
+    `RobotDescription` checks [robot] and [camera]; `effects` checks [effects], [background] and [unexplained].
+    """
 
     robot: dict[str, Any]
     camera: dict[str, Any]

@@ -427,7 +427,7 @@ def _found(
     begun = start if start.is_exact else together(start, hypotheses, told)
     told.begin(SEARCH, SETS)
     # The set of causes compared best tells the noise, and the rows that they leave out, before the long search.
-    begun, start = _counted(begun, start, simulation)
+    begun, start = _refitted(begun, start, simulation)
     unnamed = UnnamedFamilies(start)
     extended = search.run(begun) if start.is_exact else _searched(begun, search)
     other_shape = None if start.is_exact else reshaped(extended)
@@ -436,7 +436,7 @@ def _found(
     ):
         # What is left is not noise alone.
         other_shape = None
-    again, start = (extended, start) if search.ended_early else _counted(extended, start, simulation, other_shape)
+    again, start = (extended, start) if search.ended_early else _refitted(extended, start, simulation, other_shape)
     if again is not extended:
         unnamed = UnnamedFamilies(start)
         extended = _searched(again, search)
@@ -490,7 +490,7 @@ def _loose(explanation: Explanation, fits: Sequence[Fit], search: Search) -> Rat
     return play if worth > NAMED else None
 
 
-def _counted(fit: Fit, start: Fit, simulation: Simulation, shape: Observations | None = None) -> tuple[Fit, Fit]:
+def _refitted(fit: Fit, start: Fit, simulation: Simulation, shape: Observations | None = None) -> tuple[Fit, Fit]:
     """Refit, with the noise that a fit shows and without the rows that its causes leave out; the fit where it has them.
 
     Args:

@@ -20,7 +20,7 @@ from bodyschema.learning.data_outlook import LearnerEvidence
 from bodyschema.learning.model_bank import PRIOR, SOLVED
 from bodyschema.learning.nominal import NominalModel, chain_tolerances
 from bodyschema.learning.regime import LOOKED_BACK, BoolArray, Regime
-from bodyschema.learning.regimes import Regimes
+from bodyschema.learning.regime_history import Regimes
 from bodyschema.learning.snapshot import Snapshot
 from bodyschema.learning.solvers.solver import Solver, SolverClient
 from bodyschema.learning.state import Counters, Curve, LearningState

@@ -109,7 +109,7 @@ def joint_servos(servos: Servos) -> list[JointServo]:
 
 
 def _make(model: KnownModel) -> Make:
-    return "feetech" if model.table.endswith("feetech") else "dynamixel"
+    return "feetech" if model.table == "feetech" else "dynamixel"
 
 
 def _ids(bus: ScannedBus) -> str:

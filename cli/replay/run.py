@@ -204,7 +204,7 @@ class _Live:
             through = sampler.state == "ended"
             if through and not sampler.pairs:
                 raise RecordingError(
-                    f"the sampler accepted none of the rows: {_counted(sampler.rejected)}",
+                    f"the sampler accepted none of the rows: {_reasons_text(sampler.rejected)}",
                     file=self._recording.file or "recording",
                     remedy="--any-step relaxes its step and speed rules",
                 )
@@ -276,5 +276,5 @@ def _connected(process: Process, endpoint: str, token: str) -> Iterator[ZenohSes
         yield bus
 
 
-def _counted(rejected: dict[str, int]) -> str:
+def _reasons_text(rejected: dict[str, int]) -> str:
     return ", ".join(f"{count} {reason}" for reason, count in sorted(rejected.items())) or "there were none"

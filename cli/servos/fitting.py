@@ -97,10 +97,10 @@ def servo_tables(fitting: Fitting) -> str:
     names = _bus_names(servos)
     lines = ["", "# The servos, as `bodyschema scan` found them. docs/hardware.md has all keys."]
     for (port, baud), name in names.items():
-        lines += [f"[{vendor.table}.buses.{name}]", f"port = {toml_value(port)}", f"baud = {baud:_}", ""]
+        lines += [f"[drivers.{vendor.table}.buses.{name}]", f"port = {toml_value(port)}", f"baud = {baud:_}", ""]
     lines.append("# CHECK each with `bodyschema watch joints`: move the joint, and look where its angle goes.")
     for joint, servo in fitting.servos.items():
-        lines += [f"[[{vendor.table}.servos]]", f"joint = {toml_value(joint)}", f"id = {servo.id}"]
+        lines += [f"[[drivers.{vendor.table}.servos]]", f"joint = {toml_value(joint)}", f"id = {servo.id}"]
         lines.append(f"model = {toml_value(servo.model or '')}")
         if len(names) > 1:
             lines.append(f"bus = {toml_value(names[servo.port, servo.baud])}")
@@ -118,8 +118,9 @@ def _vendor(servos: Sequence[Candidate]) -> KnownModel:
     known = known_models()
     vendors = {known[servo.model or ""].table: known[servo.model or ""] for servo in servos}
     if len(vendors) > 1:
+        tables = " and ".join(f"drivers.{table}" for table in vendors)
         raise ConfigError(
-            f"the servos are of two vendors, {' and '.join(vendors)}, and an arm is of one",
+            f"the servos are of two vendors, {tables}, and an arm is of one",
             remedy="Give --port with the port of one of them, or - for the other's joints",
         )
     return next(iter(vendors.values()))

@@ -133,11 +133,11 @@ def bench_ports(bench: DryRun) -> list[str]:
     """Return a line on the devices of each port."""
     match bench.config:
         case SerialLinesConfig() as config:
-            return [f"{_counted(len(config.encoders), 'encoder')} on {config.port} at {config.baud:,} bit/s"]
+            return [f"{_plural(len(config.encoders), 'encoder')} on {config.port} at {config.baud:,} bit/s"]
         case config:
             fitted = {name: sum(config.bus_of(servo) == name for servo in config.servos) for name in config.buses}
             return [
-                f"{_counted(fitted[name], 'servo')} on {bus.port} at {bus.baud:,} bit/s"
+                f"{_plural(fitted[name], 'servo')} on {bus.port} at {bus.baud:,} bit/s"
                 for name, bus in config.buses.items()
             ]
 
@@ -148,7 +148,7 @@ def bench_commands(bench: DryRun) -> tuple[str, ...]:
     return common if isinstance(bench.config, SerialLinesConfig) else ("scan", *common)
 
 
-def _counted(count: int, what: str) -> str:
+def _plural(count: int, what: str) -> str:
     return f"{count} {what}{'' if count == 1 else 's'}"
 
 
@@ -177,9 +177,8 @@ def bench_robot_file(config: Config, bench: DryRun, port: Path) -> Path:
         case SerialLinesConfig() as board:
             tables["drivers"]["serial_lines"]["port"] = str(Path(board.port).absolute())
         case servos:
-            _, vendor = servos.table.split(".")
             for name, bus in servos.buses.items():
-                tables["drivers"][vendor]["buses"][name]["port"] = str(Path(bus.port).absolute())
+                tables["drivers"][servos.table]["buses"][name]["port"] = str(Path(bus.port).absolute())
     tables.setdefault("daemon", {})["state_dir"] = str(port.with_name(f"{port.name}.state").absolute())
     if "unexplained" in tables:
         tables["unexplained"]["model"] = str((config.file.parent / tables["unexplained"]["model"]).resolve())

@@ -44,7 +44,7 @@ __all__ = [
 ]
 
 STRANGER = "-"  # instead of a joint's name
-TABLES = {
+EEPROM_VENDORS = {
     "dynamixel": (DYNAMIXEL, DynamixelConfig.models, get_args(DynamixelBaud)),
     "feetech": (FEETECH, FeetechConfig.models, get_args(FeetechBaud)),
 }
@@ -67,7 +67,7 @@ def configured(config: Config, joints: Sequence[str], bus: str | None) -> list[W
     Raises:
         ConfigError: there are none, or no such joint or bus.
     """
-    tables = {name: getattr(config.tables.drivers, name) for name in TABLES}
+    tables = {name: getattr(config.tables.drivers, name) for name in EEPROM_VENDORS}
     table, servos = next(((name, servos) for name, servos in tables.items() if servos is not None), ("", None))
     if servos is None:
         remedy = "Add [drivers.dynamixel] or [drivers.feetech] (docs/hardware.md), or give --port and --id"
@@ -89,7 +89,7 @@ def configured(config: Config, joints: Sequence[str], bus: str | None) -> list[W
 
 def stranger(port: str, baud: int, id: int) -> Wanted:
     """Return the servo of that ID, of any vendor, that robot.toml does not name. SourceError if there is no answer."""
-    for table in [table for table, (_, _, bauds) in TABLES.items() if baud in bauds]:
+    for table in [table for table, (_, _, bauds) in EEPROM_VENDORS.items() if baud in bauds]:
         with workbench_of(table) as workbench:
             model = workbench.model_at(workbench.bus(port, baud), id)
         if model is not None:
@@ -107,7 +107,7 @@ def workbench_of(table: str) -> EepromEditor:
     def open_at(port: str, baud: int) -> tuple[SerialLine, float]:
         return SerialLine.open(port, baud, clock.now), adapter_latency_s(port)
 
-    return EepromEditor(TABLES[table][0], clock, open_at)
+    return EepromEditor(EEPROM_VENDORS[table][0], clock, open_at)
 
 
 def entry_of(joint: str, id: int, model: Model) -> ServoConfig:
@@ -121,7 +121,7 @@ def settings_by_name(workbench: EepromEditor, model: Model) -> Mapping[str, Sett
 
 def model_called(table: str, name: str) -> Model:
     """Return the model of a vendor. ConfigError if this version does not know it."""
-    models = TABLES[table][1] if table in TABLES else {}
+    models = EEPROM_VENDORS[table][1] if table in EEPROM_VENDORS else {}
     if name not in models:
         raise ConfigError(f"unknown model {name!r} of {table}", remedy=did_you_mean(name, models))
     return models[name]

@@ -37,7 +37,7 @@ Servos = DynamixelConfig | FeetechConfig
 class KnownModel:
     """A servo model with a driver."""
 
-    table: str  # its vendor's table in robot.toml
+    table: str  # its vendor's table in [drivers]
     bauds: tuple[int, ...]  # the baud rates that robot.toml accepts for it [bit/s]
     zero_ticks: int  # the middle of its range
 

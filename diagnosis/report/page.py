@@ -104,7 +104,7 @@ def _equals(p: float) -> str:
     return text if text.startswith("<") else f"= {text}"
 
 
-def _counted(gain: Gain) -> str:
+def _gain_with_outliers(gain: Gain) -> str:
     if gain.with_outliers_percent is None or gain.with_outliers_ci95 is None:
         return ""
     low, high = map(share, gain.with_outliers_ci95)
@@ -117,7 +117,10 @@ def _glance(residuals: Residuals, file: DiagnosisFile) -> str:
         (f"{mm(rms.aligned)} → {mm(rms.extended)} mm", "RMS before → after"),
         (share(gain.held_out_percent), f"gain, held out ({share(gain.ci95[0])} to {share(gain.ci95[1])})"),
         (f"{mm(rms.noise_floor)} mm", "noise alone (RMS)"),
-        (f"{file.pairs.outliers:,} of {file.pairs.total:,}", f"fixes that are not the marker{_counted(gain)}"),
+        (
+            f"{file.pairs.outliers:,} of {file.pairs.total:,}",
+            f"fixes that are not the marker{_gain_with_outliers(gain)}",
+        ),
     ]
     items = "".join(f"<div><b>{value}</b><span>{escape(label)}</span></div>" for value, label in tiles)
     return (

@@ -211,7 +211,7 @@ class Search:
             least = fit.log_likelihood + rise_for(most + doubt, candidate.dof)
             start = fit.starting([*fit.causes, candidate.effect])
             tried = joined(start, candidate.effect, least, fit.log_likelihood + 0.5 * candidate.gain)
-            gain = 2.0 * (tried.log_likelihood - fit.log_likelihood) * self._counted(tried, candidate.effect)
+            gain = 2.0 * (tried.log_likelihood - fit.log_likelihood) * self._share_that_counts(tried, candidate.effect)
             worth = nats(gain, candidate.dof) - doubt
             if worth > most and tried.causes[-1].is_possible:
                 best, most = tried, worth
@@ -288,7 +288,7 @@ class Search:
             worth = max(worth, plain) if plain > _Settings.beyond_doubt else worth
         return worth
 
-    def _counted(self, fit: Fit, effect: Effect) -> float:
+    def _share_that_counts(self, fit: Fit, effect: Effect) -> float:
         """Return the share of a gain that counts: correlated noise looks like a change with time."""
         return fit.independence if effect.kind.changes_with_time else 1.0
 
@@ -361,7 +361,7 @@ class Search:
             tried, worth = self._exchanged(fit, beside, beside.in_parts, _Settings.elsewhere)
             if worth > _Settings.elsewhere:
                 return tried
-        counted = self._counted(fit, cause)
+        counted = self._share_that_counts(fit, cause)
         least = NAMED + self.doubt(beside.itself, beside.others)
         lost = beside.is_lost_for(least if counted == 1.0 else _rise(least, beside.itself.dof, counted))
         lost = lost or not cause.is_possible

@@ -31,7 +31,7 @@ class BusConfig(ServoBusConfig, frozen=True, forbid_unknown_fields=True):
 class DynamixelConfig(ServosConfig[BusConfig], frozen=True, forbid_unknown_fields=True):
     """The table [drivers.dynamixel]. MX-28 speaks Protocol 1.0, MX-28(2.0) speaks 2.0."""
 
-    table: ClassVar[str] = "drivers.dynamixel"
+    table: ClassVar[str] = "dynamixel"
     models: ClassVar[Mapping[str, Model]] = BY_NAME
     unsupported: ClassVar[Collection[str]] = tuple(UNSUPPORTED.values())
 
@@ -43,8 +43,9 @@ class DynamixelConfig(ServosConfig[BusConfig], frozen=True, forbid_unknown_field
         """Raise ConfigError if servos, zero-force or gaze do not fit `joints` or each other; see `ServosConfig`."""
         super().check(joints, file, text)
         for name, keys, what, remedy in self._powered_mistakes():
-            line = line_of(text, (*self.table.split("."), name, *keys)) or line_of(text, (*self.table.split("."), name))
-            raise ConfigError(f"[{self.table}.{name}] {what}", file=file, line=line, remedy=remedy)
+            table = ("drivers", self.table, name)
+            line = line_of(text, (*table, *keys)) or line_of(text, table)
+            raise ConfigError(f"[{'.'.join(table)}] {what}", file=file, line=line, remedy=remedy)
 
     def _powered_mistakes(self) -> Iterator[tuple[str, tuple[str, ...], str, str]]:
         for name, table in (("zero_force", self.zero_force), ("gaze", self.gaze)):

@@ -25,5 +25,5 @@ class BusConfig(ServoBusConfig, frozen=True, forbid_unknown_fields=True):
 class FeetechConfig(ServosConfig[BusConfig], frozen=True, forbid_unknown_fields=True):
     """The table [drivers.feetech]."""
 
-    table: ClassVar[str] = "drivers.feetech"
+    table: ClassVar[str] = "feetech"
     models: ClassVar[Mapping[str, Model]] = BY_NAME

@@ -383,11 +383,11 @@ def joint_state_checks(
                 yield Check("joint states", "wrong", *_parted(robot.health))
                 return
             yield Check("joint states", "ok", f"all {len(joints)} joints of robot.toml are in {config.topic}")
-            lost, heard = _counted(robot)
+            lost, heard = _lost_and_sent(robot)
             end, readings = clock.now() + READ_S, 0
             while clock.now() < end:
                 readings += robot.read(end - clock.now()) is not None
-            lost_since, heard_since = _counted(robot)
+            lost_since, heard_since = _lost_and_sent(robot)
             rate_hz, lost, messages = readings / READ_S, lost_since - lost, heard_since - heard
             fix = "let the robot's nodes publish more often"
             yield warned("rate", f"{rate_hz:.0f} readings/s come", fix, when=rate_hz < FEW_PER_S)
@@ -415,6 +415,6 @@ def _parted(complaints: Sequence[str]) -> tuple[str, str]:
     return "".join(said), fix
 
 
-def _counted(robot: Ros2Joints) -> tuple[int, int]:
+def _lost_and_sent(robot: Ros2Joints) -> tuple[int, int]:
     """Return the number of unusable messages, and of all messages sent, so far."""
     return robot.lost + robot.refused.total(), robot.lost + robot.received

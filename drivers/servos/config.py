@@ -72,7 +72,7 @@ class ServosConfig(msgspec.Struct, Generic[BusT], frozen=True, forbid_unknown_fi
 
     def check(self, joints: Sequence[str], file: Path, text: str) -> None:
         """ConfigError when the servos are not one for each of `joints`, each with a bus and an ID of its own."""
-        table = f"{self.table}.servos"
+        table = f"drivers.{self.table}.servos"
         for place, what, key, remedy in self._mistakes(joints):
             raise ConfigError(what, file=file, line=line_in_entry(text, table, place, key), remedy=remedy)
         require_each(joints, [servo.joint for servo in self.servos], "servo", table, file, text)

@@ -77,7 +77,7 @@ def one_by_one(bus: Bus, servos: Sequence[IdentifiedServo]) -> Way:
 
 @dataclass(frozen=True, slots=True)
 class ServoVendor:
-    table: str  # its table in robot.toml
+    table: str  # its table in [drivers]
     models: Mapping[int, Model] = field(repr=False)  # by number
     errors: Mapping[int, str]  # meaning and remedy of each bit of the hardware error
     bus: type[Bus]  # class of its buses

@@ -9,7 +9,7 @@ import pytest
 from typed_pages import command_of
 
 from bodyschema.cli.hardware.bench_run import BenchRun
-from bodyschema.cli.main import COMMANDS, command_line
+from bodyschema.cli.main import COMMANDS, RENAMED, command_line
 from bodyschema.daemon.config import Config
 
 ROOT = Path(__file__).parents[2]
@@ -77,6 +77,21 @@ def test_what_a_page_links_to_is_there(page: Path) -> None:
         linked = page.parent / file if file else page
         assert linked.exists(), target
         assert not heading or heading in anchors(linked), target
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_a_page_names_only_commands_of_today(page: Path) -> None:
+    """Check code between backticks, which may go over the end of a line, and the lines of code blocks."""
+    text = page.read_text(encoding="utf-8")
+    blocks = "\n".join(re.findall(r"^```.*?^```", text, re.MULTILINE | re.DOTALL))
+    typed = re.findall(r"^(?:\$ )?(?:\.venv/bin/)?bodyschema (.*)$", blocks, re.MULTILINE)
+    code = re.findall(r"(?<!`)`(?!`)([^`]+)`(?!`)", re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL))
+    named = [words.removeprefix("bodyschema ") for words in code if words.startswith("bodyschema ")]
+    for words in (line.split() for line in [*typed, *named]):
+        assert words[0] in COMMANDS or words[0].startswith("-"), words
+    for words in (tuple(line.split()) for line in [*typed, *named, *code]):
+        # Many things are called like a former command of one word.
+        assert not any(len(name) > 1 and words[: len(name)] == name for name in RENAMED), words
 
 
 def anchors(page: Path) -> list[str]:

@@ -306,7 +306,7 @@ def test_an_eye_that_never_sees_the_board_is_named_with_the_reason() -> None:
         require_both(found)
 
 
-@pytest.mark.soak  # of the command: tests/daemon/test_cameras_command.py
+@pytest.mark.soak  # of the command: tests/cli/test_cameras_command.py
 def test_three_pairs_of_another_board_are_enough_to_say_so() -> None:
     _, pairs, _ = photographed(count=6)
     taken: list[str] = []

@@ -11,7 +11,7 @@ from guided_arm import Scene, nominal_model
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.model_bank import RIGID
 from bodyschema.learning.nominal import chain_tolerances
-from bodyschema.learning.regimes import Regimes
+from bodyschema.learning.regime_history import Regimes
 from bodyschema.learning.solvers.solver import Solved, fitted_belief
 from bodyschema.learning.solvers.tolerance_selection import Tolerances, best_tolerances, workmanship
 from kbmaps import ChainTolerances, RigidLearner
