@@ -22,11 +22,11 @@ _LESS_USUAL = 1.5
 
 @dataclass(frozen=True, eq=False)
 class UnnamedAlternative:
-    """Alternative to a cause: the other causes beside an unnamed one that is as specific.
+    """Alternative to a named cause: an unnamed one that is as specific, together with the other causes.
 
     Attributes:
         apart: the other causes, with the unnamed one removed from the data.
-        behind: its log-evidence over the cause in whose place it stands [nats].
+        behind: its log-evidence relative to the cause that it replaces [nats].
     """
 
     apart: Apart

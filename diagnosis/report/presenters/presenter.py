@@ -23,9 +23,9 @@ from bodyschema.robot.rpy import rpy_of
 from .evidence import measured_against_predicted
 
 DEG = math.degrees(1.0)
-# Ticks that divide a turn to within this share are counted per turn.
+# The number of ticks a turn is stated if it is a whole number to within this share.
 _WHOLE_TURN = 0.01
-# A step is one decimal of a file, and no tick, if its logarithm is a whole number to this.
+# A step whose log10 is a whole number to within this is a decimal place of the file, not an encoder tick.
 _DECIMAL = 1e-3
 
 
@@ -35,7 +35,7 @@ class FoundCause:
 
     Attributes:
         where, source: the joint it acts on, and the joint that causes it; None where there is none.
-        numbers: of shifts and turns, only those given count.
+        numbers: parameters by name; shifts and turns may lack axes.
         seen_by: the kind of measuring device, as in `DiagnosisFile`.
         timed: True if the recording has times; otherwise a moment is a row number.
         weighed: True if the URDF states masses; otherwise compliances are those of links of an assumed weight.
@@ -55,7 +55,7 @@ class FoundCause:
 
     @property
     def at(self) -> str:
-        """The joint, with the word."""
+        """The joint, as in "joint elbow"."""
         return f"joint {self.where}"
 
     @property
