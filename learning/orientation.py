@@ -28,11 +28,14 @@ from kbmaps import (
     rotation_vectors,
 )
 
-TRUSTED = (RIGID, EXACT, PRIOR)  # order of trust while errors do not decide
-# The marker's rotation on the nominal chain's hand is fitted to at most this many first pairs, whenever they double.
+# Order of trust while errors do not decide.
+TRUSTED = (RIGID, EXACT, PRIOR)
+# The marker's rotation on the nominal chain's hand is fitted whenever the pairs have doubled, up to this many pairs.
 FIRST = 64
-FEWEST_TO_BELIEVE = 3  # minimum number of pairs to trust the solved chain before it has predicted any
-MEAN_OVER_RMS = 0.9213  # mean length of a Gaussian turn over its RMS length, three equal axes
+# Minimum number of pairs to trust the solved chain before it has predicted any.
+FEWEST_TO_BELIEVE = 3
+# Mean divided by RMS length of a Gaussian rotation vector with the same variance about each axis.
+MEAN_OVER_RMS = 0.9213
 
 
 class AngleMemory(msgspec.Struct):
@@ -42,7 +45,7 @@ class AngleMemory(msgspec.Struct):
     angle: float = 0.0  # sum of their angles [rad]
     square: float = 0.0  # sum of their squares [rad²]
     noise: float = 0.0  # sum of the measurements' variances, all three axes [rad²]; 0 where not given
-    ratio: float = 0.0  # sum of their squares over the predicted ones
+    ratio: float = 0.0  # sum of their squares, each divided by the predicted one
 
     def add(self, angle: float, noise: float, claimed: float) -> None:
         """Add an error of this angle [rad].

@@ -53,11 +53,11 @@ class LearningHeader(msgspec.Struct, kw_only=True):
     kept_of: int  # number of pairs since the prior; the newest of them are kept
     # number of pairs at which an unknown frame, or the tool after a change, is fitted again; None for never
     next_fit: int | None
-    first_fit: bool  # True if that is the first one
+    first_fit: bool  # True if that will be the first fit
     answering: str = PRIOR  # the model that answers
     doubted_in_a_row: int = 0  # number of consecutive outliers up to now
     replays_due: float = 0.0  # replay steps that are still due
-    # their position: epochs begun, pairs of the current one, and the number of these replayed
+    # where replay is: epochs begun, number of pairs of the current epoch, and number of these that were replayed
     replay_position: tuple[int, int, int] = (0, 0, 0)
     # prior of the chain before the first of these pairs, as bytes; None before the alignment
     belief: bytes | None = None

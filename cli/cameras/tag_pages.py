@@ -104,5 +104,5 @@ def tables(tags: Tags) -> str:
 
 
 def as_printed(tags: Tags, drawn_mm: float, measured_mm: float) -> Tags:
-    """Scale the tags to the size at which the ruler of `drawn_mm` measures `measured_mm`; ConfigError for another."""
+    """Scale the tags by their page's ruler of `drawn_mm`. ConfigError if another line was measured."""
     return replace(tags, side_mm=printed_scale(drawn_mm, measured_mm) * tags.side_mm)

@@ -1,4 +1,4 @@
-"""Record which devices read the joints, how a change of them affects the pairs, and how servos are."""
+"""Record which devices read the joints, report changes that affect the pairs, and collect the status of servos."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class DeviceWatch:
         self.changes: list[str] = []  # differences from the devices of earlier pairs, with remedies
 
     def look(self) -> bool:
-        """Store the record if it is new; return True if pairs from now on differ from earlier ones."""
+        """Store the record if it is new; return True if pairs from now on are not comparable with earlier ones."""
         record = () if self._joints is None else self._joints.record
         if not record or record == self.kept:
             return False
@@ -74,7 +74,7 @@ class DeviceWatch:
 
 
 def differences(before: Sequence[Device], now: Sequence[Device]) -> list[str]:
-    """Return sentences on what makes measurements with `now` differ from those with `before`, with remedies."""
+    """Return a sentence with a remedy for each difference between devices that affects the measurements."""
     then = {device["joint"]: device for device in before}
     return [said for device in now if device["joint"] in then for said in _said(then[device["joint"]], device)]
 

@@ -29,13 +29,13 @@ class Gate:
     """Accepts a measurement if its joint-space step from the last pair is neither too small nor implausible.
 
     A step is the Euclidean norm over all joints in degrees; prismatic joints count with `metres_per_degree`. A step
-    below `min_step_deg` is not a pair, also across a restart or a gap, so that an arm at rest does not fill the store.
+    below `min_step_deg` makes no pair, not even after a restart or a pause: an arm at rest must not fill the store.
     A step above `max_step_deg`, a pause of more than a second, a `break_segment` and a marker that jumped start a
     new segment.
 
     A marker that moved faster than `max_marker_speed_m_s` from its last accepted position is refused. It is accepted
-    again after `CONFIRMATIONS` consecutive fixes that agree with each other (a tool change), when it could have moved
-    there in the elapsed time, or after that pause.
+    again in three cases: after `CONFIRMATIONS` consecutive fixes that agree with each other (a tool change), once the
+    marker has had the time to move there, or after a pause of more than a second.
 
     With `any_step`, neither step nor speed is checked: a static recording has no path between its poses.
     """
@@ -83,7 +83,7 @@ class Gate:
         return self.segment
 
     def is_too_fast(self, moved: FloatArray) -> bool:
-        """Return True if joints that moved by `moved` [rad or m], (d,), within the time uncertainty make no pair."""
+        """Return True if `moved` [rad or m] (d,), the motion within the time uncertainty, is too large for a pair."""
         return float(np.linalg.norm(moved * self._degrees_per_unit)) > MOST_TIME_ERROR_DEG
 
     def _believe(self, fix: _Fix) -> bool:

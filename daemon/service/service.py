@@ -33,7 +33,7 @@ class Service:
         loops: Collection[str],  # names of the loops that have to keep running
         clock: Clock,
         *,
-        devices: Sequence[str] = (),  # devices that the service was allowed at its start; access(2) respects this, too
+        devices: Sequence[str] = (),  # devices that systemd lets the service open; access(2) has the same answer
         may_open: Callable[[str], bool] = lambda device: os.access(device, os.R_OK | os.W_OK),
     ) -> None:
         """Start in the state "not ready"."""

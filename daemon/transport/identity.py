@@ -122,7 +122,9 @@ def is_local(endpoint: str) -> bool:
     """Return True if only this machine can reach the endpoint."""
     if endpoint.startswith("unixsock-stream/"):
         return True
-    host = endpoint.partition("/")[2].partition("?")[0].partition("#")[0].rpartition(":")[0].strip("[]")  # of IPv6
+    host = (
+        endpoint.partition("/")[2].partition("?")[0].partition("#")[0].rpartition(":")[0].strip("[]")
+    )  # IPv6 has them
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:

@@ -27,7 +27,7 @@ class Limits:
     burst: int = 5000  # queries at once after a pause
     waiting: int = 100  # unanswered queries
     request_bytes: int = 4 * 2**20  # size of a request's payload
-    waiting_bytes: int = 8 * 2**20  # sum of their payload sizes; the sum over all sources may be eight times that
+    waiting_bytes: int = 8 * 2**20  # total size of their payloads; all sources together may have eight times as much
     wait_s: float = 10.0  # a query that waited longer is refused, since its client no longer waits for the answer
     sources: int = 100  # number of sources waiting at the same time
 
@@ -53,7 +53,7 @@ class QueryLimiter(Generic[T]):
         self._limits, self._now = limits, now
         self._lock = threading.Lock()
         self._size = 0
-        # One item for each waiting query, and one for the end: this wakes up faster than a condition.
+        # One item for each waiting query, and one to end: a queue wakes its reader faster than a condition variable.
         self._turns: queue.SimpleQueue[None] = queue.SimpleQueue()
         self._sources: OrderedDict[str, _Source[T]] = OrderedDict()  # in the order of their turns
 

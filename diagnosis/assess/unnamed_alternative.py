@@ -22,10 +22,10 @@ _LESS_USUAL = 1.5
 
 @dataclass(frozen=True, eq=False)
 class UnnamedAlternative:
-    """Causes beside an unnamed cause that is as specific as a named one."""
+    """Alternative to a named cause: an unnamed one that is as specific, together with the other causes."""
 
     apart: Apart  # the other causes, with the unnamed one removed from the data
-    behind: float  # its log-evidence over the cause in whose place it stands [nats]
+    behind: float  # its log-evidence relative to the cause that it replaces [nats]
 
     @classmethod
     def in_place_of(

@@ -42,7 +42,7 @@ class Scales(NamedTuple):
 
     @property
     def several_times(self) -> float:
-        """How much larger links' lengths or angles are than a workshop's: from 0 to 1, for e times as large or more."""
+        """Logarithm of the larger scale of lengths and angles, limited to 0 (a workshop's) and 1 (e times that)."""
         return float(np.clip(np.log(self[:2]), 0.0, 1.0).max())
 
     @property
@@ -164,7 +164,7 @@ def background_effects(simulation: Simulation, q: FloatArray) -> tuple[Effect, .
 
 def _groups(effect: Effect) -> np.ndarray:
     if effect.kind.of_drive:
-        # How true a ball screw runs has nothing to do with gears, nor with links.
+        # Errors of ball screws are independent of those of gears and links.
         return np.full(len(effect.amounts), 3 if effect.prismatic else 2)
     return np.array([0, 0, 0, 1, 1, 1])
 

@@ -1,4 +1,4 @@
-"""Find a marker with play on the hand: it lies on one side or the other of it, and nothing tells on which."""
+"""Find a marker that is loose on the hand: it rests on either side of its play, at each row on an unknown one."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def rattle(fit: Fit) -> Rattle | None:
 
 
 def rattle_beside(fit: Fit) -> Rattle | None:
-    """Return the play of the marker beside a fit that goes with it.
+    """Return the play of the marker, estimated together with the other parameters of a fit.
 
     The numbers of the fit may have followed the sides, and tolerances may hide them. So sides that are not clear yet
     are taken out as well, and the fit and its tolerances follow what is left. Tolerances are at first no larger than a
@@ -91,7 +91,7 @@ def rattle_beside(fit: Fit) -> Rattle | None:
 
 
 def _two_sided(fit: Fit) -> Rattle | None:
-    """Return the most probable play, however small; None where the residuals are too few, or no noise."""
+    """Return the most probable play, however small; None if the residuals are too few or have no noise."""
     rows = fit.noise.weights > 0.0
     if fit.is_exact or rows.sum() < 2 * _Settings.fewest:
         # With the play taken out of them, positions of a simulation have no noise to compare it with.
@@ -122,7 +122,7 @@ def _two_sided(fit: Fit) -> Rattle | None:
 
 
 def _unfollowed(play: Rattle, fit: Fit) -> Rattle:
-    """Return the play of these sides, as large as it is where the fit and its tolerances no longer follow it."""
+    """Return the play with these sides, at its size when the fit and its tolerances absorb no part of it."""
     n, observations = len(play.sides), fit.observations
     by_link = np.swapaxes(_turns(fit), 1, 2) * play.sides[:, None, None]
     taken_out = np.broadcast_to(observations.play, observations.x.shape)[:, :, None]

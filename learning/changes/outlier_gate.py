@@ -11,12 +11,13 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.replay_memory import PairMemory
 
 DOUBT = 5.0  # a pair is an outlier if it is this many times farther from the prediction than expected
-MEDIAN_TO_SIGMA = 0.6501  # Median length of errors to their 1-sigma per axis, three equal axes: 1 / sqrt(2.366)
-SMALLEST_M = 1e-3  # No robot is this exact: an expected distance is never taken to be smaller [m]
+MEDIAN_TO_SIGMA = 0.6501  # 1-sigma of errors per axis by their median length, three equal axes: 1 / sqrt(2.366)
+SMALLEST_M = 1e-3  # no robot is this exact: an expected distance is never taken to be smaller [m]
 CHANGE = 6  # this many consecutive outliers prove a change
 # This many are enough if one other position of the marker explains them: their remaining distances are at most this
 # multiple of the expected ones, and at most this share of those from the prediction.
 FEWEST_FOR_CHANGE = 3
+# An explanation leaves at most this multiple of the expected distance.
 TOGETHER = 2.0
 
 
@@ -72,7 +73,7 @@ def sound(distances_m: FloatArray, noise_m: float) -> NDArray[np.bool_]:
 
 
 def explained(before_m: FloatArray, after_m: FloatArray, expected_m: float) -> bool:
-    """Return True if an explanation reduces a run's distances from `before_m` (n,) [m] to `after_m` (n,) [m]."""
+    """Return True if reducing a run's distances from `before_m` (n,) [m] to `after_m` (n,) [m] is enough."""
     before, after = (float(np.sqrt(np.square(distances).mean())) for distances in (before_m, after_m))
     return after <= min(TOGETHER * expected_m, before / DOUBT)
 
@@ -82,6 +83,6 @@ def limits_m(inside_m: FloatArray, open_m: FloatArray) -> FloatArray:
 
     Args:
         inside_m: RMS distance of recent pairs from their predictions (n,).
-        open_m: RMS distance that the data so far leave where the pairs lie (n,).
+        open_m: RMS uncertainty of the predictions at the pairs' poses, from what the data do not determine yet (n,).
     """
     return DOUBT * np.maximum(np.hypot(inside_m, open_m), SMALLEST_M)

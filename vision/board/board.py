@@ -20,7 +20,7 @@ MARKER_SHARE = 0.75
 SIZES = (50, 100, 250, 1000)
 _DICTIONARY = re.compile(r"(?:[4-7]X[4-7]_(?:50|100|250|1000)|ARUCO_ORIGINAL|APRILTAG_(?:16h5|25h9|36h10|36h11))")
 _MOST_COLUMNS = 24
-# Of a marker's side: allowed deviation of its corners from a perspective image of a plane, for lens distortion
+# Allowed deviation of a marker's corners from a perspective image of a plane, due to lens distortion [sides].
 _FITTING = 0.25
 
 
@@ -157,7 +157,7 @@ def squares_seen(numbers: Sequence[int], corners_px: Sequence[FloatArray], board
 
 
 def _place(number: int, columns: int) -> tuple[int, int]:
-    """Return column and row of a marker's square. Two rows have as many markers as one has squares."""
+    """Return column and row of a marker's square. Two neighbouring rows together have `columns` markers."""
     pair, rest = divmod(number, columns)
     upper = columns // 2
     return (2 * rest + 1, 2 * pair) if rest < upper else (2 * (rest - upper), 2 * pair + 1)

@@ -22,8 +22,10 @@ class ImageRoll:
     """The images that match a pattern for each eye, sorted by name; numbers in names sort as numbers.
 
     Attributes:
-        t: times [s] (n,). t_sigma: time between the two eyes' images [s] (n,).
-        image_size_px: of each eye's image. serials: folder and pattern of each eye.
+        t: times [s] (n,).
+        t_sigma: time between the two eyes' images [s] (n,).
+        image_size_px: width and height of each eye's image.
+        serials: pattern of each eye's files, in place of a serial number.
     """
 
     def __init__(self, config: ImagesConfig, folder: Path) -> None:

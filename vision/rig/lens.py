@@ -20,9 +20,9 @@ DISTORTION_NAMES: dict[Model, tuple[str, ...]] = {
     "fisheye": ("k1", "k2", "k3", "k4"),
     "rational": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
-# The largest x/z and y/z that a rectified image shows: beyond, a fisheye's image is stretched out.
+# The largest x/z and y/z that a rectified image shows: beyond them a fisheye's image would be stretched too much.
 WIDEST = 1.2
-# Lines across an image on which it is examined, and places on each.
+# Number of rays from the axis on which a lens is examined, and of points on each.
 RAYS = 64
 
 
@@ -32,9 +32,9 @@ class _Settings:
     Sensitivity: each at 0.3 and 3 times changes no calibration of six sets of views.
     """
 
-    iterations, converged = 30, 1e-12  # of Newton's method; a step that ends them [focal lengths]
+    iterations, converged = 30, 1e-12  # steps of Newton's method; a smaller step ends it [focal lengths]
     widest_rad = 1.5  # off the axis, beyond which a fisheye's polynomial says nothing
-    least_slope = 0.05  # of a lens that folds the image over, so that a step stays short
+    least_slope = 0.05  # lower bound of the derivative: keeps steps short where a lens folds over
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class Lens:
     def is_one_to_one(self, image_size_px: tuple[int, int]) -> bool:
         """Return False if the lens folds over within the image: two directions would be seen at one point of it.
 
-        A polynomial of the distortion turns back somewhere; a fit to corners does not keep that out of the image.
+        Far from the axis a distortion polynomial folds over; a fit to corners does not keep this out of the image.
         Directions beyond `WIDEST` do not count.
         """
         turn = 2.0 * np.pi * np.arange(RAYS) / RAYS
@@ -112,7 +112,7 @@ class Lens:
         px = px.reshape(*ahead.shape[:2], 2)
         outward = np.sum(np.diff(px, axis=0) * rays, axis=2) > 0.0
         inside = np.all((px[:-1] >= 0.0) & (px[:-1] <= np.array(image_size_px) - 1.0), axis=2)
-        # What comes back into the image behind the fold is no worse than the fold.
+        # A ray counts until it first leaves the image.
         return bool(np.all(outward | ~np.logical_and.accumulate(inside, axis=0)))
 
     def _angle(self, seen: FloatArray) -> FloatArray:

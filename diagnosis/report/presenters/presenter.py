@@ -23,8 +23,10 @@ from bodyschema.robot.rpy import rpy_of
 from .evidence import measured_against_predicted
 
 DEG = math.degrees(1.0)
-_WHOLE_TURN = 0.01  # ticks that divide a turn to within this share are counted per turn
-_DECIMAL = 1e-3  # a step is one decimal of a file, and no tick, if its logarithm is a whole number to this
+# The number of ticks a turn is stated if it is a whole number to within this share.
+_WHOLE_TURN = 0.01
+# A step whose log10 is a whole number to within this is a decimal place of the file, not an encoder tick.
+_DECIMAL = 1e-3
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ class FoundCause:
 
     @property
     def at(self) -> str:
-        """The joint, with the word."""
+        """The joint, as in "joint elbow"."""
         return f"joint {self.where}"
 
     @property
