@@ -14,9 +14,7 @@ DOUBT = 5.0  # a pair is an outlier if it is this many times farther from the pr
 MEDIAN_TO_SIGMA = 0.6501  # 1-sigma of errors per axis by their median length, three equal axes: 1 / sqrt(2.366)
 SMALLEST_M = 1e-3  # no robot is this exact: an expected distance is never taken to be smaller [m]
 CHANGE = 6  # this many consecutive outliers prove a change
-# This many are enough if one other position of the marker explains them: their remaining distances are at most this
-# multiple of the expected ones, and at most this share of those from the prediction.
-FEWEST_FOR_CHANGE = 3
+FEWEST_FOR_CHANGE = 3  # this many are enough if one other position of the marker explains them
 # An explanation leaves at most this multiple of the expected distance.
 TOGETHER = 2.0
 
