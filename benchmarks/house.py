@@ -37,7 +37,7 @@ TABLES = (
     "drivers/serial_lines/lines.py",
     "recordings/store/schema.py",
     "robot/lerobot.py",
-    "vision/tags/families.py",
+    "vision/tags/dictionary.py",
 )
 # And elsewhere: versions of formats, units, bytes of a protocol, constants of mathematics and of a distribution.
 FACTS = re.compile(

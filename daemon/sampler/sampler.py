@@ -201,7 +201,7 @@ class Sampler:
                 seen = self._marker.read(READ_S)
             except SourceEnded:
                 break
-            self._check_encoders()
+            self._check_sources()
             if seen is None:
                 self._buffer.make_room()
                 continue
@@ -214,7 +214,7 @@ class Sampler:
                 self._tally.reject(reason)
 
     def _serve_history(self) -> None:
-        self._check_encoders()
+        self._check_sources()
         if self._stopping:
             return
         self._ended = True
@@ -278,7 +278,7 @@ class Sampler:
         self._publish(encode(pair_to_wire(pair)))
         return None
 
-    def _check_encoders(self) -> None:
+    def _check_sources(self) -> None:
         if self._failure is not None:
             raise self._failure
         losses = self._joints.losses + self._marker.losses

@@ -95,6 +95,10 @@ def test_a_new_effect_is_told_in_its_words(diagnosis, robot) -> None:
     assert "from a right angle" in page(diagnosis, file, told, About("a.csv", "desk", "1.2.3"))
 
 
+def test_an_alternative_without_a_noun_has_its_name(two_files) -> None:
+    assert presenting.named(NAME, None, None) == "camera skew"
+
+
 def test_a_new_effect_is_kept_in_extended_toml(diagnosis, tmp_path) -> None:
     simulation, motion = diagnosis.extended.simulation, diagnosis.extended.run.motion
     again = load_simulation(write_extended(simulation, tmp_path, "a test"))

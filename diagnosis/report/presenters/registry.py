@@ -23,7 +23,8 @@ def named(effect: str, where: str | None, source: str | None, seen_by: str = "ca
     Args:
         seen_by: the kind of measuring device, as in `DiagnosisFile`.
     """
-    return presenter_of(effect).noun.format(joint=where, source=source, seen_by=seen_by)
+    noun = presenter_of(effect).noun or PlainPresenter(EFFECT_TYPES[effect]).noun
+    return noun.format(joint=where, source=source, seen_by=seen_by)
 
 
 def rival_named(rival: Indistinguishable, seen_by: str = "camera") -> str:
