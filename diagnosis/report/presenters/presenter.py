@@ -140,7 +140,8 @@ class Presenter(ABC):
     """Sentences and a plot for one effect."""
 
     effect: ClassVar[str]  # name of the effect
-    # the cause in a few words without figures, with {joint}, {source} and {seen_by} to fill in; empty: the effect's name
+    # the cause in a few words without figures, with {joint}, {source} and {seen_by} to fill in; if empty, the effect's
+    # name
     noun: str = ""
     # plots the evidence for a cause; `panel` may do it instead
     plot: ClassVar[staticmethod[[Residuals, Effect], Panel]] = staticmethod(measured_against_predicted)
