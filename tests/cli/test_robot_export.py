@@ -56,6 +56,15 @@ def test_gain_of_the_file_itself_is_printed(extended, measured, tmp_path, capsys
     assert "not in the file: settling" in told
 
 
+def test_json_has_the_file_its_gaps_and_the_errors_in_si(extended, measured, tmp_path, capsys) -> None:
+    export(extended, tmp_path / "arm.txt", "--measured", measured, "--json")
+    told = json.loads(capsys.readouterr().out)
+    assert told["file"] == str(tmp_path / "arm.txt")
+    assert any("settling" in sentence for sentence in told["not_in_it"])
+    assert [row["model"] for row in told["errors"]][:2] == ["nominal", "bodyschema simulate"]
+    assert told["errors"][1]["rms_m"] == 0.0 < told["errors"][0]["rms_m"] < 1.0
+
+
 def rms_mm(told: str) -> list[float]:
     return [float(line.split("│")[2]) for line in told.splitlines() if line.count("│") > 3]
 

@@ -10,7 +10,7 @@ from small_arm import JOINTS, write_small_arm
 from bodyschema.cli.main import app
 from bodyschema.daemon.config import Config
 from bodyschema.effects import load_simulation
-from bodyschema.interfaces.errors import ConfigError, RecordingError
+from bodyschema.interfaces.errors import ConfigError, RecordingError, RequestError
 from bodyschema.recordings.recording import Recording, joints_in
 from bodyschema.robot.toml_file import read_toml
 
@@ -68,6 +68,20 @@ def test_parquet_has_the_same_numbers(tmp_path) -> None:
     called("simulate", "--like", tmp_path / "like.csv", "--out", tmp_path / "out.parquet")
     np.testing.assert_array_equal(Recording.read(tmp_path / "out.parquet", JOINTS).x, out.x)
     assert joints_in(tmp_path / "out.parquet") == JOINTS
+
+
+def test_json_says_how_many_rows_were_written_and_where(tmp_path, capsys) -> None:
+    measured(tmp_path / "like.csv")
+    simulated(tmp_path, "--json")
+    told = json.loads(capsys.readouterr().out)
+    assert (told["file"], told["rows"], told["effects"]) == (str(tmp_path / "out.csv"), ROWS, 1)
+
+
+def test_json_without_a_file_is_refused(tmp_path) -> None:
+    measured(tmp_path / "like.csv")
+    robot = write_small_arm(tmp_path, EFFECT)
+    with pytest.raises(RequestError, match="--json needs --out"):
+        called("simulate", "--like", tmp_path / "like.csv", "--robot", robot, "--json")
 
 
 def test_without_a_file_the_rows_go_to_standard_output(tmp_path, capsys) -> None:

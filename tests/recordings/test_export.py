@@ -129,6 +129,14 @@ def test_a_store_in_use_is_exported_without_robot_toml(tmp_path: Path, store: Pa
     assert "1 pairs" in capsys.readouterr().out
 
 
+def test_json_has_the_number_of_pairs(tmp_path: Path, store: PairStore, capsys) -> None:
+    fix = MarkerFix(1.5, np.array([1.0, 2, 3]), np.eye(3) * 1e-6, (1.0, 2.0, 3.0, 4.0))
+    store.append(7, "2026-01-01T00:00:00Z", np.array([0.1, 0.2]), fix)
+    export(tmp_path / "pairs.sqlite", tmp_path / "a.csv", "--json")
+    told = json.loads(capsys.readouterr().out)
+    assert (told["file"], told["pairs"]) == (str(tmp_path / "a.csv"), 1)
+
+
 def test_an_export_tells_unreadable_pairs(tmp_path: Path, store: PairStore, caplog) -> None:
     for k in range(4):
         fix = MarkerFix(1.5 + k, np.array([1.0, 2, 3]), np.eye(3) * 1e-6)

@@ -10,7 +10,8 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 from rich.console import Console
 
-from bodyschema.cli.commands.options import SourceRobotFile, flag, robot_file, say
+from bodyschema.cli.commands.options import SourceRobotFile, flag, print_json, robot_file, say
+from bodyschema.interfaces.errors import RequestError
 
 
 def simulate(
@@ -23,6 +24,7 @@ def simulate(
     noise: Annotated[bool, flag("Add the noise of the positions: as in LIKE, else as in [camera].")] = False,
     seed: Annotated[int, Parameter(help="Of the noise.", validator=Number(gte=0))] = 0,
     force: Annotated[bool, flag("Replace OUT when it is there.")] = False,
+    as_json: Annotated[bool, flag("Print the result as JSON; needs --out.", name="--json")] = False,
 ) -> None:
     """Simulate what would have been measured at the joint angles of a recording.
 
@@ -43,6 +45,8 @@ def simulate(
 
     if out is not None:
         recordings.check_target(out, force=force)
+    elif as_json:
+        raise RequestError("--json needs --out: without it the rows themselves go to standard output")
     robot = robot_file(robot, like)
     simulation = load_simulation(robot)
     recording = recordings.opened(like, simulation.robot.joints)
@@ -57,5 +61,8 @@ def simulate(
         return
     recordings.write(result, out, scene=scene_for(out, robot, result))
     count = len(simulation.effects)
+    if as_json:
+        print_json({"file": str(out), "robot": simulation.robot.name, "rows": len(result), "effects": count})
+        return
     effects = "without effects" if not count else f"with {count} effect{'s' if count > 1 else ''}"
     say(f"{len(result)} rows of {simulation.robot.name}, {effects}, written to {out}")

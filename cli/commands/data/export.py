@@ -10,7 +10,16 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from bodyschema.cli.commands.options import AS_THEY_ARE, HERE, DatasetCalibration, RobotFile, SourceOptions, flag, say
+from bodyschema.cli.commands.options import (
+    AS_THEY_ARE,
+    HERE,
+    DatasetCalibration,
+    RobotFile,
+    SourceOptions,
+    flag,
+    print_json,
+    say,
+)
 from bodyschema.interfaces.errors import RequestError
 
 
@@ -38,6 +47,7 @@ def export(
         Path | None, Parameter(help="With a robot: a recording or store; prints the errors of OUT on it.")
     ] = None,
     force: Annotated[bool, flag("Replace OUT when it is there.")] = False,
+    as_json: Annotated[bool, flag("Print the result as JSON.", name="--json")] = False,
 ) -> None:
     """Turn pairs into files of other programs, and a robot with what was found into MJCF, URDF or a correction.
 
@@ -59,7 +69,7 @@ def export(
     from bodyschema.recordings import files as recordings
 
     if source.suffix.lower() == ".toml":
-        _export_robot(source, out, measured, force=force)
+        _export_robot(source, out, measured, force=force, as_json=as_json)
         return
     if measured is not None:
         raise RequestError("--measured goes with a robot: give an extended.toml in the place of SOURCE")
@@ -69,13 +79,16 @@ def export(
     else:
         recording, devices = opened(Config.load(robot), source, taken, lerobot), []
     scene = scene_for(out, robot, recording) if robot.exists() else None
-    if scene is None and out.suffix.lower() == recordings.RERUN:
+    if scene is None and out.suffix.lower() == recordings.RERUN and not as_json:
         say(f"Without robot and cameras: there is no {robot}. Give --robot")
     recordings.write(recording, out, devices, scene)
-    say(f"{len(recording)} pairs written to {out}")
+    if as_json:
+        print_json({"file": str(out), "pairs": len(recording)})
+    else:
+        say(f"{len(recording)} pairs written to {out}")
 
 
-def _export_robot(source: Path, out: Path, measured: Path | None, *, force: bool) -> None:
+def _export_robot(source: Path, out: Path, measured: Path | None, *, force: bool, as_json: bool) -> None:
     from bodyschema.calibration.plausibility.limits import require_units
     from bodyschema.cli.terminal import robot_export
     from bodyschema.effects import load_simulation
@@ -87,11 +100,16 @@ def _export_robot(source: Path, out: Path, measured: Path | None, *, force: bool
     if measured is not None:
         recording = recordings.opened(measured, simulation.robot.joints)
         require_units(simulation.robot, recording, measured)
-    say(*robot_export.write(simulation, out))
+    gaps = robot_export.write(simulation, out)
+    rows, why_not = ([], None) if recording is None else robot_export.compared(simulation, recording, out)
+    if as_json:
+        errors = [{"model": row.model, "rms_m": 1e-3 * row.rms_mm, "mean_m": 1e-3 * row.mean_mm} for row in rows]
+        print_json({"file": str(out), "robot": simulation.robot.name, "not_in_it": gaps, "errors": errors})
+        return
+    say(*gaps)
     say(f"{simulation.robot.name} {robot_export.effects_of(simulation)} written to {out}")
     if recording is None:
         return
-    rows, why_not = robot_export.compared(simulation, recording, out)
     table = Table(title=Text(f"all {len(recording)} rows of {measured}, outliers included"))
     for head in ("model", "RMS [mm]", "mean [mm]", "gain [%]"):
         table.add_column(Text(head))
