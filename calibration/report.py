@@ -14,6 +14,7 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.solvers.tolerance_selection import WORKMANSHIP
 from bodyschema.recordings.recording import Recording
 from bodyschema.robot.calibrated_files import CAMERA_LINK
+from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.hand_eye import HandEye
 from kbmaps import ChainBelief, ChainParameters, RigidLearner
 
@@ -209,8 +210,6 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
             Figure(*(float(unit * number) for number in numbers))
             for unit, *numbers in zip(_UNITS, named.drawn[:9], values[:9], halves[:9], strict=True)
         ]
-        least = np.where(robot.chain.prismatic, STILL_M, STILL_RAD)
-        moved = np.ptp(recording.q, axis=0)
         return cls(
             robot=robot.name,
             source=source,
@@ -233,7 +232,7 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
             # Everett and Hsu 1988: four for each joint that turns, two for each that slides, six for the ends of the
             # chain, less the three turns of the marker that its place does not show.
             showable=4 * int((~slides).sum()) + 2 * int(slides.sum()) + 3,
-            still=[name for name, still in zip(robot.joints, moved < least, strict=True) if still],
+            still=_still(robot, recording),
             first=first,
             other_tool_from=None if jump is None else first + jump.row - 1,
             other_tool_mm=None if jump is None else 1e3 * jump.distance_m,
@@ -333,6 +332,13 @@ def _badly_made(calibration: Calibration) -> list[str]:
         "considered. "
         "The URDF or the recording is of another arm."
     ]
+
+
+def _still(robot: RobotDescription, recording: Recording) -> list[str]:
+    """Return the joints that hardly moved."""
+    least = np.where(robot.chain.prismatic, STILL_M, STILL_RAD)
+    moved = np.ptp(recording.q, axis=0)
+    return [name for name, still in zip(robot.joints, moved < least, strict=True) if still]
 
 
 def _mean_error(predicted: FloatArray, recording: Recording) -> float:

@@ -10,7 +10,7 @@ import logging
 import math
 import os
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -67,26 +67,27 @@ class DaemonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 # Keys of earlier versions by their tables, whose values are fixed now. The next release knows them no more.
 RETIRED = {
-    ("daemon",): ("max_time_error_deg", "segment_gap_s", "keep_newest"),
-    ("drivers", "dynamixel"): ("max_speed_deg_s", "max_move_deg"),
-    ("drivers", "dynamixel", "zero_force"): ("doubtful_cycles", "ramp_s", "overcurrent_s"),
-    ("drivers", "dynamixel", "gaze"): ("doubtful_cycles", "stale_s", "blocked_s", "blocked_deg"),
-    ("drivers", "feetech"): ("max_speed_deg_s", "max_move_deg"),
-    ("drivers", "serial_lines"): ("max_speed_deg_s", "max_move_deg"),
-    ("drivers", "ros2"): ("max_gap_s", "max_speed_deg_s", "max_speed_m_s"),
-    ("drivers", "ros2", "marker"): ("rate_hz",),
-    ("vision",): (
+    ("daemon",): {"max_time_error_deg", "segment_gap_s", "keep_newest"},
+    ("drivers", "dynamixel"): {"max_speed_deg_s", "max_move_deg"},
+    ("drivers", "dynamixel", "zero_force"): {"doubtful_cycles", "ramp_s", "overcurrent_s"},
+    ("drivers", "dynamixel", "gaze"): {"doubtful_cycles", "stale_s", "blocked_s", "blocked_deg"},
+    ("drivers", "feetech"): {"max_speed_deg_s", "max_move_deg"},
+    ("drivers", "serial_lines"): {"max_speed_deg_s", "max_move_deg"},
+    ("drivers", "ros2"): {"max_gap_s", "max_speed_deg_s", "max_speed_m_s"},
+    ("drivers", "ros2", "marker"): {"rate_hz"},
+    ("vision",): {
         *("min_pixels", "border_margin_px", "min_visible", "max_centre_sigma_px", "max_candidates"),
         *("epipolar_px", "epipolar_sigmas", "eye_size_ratio", "depth_size_ratio", "max_speed_m_s"),
-    ),
-    ("vision", "tag"): (
+    },
+    ("vision", "tag"): {
         *("min_side_px", "min_contrast", "min_visible", "max_corner_sigma", "epipolar_px", "epipolar_sigmas"),
         *("size_tolerance", "max_reprojection"),
-    ),
-    ("vision", "cameras", "two"): ("max_apart_s",),
-    ("learner",): ("step_size", "seed"),
-    ("sim", "camera"): ("scene_step", "supersampling"),
-    ("sim", "guide"): ("force_limit_n", "torque_limit_nm", "gaze_speed_rad_s"),
+    },
+    ("vision", "cameras", "two"): {"max_apart_s"},
+    ("vision", "further_cameras", "two"): {"max_apart_s"},
+    ("learner",): {"step_size", "seed"},
+    ("sim", "camera"): {"scene_step", "supersampling"},
+    ("sim", "guide"): {"force_limit_n", "torque_limit_nm", "gaze_speed_rad_s"},
 }
 # A larger radius is one of another unit [m].
 LARGEST_BALL_M = 0.5
@@ -316,24 +317,34 @@ def _without_retired(raw: dict[str, Any], file: Path, text: str) -> dict[str, An
     """Return the tables without the keys of earlier versions; the log says of each that its value is not used."""
     tables = deepcopy(raw)
     for path, keys in RETIRED.items():
-        table: Any = tables
-        for name in path:
-            table = table.get(name) if isinstance(table, dict) else None
-        for key in keys if isinstance(table, dict) else ():
-            if key in table:
+        for table in _tables_at(tables, path):
+            for key in sorted(keys & table.keys()):
                 del table[key]
                 where = f"{file}:{line_of(text, (*path, key))}: [{'.'.join(path)}] {key}"
                 log.warning("%s is no key any more, and its value is not used. Delete the line", where)
     return tables
 
 
+def _tables_at(value: Any, path: tuple[str, ...]) -> Iterator[dict[str, Any]]:
+    """Yield the table at a path of keys, or each if one of them is an array of tables."""
+    if isinstance(value, list):
+        for each in value:
+            yield from _tables_at(each, path)
+    elif isinstance(value, dict) and path:
+        yield from _tables_at(value.get(path[0]), path[1:])
+    elif isinstance(value, dict):
+        yield value
+
+
 def _override(raw: dict[str, Any], known: list[str], environment: Mapping[str, str]) -> dict[str, Any]:
     merged = {name: dict(table) if isinstance(table, dict) else table for name, table in raw.items()}
     for variable, value in environment.items():
         table, _, key = variable.removeprefix(ENVIRONMENT).lower().partition("_")
+        if not (variable.startswith(ENVIRONMENT) and table in known and key):
+            continue
         if key in RETIRED.get((table,), ()):
             log.warning("%s is no key any more, and its value is not used", variable)
-        elif variable.startswith(ENVIRONMENT) and table in known and key:
+        else:
             merged.setdefault(table, {})[key] = _checked(variable, table, key, _toml_value(value))
     return merged
 

@@ -79,12 +79,7 @@ def descend(goal: Goal, start: FloatArray, joints: JointRange, max_steps: int) -
         if goal.reached(error):
             return Descent(q, error, step_number, True)
         jacobian = goal.jacobian(q)
-        # Stuck: all motions that could lessen the error violate the limits, or are perpendicular to it.
-        scaled_jacobian = jacobian * joints.scale
-        pull = scaled_jacobian.T @ error
-        forbidden = ((q <= joints.lower) & (pull < 0.0)) | ((q >= joints.upper) & (pull > 0.0))
-        reach = np.linalg.norm(scaled_jacobian, axis=0) * float(np.linalg.norm(error))
-        if (forbidden | (np.abs(pull) <= _Settings.stuck_cosine * reach)).all():
+        if _is_stuck(jacobian * joints.scale, error, q, joints):
             return Descent(q, error, step_number + 1, True)
         while True:
             damping = share * square + _Settings.damping_floor_m2
@@ -104,6 +99,14 @@ def descend(goal: Goal, start: FloatArray, joints: JointRange, max_steps: int) -
             share *= 2.0
         q, error = new_q, new_error
     return Descent(q, error, max_steps, goal.reached(error))
+
+
+def _is_stuck(scaled_jacobian: FloatArray, error: FloatArray, q: FloatArray, joints: JointRange) -> bool:
+    """Return True if all motions that could lessen the error violate the limits, or are perpendicular to it."""
+    pull = scaled_jacobian.T @ error
+    forbidden = ((q <= joints.lower) & (pull < 0.0)) | ((q >= joints.upper) & (pull > 0.0))
+    reach = np.linalg.norm(scaled_jacobian, axis=0) * float(np.linalg.norm(error))
+    return bool((forbidden | (np.abs(pull) <= _Settings.stuck_cosine * reach)).all())
 
 
 def settle(goal: Goal, reached: Descent, posture: FloatArray, joints: JointRange, max_steps: int) -> Descent:

@@ -11,6 +11,7 @@ from bodyschema.interfaces.records import Reason
 from bodyschema.vision.config import VisionConfig
 from bodyschema.vision.tags.body import TagBody
 from bodyschema.vision.tags.config import TagConfig
+from bodyschema.vision.tags.settings import EdgeSettings, TagSettings
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = (ROOT / "docs" / "tags.md").read_text(encoding="utf-8")
@@ -19,6 +20,11 @@ TABLES = re.findall(r"```toml\n(.*?)```", PAGE, re.DOTALL)
 
 def test_the_page_shows_every_setting_with_its_default() -> None:
     assert msgspec.toml.decode(TABLES[0])["vision"]["tag"] == msgspec.to_builtins(TagConfig())
+
+
+def test_the_limits_on_the_page_are_the_trackers() -> None:
+    assert f"less certain than {100 * TagSettings.most_corner_sigma:g} % of the side" in PAGE
+    assert f"differ by less than {EdgeSettings.least_contrast:g} grey levels" in PAGE
 
 
 def test_the_page_s_cluster_is_one() -> None:

@@ -7,6 +7,7 @@ import msgspec
 import pytest
 
 from bodyschema.interfaces.records import MarkerMiss, Reason
+from bodyschema.vision.ball.settings import PatchSettings, TrackSettings
 from bodyschema.vision.config import NAMED_COLOURS, HueBand
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -32,6 +33,15 @@ def test_the_page_shows_every_setting_of_a_band_of_hues_with_its_default():
 def test_the_page_names_every_colour():
     sentence = next(line for line in PAGE.splitlines() if "`colour` (" in line)
     assert all(colour in sentence for colour in NAMED_COLOURS)
+
+
+def test_the_limits_on_the_page_are_the_trackers():
+    assert f"no patch of the colour of {PatchSettings.least_pixels} pixels" in PAGE
+    assert f"closer than {PatchSettings.border_px:g} pixels to the border" in PAGE
+    assert "less than three quarters of the outline" in PAGE
+    assert PatchSettings.least_visible == 0.75
+    assert f"less certain than {PatchSettings.most_sigma_px:g} px" in PAGE
+    assert f"farther away than {TrackSettings.fastest_m_s:g} m/s allows" in PAGE
 
 
 def test_the_page_lists_every_reason_that_the_tracker_gives():

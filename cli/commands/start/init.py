@@ -73,11 +73,7 @@ def init(
     Next: correct what is marked CHECK, then `bodyschema config`. With servos: `bodyschema watch joints`. With --sim
     nothing is left to correct: `bodyschema run --sim`.
     """
-    ways = [name for name, given in (("--sim", sim), ("--lerobot", lerobot), ("--from", source)) if given]
-    if len(ways) > 1:
-        raise ConfigError(f"{' and '.join(ways)} exclude each other", remedy="Give one of them")
-    if source is not None and urdf is None:
-        raise ConfigError("--from needs the robot's URDF", remedy="Give it with --urdf")
+    _require_one_way(sim=sim, lerobot=lerobot, source=source, urdf=urdf)
     if os.path.lexists(robot):
         raise ConfigError("is there already", file=robot, remedy="Give another --robot, or move it away")
     from bodyschema.cli.hardware.robot_template import EXAMPLE, guess_from, robot_toml
@@ -221,3 +217,12 @@ def _summary(fitting: Fitting) -> list[str]:
     lines += [f"  {joint}: no servo, so it is not in joints and stands still at 0" for joint in fitting.bare]
     lines += [f"  ID {servo.id}, {servo.model}: moves none of the joints" for servo in fitting.left]
     return lines
+
+
+def _require_one_way(*, sim: bool, lerobot: str | None, source: str | None, urdf: Path | None) -> None:
+    """Raise ConfigError if several ways to begin are given, or one without what it needs."""
+    ways = [name for name, given in (("--sim", sim), ("--lerobot", lerobot), ("--from", source)) if given]
+    if len(ways) > 1:
+        raise ConfigError(f"{' and '.join(ways)} exclude each other", remedy="Give one of them")
+    if source is not None and urdf is None:
+        raise ConfigError("--from needs the robot's URDF", remedy="Give it with --urdf")
