@@ -101,13 +101,14 @@ def _export_robot(source: Path, out: Path, measured: Path | None, *, force: bool
         recording = recordings.opened(measured, simulation.robot.joints)
         require_units(simulation.robot, recording, measured)
     gaps = robot_export.write(simulation, out)
+    if not as_json:
+        say(*gaps)
+        say(f"{simulation.robot.name} {robot_export.effects_of(simulation)} written to {out}")
     rows, why_not = ([], None) if recording is None else robot_export.compared(simulation, recording, out)
     if as_json:
         errors = [{"model": row.model, "rms_m": 1e-3 * row.rms_mm, "mean_m": 1e-3 * row.mean_mm} for row in rows]
         print_json({"file": str(out), "robot": simulation.robot.name, "not_in_it": gaps, "errors": errors})
         return
-    say(*gaps)
-    say(f"{simulation.robot.name} {robot_export.effects_of(simulation)} written to {out}")
     if recording is None:
         return
     table = Table(title=Text(f"all {len(recording)} rows of {measured}, outliers included"))
