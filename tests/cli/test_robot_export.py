@@ -56,7 +56,7 @@ def test_gain_of_the_file_itself_is_printed(extended, measured, tmp_path, capsys
     assert "not in the file: settling" in told
 
 
-def test_json_has_the_file_its_gaps_and_the_errors_in_si(extended, measured, tmp_path, capsys) -> None:
+def test_json_has_file_gaps_and_errors_in_si(extended, measured, tmp_path, capsys) -> None:
     export(extended, tmp_path / "arm.txt", "--measured", measured, "--json")
     told = json.loads(capsys.readouterr().out)
     assert told["file"] == str(tmp_path / "arm.txt")

@@ -70,7 +70,7 @@ def test_parquet_has_the_same_numbers(tmp_path) -> None:
     assert joints_in(tmp_path / "out.parquet") == JOINTS
 
 
-def test_json_says_how_many_rows_were_written_and_where(tmp_path, capsys) -> None:
+def test_json_has_rows_written_and_file(tmp_path, capsys) -> None:
     measured(tmp_path / "like.csv")
     simulated(tmp_path, "--json")
     told = json.loads(capsys.readouterr().out)

@@ -27,17 +27,17 @@ def test_the_environment_overrides_the_file(tmp_path) -> None:
     assert (tables.daemon.max_step_deg, tables.zenoh.sampler) == (7.5, "tcp/127.0.0.1:9")
 
 
-def test_a_retired_key_in_the_environment_is_passed_over_with_a_warning(tmp_path, caplog) -> None:
+def test_a_retired_key_in_the_environment_only_warns(tmp_path, caplog) -> None:
     load(tmp_path, environment={"BODYSCHEMA_VISION_EPIPOLAR_PX": "1"})
     assert "BODYSCHEMA_VISION_EPIPOLAR_PX is no key any more" in caplog.text
 
 
-def test_a_variable_of_another_program_is_none_of_ours(tmp_path, caplog) -> None:
+def test_variables_of_other_programs_are_ignored(tmp_path, caplog) -> None:
     load(tmp_path, environment={"LEARNER_SEED": "1", "DAEMON_KEEP_NEWEST": "2"})
     assert not caplog.records
 
 
-def test_a_retired_key_is_found_in_each_table_of_an_array(tmp_path, caplog) -> None:
+def test_retired_keys_in_arrays_of_tables_warn(tmp_path, caplog) -> None:
     cameras = 'latency_s = 0.0\n[vision.cameras.images]\nleft = "a/*.png"\nright = "b/*.png"\nfps = 30\n'
     two = 'image_size_px = [640, 480]\nleft = "/dev/v4l/by-id/a"\nright = "/dev/v4l/by-id/b"\nmax_apart_s = 0.1\n'
     further = "".join(

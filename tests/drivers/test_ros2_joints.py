@@ -52,7 +52,7 @@ def test_joints_of_the_robot_that_are_not_ours_are_passed_over() -> None:
         assert {len(reading.q) for reading in robot.read(0.5)} == {1}
 
 
-def test_a_sliding_joint_is_read_in_metres_and_has_a_gate_of_its_own() -> None:
+def test_a_sliding_joint_has_a_gate_in_metres() -> None:
     path = {"lift": lambda t: 5.0 * t}
     turning, sliding = (Robot(joints=("lift",), paths=path, prismatic=[k]) for k in (False, True))
     with turning.joints, sliding.joints:

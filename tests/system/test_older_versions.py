@@ -172,7 +172,7 @@ def test_a_learner_with_an_older_checkpoint_keeps_it_and_learns_every_stored_pai
     assert kept.read_bytes() == (OLDER / "learner_1.ckpt").read_bytes()
 
 
-def test_a_robot_toml_of_the_first_version_is_read(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_first_version_s_robot_toml_is_read(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "arm.urdf").write_text(URDF)
     shutil.copy(OLDER / "robot_1.toml", tmp_path / "robot.toml")
     config = Config.load(tmp_path / "robot.toml", {})

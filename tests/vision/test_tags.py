@@ -336,13 +336,13 @@ def test_a_cluster_of_which_one_tag_is_hidden_is_found_as_well() -> None:
     assert max(off(TagTracker(SMALL, CUBE, CONFIG).track(frame), rotation, MIDDLE)) < 4.0
 
 
-def test_a_cluster_of_which_the_eyes_see_different_tags_is_no_marker() -> None:
+def test_eyes_without_a_common_tag_see_no_marker() -> None:
     one, other = cube_at(tilted([0.2, 1.0, 0.3], 40.0), MIDDLE)
     frame = StereoFrame(0.0, seen(one).left, seen(other).images[1])
     assert reason(TagTracker(SMALL, CUBE, CONFIG).track(frame)) is Reason.NO_MARKER
 
 
-def test_a_tag_that_only_one_eye_measures_names_its_fault_in_the_other(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_tag_refused_by_one_eye_tells_why(monkeypatch: pytest.MonkeyPatch) -> None:
     one, other = cube_at(tilted([0.2, 1.0, 0.3], 40.0), MIDDLE)
     right = seen(one, other).images[1].astype(np.float64)
     faded = slice(None, int(SMALL.project(np.array([one.x, other.x]))[:, 2].mean()))  # up to the other tag
