@@ -71,7 +71,7 @@ def test_a_competitor_that_needs_no_drawing_learns_without(competitor):
     assert mean_error(competitor, problem) < 0.3 * start
 
 
-def test_the_drawing_as_it_is_errs_by_its_tool():
+def test_nominal_model_errs_by_its_tool():
     assert mean_error(BY_KEY["drawing"], simple_problem()) == pytest.approx(
         np.linalg.norm([0.03, 0.03, 0.02]), rel=1e-6
     )
@@ -96,7 +96,7 @@ def test_what_cannot_hold_thirty_joints_says_why():
     assert not {"rigid", "train", "calibration", "gp", "mlp"} & refused
 
 
-def test_our_nlms_and_padasips_take_the_same_first_pass():
+def test_nlms_matches_padasip_on_first_pass():
     problem = simple_problem(1)
     test = np.zeros((1, 2))
     # With one pair the replays repeat the same step, so both have seen it five times.
@@ -127,14 +127,14 @@ def test_placement_derivatives_are_those_of_differences():
         np.testing.assert_allclose(jacobian[:, :, k], (up - down) / (2.0 * step), atol=1e-8)
 
 
-def test_a_body_schema_of_a_drawing_is_that_drawing():
+def test_body_schema_of_nominal_arm_predicts_like_it():
     problem = simple_problem()
     assert problem.drawing is not None
     schema = BodySchema.drawn(problem.drawing)
     np.testing.assert_allclose(schema.predict(problem.q), problem.drawing.positions(problem.q), atol=1e-12)
 
 
-def test_a_body_schemas_step_goes_down_the_squared_error():
+def test_body_schema_step_descends_squared_error():
     problem = simple_problem()
     assert problem.drawing is not None
     schema = BodySchema.drawn(problem.drawing)
@@ -179,13 +179,13 @@ def lwpr_on_cross(updates: int, settings: Settings) -> tuple[float, LWPR]:
     return float(np.mean((model.predict(grid)[:, 0] - cross(grid)) ** 2) / np.var(cross(grid))), model
 
 
-def test_lwpr_learns_the_cross_function_to_its_published_level():
+def test_lwpr_learns_cross_function_to_published_level():
     error, model = lwpr_on_cross(4000, Settings(first_metric=120.0))
     assert error < 0.03
     assert 40 < model.fields < 100
 
 
-def test_lwprs_width_adaptation_helps_where_the_first_width_is_too_wide():
+def test_lwpr_width_adaptation_corrects_wide_start():
     still, _ = lwpr_on_cross(3000, Settings(first_metric=20.0, learning_rate=0.0))
     adapted, _ = lwpr_on_cross(3000, Settings(first_metric=20.0))
     assert adapted < 0.85 * still

@@ -50,7 +50,7 @@ def values(*errors: float) -> dict[str, list[Values]]:
     return {STUDY.key: [{"error": error, "bound": 4.0} for error in errors]}
 
 
-def test_the_page_has_every_row_and_figure_in_the_table_s_order():
+def test_page_has_all_rows_in_table_order():
     rows = registry.rows(None)
     assert re.findall(r"^\| \*\*(\S+)\*\*: (.*?) \|", PAGE, re.MULTILINE) == [(row.name, row.what) for row in rows]
     assert re.findall(r"^\| – (.*?) \|", PAGE, re.MULTILINE) == [one.what for row in rows for one in row.figures]
@@ -73,7 +73,7 @@ def test_docs_are_written_in_place(tmp_path):
     assert table(rows, {}) in (tmp_path / "goals_table.md").read_text(encoding="utf-8")
 
 
-def test_what_is_kept_under_one_key_is_measured_in_one_way():
+def test_results_key_identifies_one_way_of_measuring():
     runs: dict[str, set[object]] = {}
     for study in (study for row in registry.rows(None) for figure in row.figures for study in figure.studies):
         run = study.run
@@ -82,7 +82,7 @@ def test_what_is_kept_under_one_key_is_measured_in_one_way():
     assert [key for key, ways in runs.items() if len(ways) > 1] == []
 
 
-def test_a_seed_that_is_known_is_not_measured_again(tmp_path):
+def test_known_seed_is_not_measured_again(tmp_path):
     path = tmp_path / "goals.json"
     first = Results(path)
     for seed in range(command.FIRST_SEED, command.FIRST_SEED + 3):
@@ -103,7 +103,7 @@ def test_runs_side_by_side_keep_each_other_s_seeds(tmp_path):
     assert Results(path).values() == {STUDY.key: [{"error": 1.0}, {"error": 2.0}]}
 
 
-def test_what_was_forgotten_does_not_come_back_from_the_file(tmp_path):
+def test_forgotten_result_does_not_return_from_file(tmp_path):
     results = Results(tmp_path / "goals.json")
     results.add(STUDY, 1000, {"error": 1.0})
     results.save()
@@ -118,7 +118,7 @@ def test_nothing_is_begun_after_the_deadline(tmp_path):
     assert results.values() == {}
 
 
-def test_a_study_that_lacks_its_data_is_passed_over(tmp_path, capsys):
+def test_study_without_its_data_is_skipped(tmp_path, capsys):
     def missing(seed: int) -> Values:
         raise NotHereError(f"nothing is there for {seed}")
 
@@ -130,7 +130,7 @@ def test_a_study_that_lacks_its_data_is_passed_over(tmp_path, capsys):
     assert "nothing is there for 1000" in capsys.readouterr().err
 
 
-def test_without_recordings_the_recorded_row_says_what_to_give():
+def test_recorded_row_without_recordings_says_what_to_give():
     row = next(row for row in registry.rows(None) if row.name == "ur5")
     with pytest.raises(NotHereError, match="--data"):
         row.studies[0].run(0)
@@ -148,12 +148,12 @@ def test_without_recordings_the_recorded_row_says_what_to_give():
         (between(1.0, 2.0), None, 0.5, Verdict.NOT_MET),
     ],
 )
-def test_the_goal_is_the_number_or_more_than_the_bound_by_15_percent(goal, bound, error, verdict):
+def test_goal_is_number_or_bound_plus_15_percent(goal, bound, error, verdict):
     cell = judged(a_figure(goal, mean(bound) if bound else None), values(error, error))
     assert cell.verdict is verdict
 
 
-def test_a_goal_within_two_standard_errors_is_in_doubt():
+def test_goal_within_two_standard_errors_is_undecided():
     assert judged(a_figure(), values(1.0, 2.0, 2.5)).in_doubt
     assert not judged(a_figure(), values(1.0, 1.1, 1.2)).in_doubt
 
@@ -165,7 +165,7 @@ def test_a_row_stands_as_its_worst_figure(errors, standing):
     assert shown.splitlines()[2].endswith(f"| {standing} |")
 
 
-def test_the_ladder_is_held_against_the_best_single_model_of_each_truth(monkeypatch):
+def test_ladder_is_compared_with_best_model_per_truth(monkeypatch):
     models = {"rigid": None, "residual": None, not_rigid.ANSWER: None}
     monkeypatch.setattr(not_rigid, "MODELS", models)
     row = next(row for row in registry.rows(None) if row.name == "ladder")
@@ -189,12 +189,12 @@ def test_estimates():
 
 
 @pytest.mark.parametrize(("level", "size"), [(5.0, 10.0), (2.0, 20.0), (0.5, math.inf)])
-def test_the_size_that_reaches_a_level_lies_between_sizes(level, size):
+def test_size_reaching_level_is_interpolated(level, size):
     estimate = first_below({10: "n10", 40: "n40"}, level)
     assert estimate([[{"n10": 4.0, "n40": 1.0}]]).value == pytest.approx(size)
 
 
-def test_an_unknown_row_is_told_with_those_that_there_are(monkeypatch, tmp_path):
+def test_unknown_row_error_lists_known_rows(monkeypatch, tmp_path):
     monkeypatch.setattr(sys, "argv", ["goals", "--rows", "nonsense", "--json", str(tmp_path / "goals.json")])
     with pytest.raises(SystemExit, match=r"nonsense; there are net, net-20"):
         command.main()

@@ -59,7 +59,7 @@ def test_nothing_is_begun_after_the_deadline():
     assert not results.outcomes
 
 
-def test_a_fit_that_takes_too_long_is_given_up_and_no_larger_one_is_tried():
+def test_slow_fit_ends_growth():
     results = Results()
     slow = Competitor("slow", "Slow", "peer", loop_for_ever, "")
     run_quietly(plan([slow], fit_limit_s=0.05), results)
@@ -75,7 +75,7 @@ def test_a_divergence_counts_as_a_failure():
     assert "diverged" in summary.reason
 
 
-def test_the_mean_and_its_standard_error_are_over_the_seeds_that_came_to_an_end():
+def test_mean_and_standard_error_cover_finished_seeds():
     values = [0.01, 0.02, 0.03]
     outcomes = [Outcome("t", "c", 30, seed, "ok", {"x": value}) for seed, value in enumerate(values)]
     summary = cell([*outcomes, Outcome("t", "c", 30, 3, "failed", reason="NaN")], "x")
@@ -95,7 +95,7 @@ def test_the_bound_is_what_the_right_model_reaches():
     assert np.mean(errors) == pytest.approx(np.mean(floors), rel=0.15)
 
 
-def test_no_bound_is_given_where_the_right_model_is_no_rigid_chain():
+def test_bound_is_absent_for_non_rigid_truth():
     bent = next(task for task in simulated_tasks() if task.key == "sag1").trial(0, 30)
     assert bent is not None
     assert bounds(bent) == {}
@@ -123,7 +123,7 @@ def test_the_page_has_every_task_with_a_chart(page):
     assert all("<polyline" in section for section in sections.values())
 
 
-def test_the_page_names_every_competitor_and_what_it_is(page):
+def test_page_describes_every_competitor(page):
     assert all(f"<code>{competitor.key}</code>" in page for competitor in COMPETITORS)
 
 
@@ -141,7 +141,7 @@ def test_a_competitor_has_one_colour_in_all_charts(page):
     assert len(set(colours)) == 1
 
 
-def test_the_names_of_the_best_stand_at_their_lines_ends(page):
+def test_best_competitors_are_named_at_line_ends(page):
     section = page.split('<section id="rough6">')[1].split("</section>")[0]
     assert len(re.findall(r'<text class="end"', section)) == 5
 
@@ -151,13 +151,13 @@ def test_a_single_seed_is_not_called_a_mean(page):
     assert "Means over" not in page
 
 
-def test_names_at_lines_ends_are_kept_apart_within_the_chart():
+def test_line_labels_stay_apart_within_chart():
     placed = apart([10.0, 11.0, 279.0, 280.0, 280.0])
     assert min(np.diff(placed)) >= 14.0
     assert max(placed) <= 280.0
 
 
-def test_the_tables_say_each_task_s_means_with_the_best_in_bold():
+def test_tables_show_task_means_with_best_bold():
     drawing, psom = BY_KEY["drawing"], BY_KEY["psom"]
     results = Results()
     for key, error_m in (("drawing", 4e-3), ("psom", 0.12)):

@@ -100,24 +100,24 @@ def small(name: str) -> Experiment:
         return SMALL[name](a_run())
 
 
-def test_a_walk_takes_steps_between_one_and_three_degrees() -> None:
+def test_walk_steps_are_one_to_three_degrees() -> None:
     q = walk(np.random.default_rng(0), 30, JOINTS[7])
     steps = np.degrees(np.linalg.norm(np.diff(q, axis=0), axis=1))
     assert (steps.min() >= 1.0, steps.max() <= 3.0) == (True, True)
 
 
-def test_a_walk_with_steps_of_each_joint_takes_them_in_the_root_mean_square() -> None:
+def test_walk_by_joint_has_rms_step_size() -> None:
     q = walk(np.random.default_rng(0), 30, JOINTS[7], each_joint=True)
     steps = np.degrees(np.sqrt(np.square(np.diff(q, axis=0)).mean(axis=1)))
     assert (steps.min() >= 1.0, steps.max() <= 3.0) == (True, True)
 
 
-def test_the_same_seed_gives_the_same_walk_although_two_threads_read_it() -> None:
+def test_walk_is_reproducible_across_threads() -> None:
     walks = [walk(np.random.default_rng(3), 20, JOINTS[5]) for _ in range(2)]
     np.testing.assert_array_equal(*walks)
 
 
-def test_the_longer_tool_moves_the_marker_by_its_length() -> None:
+def test_longer_tool_moves_marker_by_its_length() -> None:
     chain = arm(7)
     q = np.random.default_rng(0).uniform(-1.0, 1.0, (20, 7))
     moved = np.linalg.norm(longer_tool(chain, 0.25).positions(q) - chain.positions(q), axis=1)
@@ -131,7 +131,7 @@ def test_every_joint_of_the_arm_moves_the_marker(joints: tuple[str, ...]) -> Non
     assert min(moves) > 0.003
 
 
-def test_a_curve_tells_from_where_on_it_stays_below_a_limit() -> None:
+def test_curve_reports_where_it_stays_below_limit() -> None:
     found = Curve("", "", count=[10, 20, 30, 40], mean=[5.0, 1.0, 3.0, 1.0])
     assert (found.first_below(2.0), found.first_below(0.5)) == (40, None)
 
@@ -141,17 +141,17 @@ def test_a_curve_says_nothing_before_its_first_point() -> None:
     assert (found.at(9), found.at(19), found.at(20)) == (None, 5.0, 1.0)
 
 
-def test_the_mean_length_of_unit_noise_is_what_is_drawn() -> None:
+def test_mean_length_of_unit_noise_matches_draws() -> None:
     drawn = np.linalg.norm(np.random.default_rng(0).normal(size=(100_000, 3)), axis=1)
     assert drawn.mean() == pytest.approx(MEAN_NOISE, rel=0.005)
 
 
-def test_each_stage_of_a_stream_learns_every_pair_once() -> None:
+def test_stream_stage_learns_each_pair_once() -> None:
     order = in_stages(np.random.default_rng(0), 50, 150)
     assert [sorted(stage) for stage in order.reshape(3, 50)] == [list(range(50))] * 3
 
 
-def test_a_model_of_ones_own_joins_with_one_line() -> None:
+def test_custom_model_joins_with_one_line() -> None:
     chain, q = arm(5), np.random.default_rng(0).uniform(-1.0, 1.0, (40, 5))
     mine = Contender("mine", "black", WITH_DRAWING[0].make)
     known = Knowledge(longer_tool(chain, 0.1), ChainTolerances(tool=0.1), np.pi)
@@ -179,23 +179,23 @@ def test_every_experiment_has_readings_and_curves_without_gaps(name: str) -> Non
 
 
 @pytest.mark.parametrize("name", NAMES[:4])
-def test_every_figure_has_the_new_models_beside_the_papers_method(name: str) -> None:
+def test_figures_compare_new_models_with_paper_method(name: str) -> None:
     table = small(name).comparison
     assert table is not None
     names = [curve.name for panel in small(name).panels for curve in panel.curves]
     assert {contender.name for contender in WITH_DRAWING} <= set(table.rows) & set(names)
 
 
-def test_on_figure_7s_noisy_pairs_the_rigid_chain_is_ahead_of_the_papers_rule() -> None:
+def test_rigid_chain_beats_paper_on_figure_7() -> None:
     where = ("σ = 20 mm", "near", "at 32")
     assert error(small("fig7"), "rigid chain", *where) < 0.6 * error(small("fig7"), "paper's rule", *where)
 
 
-def test_as_many_noise_free_samples_as_control_points_give_the_arm_back() -> None:
+def test_noise_free_samples_per_control_point_recover_arm() -> None:
     assert value(small("exactness"), "5 joints", "from ±80°", "mean error") < 1e-9
 
 
-def test_the_terminal_tells_a_quantity_once_and_each_way_to_read_it() -> None:
+def test_terminal_shows_quantity_once_with_each_interpretation() -> None:
     readings = [Reading("error", read_as, "50 mm", given) for read_as, given in (("near", 0.0235), ("far", None))]
     table = Comparison("others", [Column("near", 30)], {"rigid chain": [1e-15], "tensor train": [0.118]})
     console = Console(width=120, record=True, file=io.StringIO())
@@ -206,7 +206,7 @@ def test_the_terminal_tells_a_quantity_once_and_each_way_to_read_it() -> None:
 
 
 @pytest.mark.soak
-def test_the_command_draws_the_curves_and_tells_the_papers_figure_beside_ours(tmp_path, capsys, monkeypatch) -> None:
+def test_command_plots_curves_and_prints_both_figures(tmp_path, capsys, monkeypatch) -> None:
     def told(run: Run) -> Experiment:
         run.say("exact learning")
         return small("fig4")
@@ -263,7 +263,7 @@ def test_measured_curves_without_pybullet_name_what_to_install(tmp_path, monkeyp
 
 
 @pytest.mark.soak
-def test_figure_5_simulates_in_the_very_postures_that_were_measured(monkeypatch) -> None:
+def test_figure_5_simulates_measured_postures(monkeypatch) -> None:
     monkeypatch.setattr("bodyschema.reproduce.fig5.postures", planted)
     monkeypatch.setattr("bodyschema.reproduce.fig5._models", lambda *_: {})  # only least squares is asked here
     found = fig5(a_run(real=True), train=300, test=30)
@@ -283,7 +283,7 @@ def by_the_rule_and_a_rigid_chain(
 
 
 @pytest.mark.soak
-def test_figure_7_tests_on_measured_points_and_on_the_truth(monkeypatch) -> None:
+def test_figure_7_tests_on_measurements_and_truth(monkeypatch) -> None:
     monkeypatch.setattr("bodyschema.reproduce.fig7.learn_stream", by_the_rule_and_a_rigid_chain)
     monkeypatch.setattr("bodyschema.reproduce.fig7.guided_walk", planted)
     found = fig7(a_run(real=True), online=32, cycles=64, held_out=20, onward=20)
@@ -292,7 +292,7 @@ def test_figure_7_tests_on_measured_points_and_on_the_truth(monkeypatch) -> None
 
 
 @pytest.mark.soak
-def test_a_guided_walk_is_measured_in_the_samplers_steps_as_well_as_the_tracker_can() -> None:
+def test_guided_walk_has_sampler_steps_and_tracker_noise() -> None:
     pytest.importorskip("pybullet")
     found = guided_walk(6, 5, 0, lambda _said: None)
     steps = np.degrees(np.linalg.norm(np.diff(found.q, axis=0), axis=1))
@@ -300,7 +300,7 @@ def test_a_guided_walk_is_measured_in_the_samplers_steps_as_well_as_the_tracker_
 
 
 @pytest.mark.soak
-def test_postures_far_apart_are_measured_as_well_as_the_tracker_can() -> None:
+def test_distant_postures_have_tracker_noise() -> None:
     pytest.importorskip("pybullet")
     found = postures(5, 5, 0, lambda _said: None)
     steps = np.degrees(np.linalg.norm(np.diff(found.q, axis=0), axis=1))
@@ -310,14 +310,14 @@ def test_postures_far_apart_are_measured_as_well_as_the_tracker_can() -> None:
 
 @pytest.mark.soak
 @pytest.mark.parametrize("seed", range(3))
-def test_with_noise_the_test_error_falls_below_the_training_error_near_the_papers_2200_samples(seed: int) -> None:
+def test_error_crosses_training_error_near_2200_samples(seed: int) -> None:
     found = fig4(a_run(seed), tests=2_000)
     assert 1_800 <= value(found, "test error < training") <= 2_600
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("seed", range(3))
-def test_after_figure_6s_tool_change_thirty_pairs_tell_more_than_1800_cycles_of_the_papers_rule(seed: int) -> None:
+def test_thirty_pairs_beat_1800_paper_cycles_after_change(seed: int) -> None:
     found = fig6(a_run(seed))
     for noise in ("without noise", "σ = 20 mm"):
         of_rule = value(found, "1,800", f"; {noise}; near")
@@ -326,7 +326,7 @@ def test_after_figure_6s_tool_change_thirty_pairs_tell_more_than_1800_cycles_of_
 
 @pytest.mark.soak
 @pytest.mark.parametrize("seed", range(3))
-def test_figure_7s_measured_curve_falls_with_the_replay_as_the_simulated_one_does(seed: int) -> None:
+def test_figure_7_replay_lowers_measured_and_simulated_error(seed: int) -> None:
     pytest.importorskip("pybullet")
     found = fig7(a_run(seed, real=True))
     for curve in ("measured; held out, as", "simulated in the measured poses; held out, true"):

@@ -36,7 +36,7 @@ def test_tables_fit_80_columns_without_a_broken_cell() -> None:
         assert any(words in line for line in lines), words
 
 
-def test_a_model_has_a_row_for_each_test_and_a_column_for_each_number_of_pairs() -> None:
+def test_table_has_row_per_test_column_per_count() -> None:
     columns = [Column("near", 30), Column("near", 600), Column("far", 30)]
     table = Comparison("others", columns, {"rigid": [0.001, 0.002, 0.003]})
     rows = [line.split() for line in printed(Experiment("x", "X", "cycles", [], [], table, []), 80).splitlines()]
@@ -65,7 +65,7 @@ def test_without_a_terminal_each_step_is_a_line() -> None:
     assert console.export_text().splitlines() == ["fig4: one", "fig4: two"]
 
 
-def test_on_a_terminal_a_step_takes_the_place_of_the_last_one() -> None:
+def test_terminal_step_overwrites_last_one() -> None:
     stream = io.StringIO()
     console = Console(file=stream, force_terminal=True, width=60)
     with screen.shown_on(console, "fig4") as say:
@@ -83,7 +83,7 @@ def axes_of(panel: Panel):
     return axes
 
 
-def test_what_varies_from_pair_to_pair_is_a_band_around_its_median() -> None:
+def test_varying_curve_is_band_around_median() -> None:
     rng = np.random.default_rng(0)
     lengths = rng.uniform(0.001, 0.002, 7_000).tolist()
     axes = axes_of(Panel("", [Curve("each pair", "green", thin=True, count=list(range(7_000)), mean=lengths)], True))
@@ -94,7 +94,7 @@ def test_what_varies_from_pair_to_pair_is_a_band_around_its_median() -> None:
     assert (heights.min() > 1.0, heights.max() < 2.0) == (True, True)
 
 
-def test_a_logarithmic_axis_has_no_more_points_than_can_be_told_apart_and_the_last_one_as_it_is() -> None:
+def test_logarithmic_axis_thins_points_and_keeps_last() -> None:
     curve = Curve("rule", "red", count=list(range(0, 3_000, 10)), mean=np.linspace(0.1, 0.01, 300).tolist())
     (line,) = axes_of(Panel("", [curve])).get_lines()
     points = np.asarray(line.get_xydata())
@@ -102,13 +102,13 @@ def test_a_logarithmic_axis_has_no_more_points_than_can_be_told_apart_and_the_la
     assert points[-1].tolist() == pytest.approx([2_990.0, 10.0])
 
 
-def test_where_curves_coincide_the_narrow_one_lies_above_the_wide_one() -> None:
+def test_narrow_curve_covers_coinciding_wide_one() -> None:
     curves = [Curve(str(width), "red", width=width, count=[1, 2, 3], mean=[0.1] * 3) for width in (1.4, 5.0)]
     narrow, wide = axes_of(Panel("", curves)).get_lines()
     assert narrow.get_zorder() > wide.get_zorder()
 
 
-def test_the_legend_says_what_styles_and_dotted_lines_mean() -> None:
+def test_legend_explains_styles_and_dotted_lines() -> None:
     curve = Curve("rule", "red", count=[1, 2], mean=[0.1, 0.1], largest=[0.2, 0.2])
     axes = axes_of(Panel("", [curve], as_paper=True, styles={"--": "without noise"}))
     legend = axes.get_legend()

@@ -27,22 +27,22 @@ def q(rng):
     return rng.uniform(-1.4, 1.4, (40, 6))
 
 
-def test_a_rigid_arm_moves_as_the_chain_whose_numbers_it_has(chain, q):
+def test_rigid_arm_matches_its_chain(chain, q):
     np.testing.assert_allclose(Arm.of(chain).positions(q), chain.positions(q), atol=1e-12)
 
 
-def test_a_shifted_marker_is_seen_where_a_chain_with_that_tool_has_it(chain, q):
+def test_shifted_marker_matches_chain_with_that_tool(chain, q):
     shift = np.array([0.1, -0.02, 0.03])
     np.testing.assert_allclose(Arm.of(chain).positions(q, shift), chain.with_tool(shift).positions(q), atol=1e-12)
 
 
-def test_an_eccentric_encoder_errs_by_its_size_once_a_turn(chain):
+def test_eccentric_encoder_errs_once_per_turn(chain):
     turn = np.tile(np.linspace(0.0, 2.0 * np.pi, 721)[:, None], (1, 6))
     error = Eccentric(math.radians(1.0), np.arange(6.0))(Arm.of(chain), turn) - turn
     np.testing.assert_allclose(np.abs(error).max(axis=0), math.radians(1.0), rtol=1e-4)
 
 
-def test_a_gear_gain_of_one_per_cent_turns_by_one_per_cent_more(chain, q):
+def test_gear_gain_scales_the_turn(chain, q):
     np.testing.assert_allclose(GearGain(np.full(6, 1.01))(Arm.of(chain), q), 1.01 * q)
 
 
@@ -72,25 +72,25 @@ def test_torques_are_the_slope_of_the_potential_energy(chain, q):
 
 
 @pytest.mark.parametrize("degrees", [1.0, 3.0])
-def test_sag_bends_the_most_loaded_joint_by_about_what_it_says(chain, degrees, rng):
+def test_sag_bends_most_loaded_joint_as_stated(chain, degrees, rng):
     poses = rng.uniform(-np.pi / 2, np.pi / 2, (400, 6))
     deflections = np.abs(Sag.on(6, math.radians(degrees))(Arm.of(chain), poses) - poses)
     assert np.degrees(deflections.max()) == pytest.approx(degrees, rel=0.2)
     assert deflections[:, :2].max() == 0.0
 
 
-def test_the_cameras_scales_are_off_by_two_to_three_per_cent(rng):
+def test_camera_scales_err_two_to_three_percent(rng):
     scales = np.abs(np.diag(Affine.drawn(rng).matrix) - 1.0)
     assert ((scales >= 0.02) & (scales <= 0.03)).all()
 
 
-def test_radial_distortion_is_two_per_cent_at_its_radius():
+def test_radial_distortion_is_two_per_cent():
     seen = Radial(0.02, 0.5, np.zeros(3))(np.array([[0.5, 0.0, 0.0], [0.0, 0.0, 0.0]]))
     np.testing.assert_allclose(seen, [[0.51, 0.0, 0.0], [0.0, 0.0, 0.0]])
 
 
 @pytest.mark.parametrize("key", [key for key in BENT if key != "rigid"])
-def test_no_rigid_chain_is_the_truth_of_a_bent_task(key):
+def test_bent_task_has_no_rigid_truth(key):
     setting = BENT[key][1]
     trial, rigid = setting(3, 30), BENT["rigid"][1](3, 30)
     assert trial is not None
@@ -104,7 +104,7 @@ def test_no_rigid_chain_is_the_truth_of_a_bent_task(key):
     assert np.linalg.norm(straight - rigid.arm.positions(same), axis=1).max() < 1e-12
 
 
-def test_noise_free_truth_is_asked_for_and_the_pairs_carry_the_noise():
+def test_truth_is_noise_free_and_pairs_are_noisy():
     trial = Setting()(0, 2000)
     assert trial is not None
     assert trial.arm is not None
@@ -112,7 +112,7 @@ def test_noise_free_truth_is_asked_for_and_the_pairs_carry_the_noise():
     assert noise.std() == pytest.approx(0.01, rel=0.05)
 
 
-def test_the_pairs_of_one_seed_begin_alike_whatever_their_number():
+def test_pairs_of_one_seed_share_their_beginning():
     few, many = Setting()(4, 30), Setting()(4, 100)
     np.testing.assert_array_equal(few.problem.x, many.problem.x[:30])
     np.testing.assert_array_equal(few.tests["drawn alike"][1], many.tests["drawn alike"][1])
@@ -128,7 +128,7 @@ def test_a_rough_drawing_errs_as_its_tolerances_say():
     assert 0.07 < np.mean(errors) < 0.11
 
 
-def test_the_tool_moves_by_a_quarter_metre_between_the_pairs_before_and_after():
+def test_tool_change_is_a_quarter_metre():
     trial = next(task for task in simulated_tasks() if task.key == "tool").trial(0, 10)
     assert trial is not None
     assert trial.before is not None
@@ -137,7 +137,7 @@ def test_the_tool_moves_by_a_quarter_metre_between_the_pairs_before_and_after():
     assert np.linalg.norm(before, axis=1).mean() == pytest.approx(0.25, rel=0.02)
 
 
-def test_a_local_zone_spans_forty_degrees_and_is_asked_beyond():
+def test_local_zone_spans_forty_degrees_and_tests_beyond():
     trial = next(task for task in simulated_tasks() if task.key == "local").trial(0, 300)
     assert trial is not None
     assert np.degrees(np.ptp(trial.problem.q, axis=0)).max() <= 40.0

@@ -53,7 +53,9 @@ def scene() -> tuple[Built, Motion, Way, list[Cause]]:
 
 
 @pytest.mark.parametrize("effect", EFFECTS)
-def test_the_observer_knows_how_the_cause_looks(scene: tuple[Built, Motion, Way, list[Cause]], effect: str) -> None:
+def test_observer_columns_match_the_simulated_effect(
+    scene: tuple[Built, Motion, Way, list[Cause]], effect: str
+) -> None:
     built, motion, way, causes = scene
     by_joints, by_frames = way.posture.by_joints(), way.posture.by_frames()
     arm = replace(built.arm, ticks=dict.fromkeys(built.arm.ticks, 2**52))
@@ -76,11 +78,11 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> DenseCase:
     return hide_dense(2, tmp_path_factory.mktemp("dense"), rows=200, count=2)
 
 
-def test_the_truth_is_outside_the_folder_that_is_diagnosed(case: DenseCase) -> None:
+def test_ground_truth_is_outside_the_diagnosed_folder(case: DenseCase) -> None:
     assert sorted(file.name for file in (case.folder / "case").iterdir()) == ["arm.urdf", "measured.csv", "robot.toml"]
 
 
-def test_the_truth_tells_each_cause_with_its_evidence(case: DenseCase) -> None:
+def test_sealed_truth_lists_each_cause_with_its_evidence(case: DenseCase) -> None:
     told = json.loads((case.folder / "sealed.json").read_text(encoding="utf-8"))
     assert [entry["cause"] for entry in told["truth"]] == [written(cause) for cause in case.truth]
     assert all(entry["nats"] == pytest.approx(nats) for entry, nats in zip(told["truth"], case.nats, strict=True))
@@ -117,12 +119,12 @@ def test_the_observer_is_sure_of_a_large_cause() -> None:
     assert spare > 0.0
 
 
-def test_the_observer_is_not_sure_of_a_cause_below_the_noise() -> None:
+def test_observer_rejects_cause_below_the_noise() -> None:
     evidence, _ = _observer([1.0, 0.005, 1.0]).evidence([1])
     assert evidence[0].nats < 0.0
 
 
-def test_the_observer_does_not_see_what_the_instrument_absorbs() -> None:
+def test_observer_rejects_cause_absorbed_by_instrument_pose() -> None:
     rng = np.random.default_rng(1)
     column, other = rng.normal(size=(60, 1)), rng.normal(size=(60, 1))
     observer = Observer.of(
@@ -131,7 +133,7 @@ def test_the_observer_does_not_see_what_the_instrument_absorbs() -> None:
     assert observer.evidence([0])[0][0].nats < 0.0
 
 
-def test_a_cause_with_the_same_column_is_the_same() -> None:
+def test_causes_with_proportional_columns_are_equivalent() -> None:
     rng = np.random.default_rng(1)
     column, other = rng.normal(size=(60, 1)), rng.normal(size=(60, 1))
     blocks, amounts = [100 * column, 50 * column, 100 * other], [np.ones(1)] * 3

@@ -57,28 +57,28 @@ def test_a_sure_false_cause_of_weight_is_wrong() -> None:
     assert outcome(_sealed(ZERO), _told(_cause(ZERO), _cause(PLAY, share=20.0))) == ("wrong", [PLAY], [])
 
 
-def test_a_sure_cause_where_nothing_is_hidden_is_wrong() -> None:
+def test_sure_cause_is_wrong_when_nothing_is_hidden() -> None:
     assert outcome(_sealed(), _told(_cause(LINK)))[0] == "wrong"
 
 
-def test_a_link_in_the_place_of_a_zero_is_wrong() -> None:
+def test_link_named_instead_of_joint_offset_is_wrong() -> None:
     assert outcome(_sealed(ZERO), _told(_cause(LINK))) == ("wrong", [LINK], [ZERO])
 
 
-def test_a_zero_in_the_place_of_a_link_is_wrong() -> None:
+def test_joint_offset_named_instead_of_link_is_wrong() -> None:
     assert outcome(_sealed(LINK), _told(_cause(ZERO)))[0] == "wrong"
 
 
-def test_a_cause_that_is_the_same_in_any_motion_is_right() -> None:
+def test_cause_equivalent_in_any_motion_is_right() -> None:
     assert outcome(_sealed(LINK, same=("link_geometry@wrist",)), _told(_cause("link_geometry@wrist")))[0] == "right"
 
 
-def test_one_name_does_not_stand_for_two_hidden_causes() -> None:
+def test_one_named_cause_covers_one_hidden_cause_only() -> None:
     hidden = _sealed(ZERO, PLAY, same=("encoder_jump@elbow",))
     assert outcome(hidden, _told(_cause("encoder_jump@elbow")))[2] == [PLAY]
 
 
-def test_a_false_cause_that_tells_the_truth_beside_it_is_honest() -> None:
+def test_false_cause_with_truth_as_rival_is_honest() -> None:
     assert outcome(_sealed(ZERO), _told(_cause(LINK, rivals=(ZERO,))))[0] == "honest"
 
 
@@ -90,7 +90,7 @@ def test_unexplained_at_another_joint_is_vague() -> None:
     assert outcome(_sealed(ZERO), _told(verdict="unexplained", depends_on=("wrist",)))[0] == "vague"
 
 
-def test_a_slip_left_open_as_depending_on_time_is_honest() -> None:
+def test_unexplained_tool_slip_depending_on_time_is_honest() -> None:
     assert outcome(_sealed("tool_slip"), _told(verdict="unexplained", depends_on=("time",)))[0] == "honest"
 
 
@@ -102,7 +102,7 @@ def test_an_unsure_false_cause_is_vague() -> None:
     assert outcome(_sealed(ZERO), _told(_cause(LINK, 0.6), verdict="undecided"))[0] == "vague"
 
 
-def test_false_fixes_named_in_heavy_tails_are_no_false_cause() -> None:
+def test_outliers_named_in_heavy_tailed_noise_are_right() -> None:
     assert outcome(_sealed(noise="student"), _told(_cause("outliers")))[0] == "right"
 
 
@@ -115,7 +115,7 @@ def test_an_interval_counts_offsets_as_true_minus_reading() -> None:
     assert inside(_sealed(ZERO), _told(cause)) == (1, 1)
 
 
-def test_the_placed_model_finds_instrument_and_marker_of_a_perfect_arm(tmp_path: Path) -> None:
+def test_placed_model_recovers_instrument_and_marker_poses(tmp_path: Path) -> None:
     case = hide_dense(3, tmp_path, rows=80, count=0)
     true = replace(
         case.nominal, marker=case.nominal.marker + 0.01, eye_x=case.nominal.eye_x + np.array([1.0, -2.0, 0.5])
@@ -125,7 +125,7 @@ def test_the_placed_model_finds_instrument_and_marker_of_a_perfect_arm(tmp_path:
     assert rms_mm(built.measured(case.fresh.q) - true.measured(case.fresh.q)) < 1e-6
 
 
-def test_what_hangs_is_killed() -> None:
+def test_hung_process_is_killed() -> None:
     ran = Checkout(Path.cwd(), 0.5)._run("import time; time.sleep(60)")
     assert ran.code < 0
 
@@ -147,7 +147,7 @@ def _record(**more: Any) -> DenseJudgement:
     return DenseJudgement(**(usual | more))
 
 
-def test_a_prediction_that_is_worse_than_the_placed_model_counts() -> None:
+def test_table_counts_predictions_worse_than_placed_model() -> None:
     assert "no worse than the placed nominal model 1 of 2" in table([_record(), _record(extended_mm=2.5)])
 
 
@@ -157,7 +157,7 @@ def test_cases_that_no_observer_decides_stand_apart() -> None:
     assert "| not decidable | 1 | 0 | 0 | 1 | 0 | 0 |" in shown
 
 
-def test_a_crash_is_told_in_the_line() -> None:
+def test_line_reports_the_crash_error() -> None:
     assert line(_record(outcome="crashed", extended_mm=None, error="Traceback\nValueError: no")).endswith(
         "ValueError: no"
     )

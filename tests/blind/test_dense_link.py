@@ -23,7 +23,7 @@ def named(seed: int, rows: int | None, folder: Path) -> set[tuple[str, str | Non
 
 
 @pytest.mark.soak
-def test_a_link_of_which_each_turn_alone_is_worth_nothing_is_named_beside_four_causes(tmp_path: Path) -> None:
+def test_link_turned_obliquely_is_named_beside_four_causes(tmp_path: Path) -> None:
     # The link is turned by 1.6° about an oblique axis.
     assert named(53001, 600, tmp_path) == {
         ("tool_slip", None),
@@ -35,7 +35,7 @@ def test_a_link_of_which_each_turn_alone_is_worth_nothing_is_named_beside_four_c
 
 
 @pytest.mark.soak
-def test_an_offset_that_first_order_does_not_tell_from_tolerances_is_named_beside_four_causes(tmp_path: Path) -> None:
+def test_offset_resembling_tolerances_is_named_beside_four_causes(tmp_path: Path) -> None:
     # The offset is 1.4°, and the noise 0.02 mm.
     assert named(54102, None, tmp_path) == {
         ("tool_slip", None),

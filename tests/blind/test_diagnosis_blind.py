@@ -94,7 +94,7 @@ def _check(names: tuple[str, ...]) -> None:
     [*KNOWN, *(pytest.param(case, marks=pytest.mark.soak) for case in MORE)],
     ids=lambda case: f"{case.scenario}-{case.seed}",
 )
-def test_a_case_of_a_known_seed_is_right_or_below_the_noise(case: Case) -> None:
+def test_known_case_is_right_or_missed_below_noise(case: Case) -> None:
     # A camera 0.3 mm and 0.02° off, or a slow drift of 0.8 mm below 4 mm of noise, is tolerated.
     record = run(case)
     assert not isinstance(record, Crash), record
@@ -104,7 +104,7 @@ def test_a_case_of_a_known_seed_is_right_or_below_the_noise(case: Case) -> None:
 
 
 @pytest.mark.soak
-def test_what_is_hidden_is_named() -> None:
+def test_hidden_causes_are_named() -> None:
     _check(NAMED)
 
 
@@ -114,7 +114,7 @@ def test_nothing_is_found_where_nothing_is_hidden() -> None:
 
 
 @pytest.mark.soak
-def test_what_is_outside_the_table_gets_no_name() -> None:
+def test_effect_outside_the_table_gets_no_name() -> None:
     _check(OUTSIDE)
 
 

@@ -50,7 +50,7 @@ def whitened_rms(case: HiddenCase, taken: Taken) -> float:
 
 
 @pytest.mark.parametrize("name", ARMS)
-def test_pybullet_and_the_described_chain_agree_on_the_marker(name: str, tmp_path: Path) -> None:
+def test_pybullet_marker_matches_nominal_chain(name: str, tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     arm = ARMS[name](rng)
     write_robot(tmp_path, arm, "held", marker_known=True, pose_known=True)
@@ -64,9 +64,7 @@ def test_pybullet_and_the_described_chain_agree_on_the_marker(name: str, tmp_pat
 
 @pytest.mark.parametrize("hold", HOLDS)
 @pytest.mark.parametrize("name", ARMS)
-def test_with_nothing_hidden_only_encoder_ticks_are_between_chain_and_positions(
-    name: str, hold: str, tmp_path: Path
-) -> None:
+def test_deviation_without_hidden_effect_is_encoder_quantization(name: str, hold: str, tmp_path: Path) -> None:
     case = hide(1, tmp_path, (), arm=name, hold=hold, pairs=60)
     farthest = 1.2  # m, longer than any arm
     ticks = sum(0.5 * case.arm.quantum(joint) for joint in case.arm.read)
@@ -91,20 +89,20 @@ def test_the_same_seed_gives_the_same_files(tmp_path: Path) -> None:
     assert (first / "measured.csv").read_bytes() != (third / "measured.csv").read_bytes()
 
 
-def test_the_folder_tells_nothing_of_the_truth(tmp_path: Path) -> None:
+def test_case_folder_reveals_no_ground_truth(tmp_path: Path) -> None:
     hide(3, tmp_path, 2, pairs=60)
     assert sorted(file.name for file in tmp_path.iterdir()) == sorted(FILES)
 
 
 @pytest.mark.parametrize("effect", some([name for name in EVERY if name != "outliers"], 4))
-def test_an_effect_is_as_large_as_the_truth_says(effect: str, tmp_path: Path) -> None:
+def test_whitened_effect_matches_the_stated_size(effect: str, tmp_path: Path) -> None:
     case = hide(11, tmp_path, [effect], pairs=150, size=8.0)
     # Rounding to ticks adds up to one unit of noise; the size was taken at the spare pairs too.
     assert whitened_rms(case, case.measured) == pytest.approx(case.truth[0].size, rel=0.15, abs=0.4)
 
 
 @pytest.mark.parametrize("name", some(list(ARMS), len(ARMS)))
-def test_residuals_with_nothing_hidden_are_as_large_as_the_noise(name: str, tmp_path: Path) -> None:
+def test_residuals_without_hidden_effect_match_the_noise(name: str, tmp_path: Path) -> None:
     case = hide(27, tmp_path, (), arm=name, pairs=500)
     off = case.measured.x - nominal(case, case.measured)
     chi2 = np.einsum("ni,nij,nj->n", off, np.linalg.inv(case.measured.noise), off)
@@ -118,7 +116,7 @@ def test_an_effect_gets_the_size_asked_for(effect: str, size: float, tmp_path: P
     assert case.truth[0].size == pytest.approx(size, rel=0.05)
 
 
-def test_a_fresh_recording_has_the_same_effect_on_another_way(tmp_path: Path) -> None:
+def test_fresh_recording_has_same_effect_on_another_path(tmp_path: Path) -> None:
     case = hide(13, tmp_path, ["joint_offset@elbow"], arm="industrial", pairs=300, size=10.0)
     assert not np.array_equal(case.measured.q, case.fresh.q)
     assert whitened_rms(case, case.fresh) == pytest.approx(whitened_rms(case, case.measured), rel=0.3)
@@ -131,7 +129,7 @@ def test_positions_scatter_as_their_covariances_say(tmp_path: Path) -> None:
     assert chi2.mean() == pytest.approx(3.0, rel=0.15)
 
 
-def test_outliers_are_as_many_as_said_and_far_away(tmp_path: Path) -> None:
+def test_outliers_match_requested_count_and_are_distant(tmp_path: Path) -> None:
     case = hide(15, tmp_path, (), pairs=400, outliers=0.1)
     off = np.linalg.norm(case.measured.x - case.measured.x_noise_free, axis=1)
     assert case.measured.outlier.sum() == 40
@@ -148,7 +146,7 @@ def test_named_joints_are_taken(tmp_path: Path) -> None:
     assert (case.truth[0].where, case.truth[0].source) == ("elbow", "waist")
 
 
-def test_what_is_only_roughly_known_is_no_truth_to_find(tmp_path: Path) -> None:
+def test_unknown_marker_and_camera_pose_are_nuisances(tmp_path: Path) -> None:
     case = hide(18, tmp_path, (), pairs=60, marker_known=False, pose_known=False)
     assert case.truth == ()
     assert {nuisance.effect for nuisance in case.nuisances} == {"tool_offset", "camera_pose"}
@@ -156,21 +154,21 @@ def test_what_is_only_roughly_known_is_no_truth_to_find(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("effect", [name for name, kind in EVERY.items() if kind.bears])
-def test_springs_do_not_show_where_the_hand_bears_the_arm(effect: str, tmp_path: Path) -> None:
+def test_compliance_is_rejected_for_hand_supported_arm(effect: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="not all of these show"):
         hide(19, tmp_path, [effect], hold="torque_free", pairs=20)
 
 
-def test_latency_does_not_show_in_poses_that_are_held(tmp_path: Path) -> None:
+def test_camera_latency_is_rejected_for_held_poses(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="not all of these show"):
         hide(19, tmp_path, ["camera_latency"], hold="held", pairs=20)
 
 
-def test_every_effect_of_the_table_is_there() -> None:
+def test_table_has_20_effects() -> None:
     assert len(KINDS) == 20
 
 
-def test_an_outside_effect_says_on_which_joints_it_shows(tmp_path: Path) -> None:
+def test_outside_effect_states_the_joints_it_shows_on(tmp_path: Path) -> None:
     case = hide(20, tmp_path, ["cable_touches@elbow:waist"], arm="industrial", pairs=300, size=5.0)
     hidden = case.truth[0]
     assert hidden.outside
@@ -180,7 +178,7 @@ def test_an_outside_effect_says_on_which_joints_it_shows(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("name", some(list(ARMS), len(ARMS)))
-def test_a_walk_goes_in_steps_of_one_to_three_degrees_through_several_regions(name: str, tmp_path: Path) -> None:
+def test_walk_steps_one_to_three_degrees_across_range(name: str, tmp_path: Path) -> None:
     case = hide(21, tmp_path, (), arm=name, hold="torque_free", pairs=600)
     taken, ranges = case.measured, case.arm.ranges
     same = np.diff(taken.segment) == 0
@@ -192,7 +190,7 @@ def test_a_walk_goes_in_steps_of_one_to_three_degrees_through_several_regions(na
     assert (np.ptp(taken.q, axis=0) > 0.5 * (ranges[:, 1] - ranges[:, 0])).all()
 
 
-def test_pairs_of_a_walk_come_at_a_varying_rate_with_pauses(tmp_path: Path) -> None:
+def test_walk_pairs_have_varying_rate_and_pauses(tmp_path: Path) -> None:
     taken = hide(22, tmp_path, (), hold="torque_free", pairs=600).measured
     lasts = np.diff(taken.t)
     rate = 1.0 / lasts[np.diff(taken.segment) == 0]
@@ -212,14 +210,14 @@ def test_wishes_that_cannot_be_are_refused(text: str, tmp_path: Path) -> None:
         hide(24, tmp_path, [text], arm="head", pairs=20)
 
 
-def test_the_command_writes_a_case_and_tells_the_truth(tmp_path: Path) -> None:
+def test_command_writes_case_and_prints_truth(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "tests.blind.hide", "--seed", "7", "--effect", "backlash", "--pairs", "60"]
     done = subprocess.run([*command, "--out", str(tmp_path)], cwd=ROOT, capture_output=True, text=True, check=True)
     assert json.loads(done.stdout)["truth"][0]["effect"] == "backlash"
     assert (tmp_path / "measured.csv").is_file()
 
 
-def test_a_narrow_motion_keeps_to_its_part_of_the_range(tmp_path: Path) -> None:
+def test_narrow_motion_stays_in_its_part_of_range(tmp_path: Path) -> None:
     case = hide(25, tmp_path, (), arm="industrial", pairs=300, reach=0.2, hold="held")
     widths = np.ptp(np.vstack([case.measured.q, case.fresh.q]), axis=0) / np.ptp(case.arm.ranges, axis=1)
     assert (widths < 0.21).all()

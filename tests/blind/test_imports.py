@@ -40,7 +40,7 @@ def imported(file: Path) -> Iterator[str]:
 
 
 @pytest.mark.parametrize("file", GENERATOR, ids=lambda file: file.stem)
-def test_the_generator_imports_nothing_of_the_product_but_the_tracker(file: Path) -> None:
+def test_generator_imports_no_product_code_except_the_tracker(file: Path) -> None:
     ours = {name for name in imported(file) if name.partition(".")[0] in OURS | {"tests", "importlib"}}
     assert ours <= INSTRUMENT.get(file.name, set())
 

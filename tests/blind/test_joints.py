@@ -33,7 +33,7 @@ def test_play_is_the_width_between_both_directions() -> None:
     np.testing.assert_allclose((back - again)[25:-25], 0.2)
 
 
-def test_play_keeps_the_output_still_while_the_direction_turns() -> None:
+def test_backlash_holds_output_while_direction_reverses() -> None:
     turning = np.concatenate([np.linspace(0.0, 1.0, 50), np.linspace(1.0, 0.85, 20)])
     assert (play(turning, 0.2)[50:] == play(turning, 0.2)[49]).all()
 
@@ -44,5 +44,5 @@ def test_a_lag_follows_a_step_exponentially() -> None:
     np.testing.assert_allclose(1.0 - output[2:], np.exp(-t[2:] / 0.1), rtol=1e-6)
 
 
-def test_the_lag_that_leaves_a_part_of_a_move_leaves_that_part() -> None:
+def test_lag_computed_for_residual_share_leaves_that_share() -> None:
     assert left_of_move(lag_that_leaves(0.2, 1.0, 0.5), 1.0, 0.5) == pytest.approx(0.2, rel=1e-6)

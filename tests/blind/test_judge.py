@@ -121,7 +121,7 @@ def test_a_cause_beside_the_right_one_is_wrong(truth_of: Hide) -> None:
     assert compared(truth_of(ELBOW), _file(_cause(ELBOW), _cause("camera_scale")))[2] == "wrong"
 
 
-def test_finding_nothing_of_a_large_effect_is_missing_it(truth_of: Hide) -> None:
+def test_finding_nothing_of_large_effect_is_missed(truth_of: Hide) -> None:
     assert compared(truth_of(ELBOW), _file(verdict="nothing_found"))[2] == "missed"
 
 
@@ -133,12 +133,12 @@ def test_a_right_cause_called_unexplained_is_wrong(truth_of: Hide) -> None:
     assert compared(truth_of(ELBOW), _file(_cause(ELBOW), verdict="unexplained"))[2] == "wrong"
 
 
-def test_a_wrong_cause_that_leaves_the_right_one_open_is_honest(truth_of: Hide) -> None:
+def test_wrong_cause_with_right_rival_is_honest(truth_of: Hide) -> None:
     rival = _cause("joint_scale@elbow", _like(ELBOW, "this_motion"), probability=0.5)
     assert compared(truth_of(ELBOW), _file(rival, verdict="undecided"))[2] == "honest"
 
 
-def test_a_wrong_cause_that_is_said_to_be_sure_is_wrong_whatever_its_rivals(truth_of: Hide) -> None:
+def test_sure_wrong_cause_is_wrong_despite_right_rival(truth_of: Hide) -> None:
     rival = _cause("joint_scale@elbow", _like(ELBOW, "this_motion"), probability=0.97)
     assert compared(truth_of(ELBOW), _file(rival, verdict="undecided"))[2] == "wrong"
 
@@ -148,17 +148,17 @@ def test_a_needless_member_is_needless(truth_of: Hide) -> None:
     assert len(causes[0].needless) == 1
 
 
-def test_what_no_motion_tells_apart_may_be_listed(truth_of: Hide) -> None:
+def test_equivalent_cause_may_be_listed_for_any_motion(truth_of: Hide) -> None:
     _, causes, _ = compared(truth_of(ELBOW), _file(_cause(ELBOW, _like("link_geometry@elbow", "any_motion"))))
     assert (causes[0].needless, causes[0].wrong_reach) == ((), ())
 
 
-def test_saying_that_another_motion_would_tell_what_none_tells_is_wrong(truth_of: Hide) -> None:
+def test_listing_equivalent_cause_for_this_motion_is_wrong(truth_of: Hide) -> None:
     _, causes, _ = compared(truth_of(ELBOW), _file(_cause(ELBOW, _like("link_geometry@elbow", "this_motion"))))
     assert len(causes[0].wrong_reach) == 1
 
 
-def test_the_first_link_is_the_camera_pose_which_is_simpler(truth_of: Hide) -> None:
+def test_first_link_error_must_be_named_camera_pose(truth_of: Hide) -> None:
     truth = truth_of("link_geometry@shoulder_pitch")
     named = [compared(truth, _file(_cause(name)))[2] for name in ("camera_pose", "link_geometry@shoulder_pitch")]
     assert named == ["right", "wrong"]
@@ -168,21 +168,21 @@ def test_the_camera_pose_is_not_the_first_link(truth_of: Hide) -> None:
     assert compared(truth_of("camera_pose"), _file(_cause("link_geometry@shoulder_pitch")))[2] == "wrong"
 
 
-def test_an_oracle_is_not_asked_to_tell_what_no_motion_tells(truth_of: Hide) -> None:
+def test_oracle_rival_is_never_an_equivalent_cause(truth_of: Hide) -> None:
     hidden, _, _ = compared(truth_of(ELBOW), _file(_cause(ELBOW)))
     assert hidden[0].told_chi2 > 25.0
     assert hidden[0].rival is not None
     assert hidden[0].rival[0] != "link_geometry"
 
 
-def test_chi_square_grows_with_the_square_of_the_effect(truth_of: Hide) -> None:
+def test_chi_square_scales_with_squared_effect_size(truth_of: Hide) -> None:
     small, large = (truth_of("camera_scale", size=size).judged(0, None, False) for size in (1.0, 3.0))
     assert large.seen_chi2 / small.seen_chi2 == pytest.approx(9.0, rel=0.15)
     assert large.told_chi2 / small.told_chi2 == pytest.approx(9.0, rel=0.3)
 
 
 @pytest.mark.parametrize("name", [name for name in KINDS if name != "outliers"])
-def test_the_table_says_with_the_meant_numbers_what_the_world_shows(name: str, truth_of: Hide) -> None:
+def test_effect_model_with_true_parameters_explains_simulated_positions(name: str, truth_of: Hide) -> None:
     truth = truth_of(name)
     target, effect = truth.case.measured.x_noise_free, truth.meanings[0].effect
     if name == "settling":
@@ -192,7 +192,7 @@ def test_the_table_says_with_the_meant_numbers_what_the_world_shows(name: str, t
 
 
 @pytest.mark.parametrize(("usual_s", "memory"), [(0.06, math.exp(-1.0)), (0.12, math.exp(-2.0))])
-def test_what_a_joint_remembers_is_told_after_the_usual_time(usual_s: float, memory: float, truth_of: Hide) -> None:
+def test_settling_memory_is_evaluated_at_usual_interval(usual_s: float, memory: float, truth_of: Hide) -> None:
     parameters = {"left": 0.3, "move_s": 0.03, "rest_s": 0.03, "tau_s": 0.06}
     hidden = Hidden("settling", "elbow", None, parameters, KINDS["settling"].sign)
     meaning = meant(hidden, truth_of(ELBOW).robot, usual_s)
@@ -223,7 +223,7 @@ def test_a_moment_between_the_right_rows_is_right(truth_of: Hide) -> None:
     assert inside == [True, False]
 
 
-def test_a_number_that_the_motion_does_not_tell_is_left_out(truth_of: Hide) -> None:
+def test_parameter_not_determined_by_motion_is_left_out(truth_of: Hide) -> None:
     _, causes, _ = compared(truth_of(ELBOW), _file(_cause(ELBOW, offset_rad=Interval(0.0, (-3.0, 3.0)))))
     assert (causes[0].numbers, causes[0].left_out) == ((), {"offset_rad": "not determined by this motion"})
 
@@ -244,7 +244,7 @@ def test_false_fixes_where_there_are_none_are_wrong(truth_of: Hide) -> None:
 @pytest.mark.parametrize(
     ("probability", "told_chi2", "said"), [(0.6, 20.0, "honest"), (0.95, 20.0, "wrong"), (0.6, 30.0, "wrong")]
 )
-def test_a_name_that_is_left_open_is_honest_where_no_oracle_tells_it_from_what_has_none(
+def test_unsure_name_is_honest_below_oracle_threshold(
     truth_of: Hide, probability: float, told_chi2: float, said: str
 ) -> None:
     truth = truth_of("vergence", pose_known=True)
@@ -254,30 +254,30 @@ def test_a_name_that_is_left_open_is_honest_where_no_oracle_tells_it_from_what_h
     assert outcome(file, [msgspec.structs.replace(hidden, told_chi2=told_chi2)], causes, False) == said
 
 
-def test_what_is_outside_the_table_is_right_when_unexplained_and_wrong_under_a_name(truth_of: Hide) -> None:
+def test_outside_effect_is_right_unexplained_and_wrong_named(truth_of: Hide) -> None:
     truth = truth_of("square_of_other@elbow:shoulder_pitch")
     unexplained = _file(verdict="unexplained", depends_on=("elbow", "shoulder_pitch"))
     named = _file(_cause("joint_scale@elbow"))
     assert (compared(truth, unexplained)[2], compared(truth, named)[2]) == ("right", "wrong")
 
 
-def test_the_right_joints_are_those_on_which_it_shows() -> None:
+def test_right_joints_are_those_showing_the_effect() -> None:
     hidden = Hidden("link_bend", "a", None, {}, "", True, ("b",), shows_on={"a": 0.1, "b": 0.8, "c": 0.01})
     said = [("b",), ("a", "b"), ("a",), ("b", "c")]
     assert [joints_right(hidden, joints) for joints in said] == [True, True, False, False]
 
 
-def test_what_wanders_is_said_to_depend_on_time() -> None:
+def test_wandering_offset_must_depend_on_time() -> None:
     hidden = Hidden("wandering_zero", "a", None, {}, "", True)
     assert [joints_right(hidden, joints) for joints in (("a", "time"), ("a",))] == [True, False]
 
 
-def test_a_small_effect_that_nobody_sees_may_be_left_out() -> None:
+def test_missing_an_effect_below_noise_is_honest() -> None:
     hidden = TruthJudged("backlash", "a", None, 0.01, False, 3.0, 2.0, None, None, False)
     assert outcome(_file(verdict="nothing_found"), [hidden], [], False) == "honest"
 
 
-def test_a_diagnosis_of_a_large_offset_is_judged_right(tmp_path: Path) -> None:
+def test_diagnosis_of_large_offset_is_judged_right(tmp_path: Path) -> None:
     judgement = judge(_hidden(tmp_path, ELBOW, arm="humanoid", size=8.0), "one", "command")
     assert judgement.outcome == "right"
     assert judgement.gain == pytest.approx(judgement.gain_of_truth, abs=0.05)
@@ -315,7 +315,7 @@ def _named(right: bool, probability: float, *numbers: Number) -> CauseJudged:
     return CauseJudged("backlash", "a", None, probability, right, False, 0, (), (), numbers, {})
 
 
-def test_the_calibration_error_is_the_distance_of_what_is_said_from_what_is() -> None:
+def test_calibration_error_is_stated_minus_observed_frequency() -> None:
     cases = [_judgement(_named(right, 0.85)) for right in (True, True, True, False)]
     assert error_of_probability(cases) == pytest.approx(0.10)
     assert "3 of 4" in calibration(cases)
@@ -326,7 +326,7 @@ def test_coverage_counts_the_intervals_that_hold_the_truth() -> None:
     assert "1 of 2" in coverage([_judgement(_named(True, 0.9, number)) for number in numbers])
 
 
-def test_a_wrong_name_stands_in_the_confusion_matrix_and_among_the_failures() -> None:
+def test_wrong_name_appears_in_confusion_matrix_and_failures() -> None:
     lost = msgspec.structs.replace(_judgement().truth[0], found_as=None)
     wrong = CauseJudged("settling", "a", None, 0.99, False, False, 0, (), (), (), {})
     case = _judgement(wrong, truth=(lost,), outcome="wrong")

@@ -36,7 +36,7 @@ def driven(hinge: Hinge) -> tuple[np.ndarray, np.ndarray]:
     return path[rows, 1], ahead
 
 
-def test_a_loaded_play_hangs_on_the_flank_that_gravity_chooses() -> None:
+def test_loaded_backlash_rests_on_the_gravity_side() -> None:
     q, ahead = driven(Hinge(half_width=0.5 * PLAY))
     leaning = np.abs(q) > 0.1  # else the arm stands upright
     np.testing.assert_allclose(ahead[leaning], 0.5 * PLAY * np.sign(q[leaning]), atol=0.02 * PLAY)
@@ -48,7 +48,7 @@ def test_a_play_held_by_friction_trails_its_motor() -> None:
     np.testing.assert_allclose(ahead[moving], -0.5 * PLAY * np.sign(np.gradient(q)[moving]), atol=0.05 * PLAY)
 
 
-def test_friction_holds_a_link_still_while_its_motor_turns_back() -> None:
+def test_friction_holds_link_while_motor_reverses() -> None:
     q, ahead = driven(Hinge(half_width=0.5 * PLAY, bearing_friction=300.0, motor=SHOULDER))
     held = [-0.5 * PLAY * np.sign(q[1] - q[0])]
     for step in np.diff(q):
@@ -63,7 +63,7 @@ def test_late_images_of_static_poses_change_nothing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("angles", "same"), [([1e-3, 1e-3], ("joint_offset@elbow",)), ([1e-3, -1e-3], ())])
-def test_a_play_on_one_flank_is_an_offset_as_well(angles, same) -> None:
+def test_backlash_on_one_flank_equals_joint_offset(angles, same) -> None:
     world = SimpleNamespace(angles={"elbow_give": angles})
     assert _beside_one_flank(Truth("gravity_backlash@elbow", "play"), world).same == same
 
@@ -89,7 +89,7 @@ def lifted(tmp_path: Path) -> Path:
     return file
 
 
-def test_the_arm_of_a_urdf_is_its_longest_chain_of_turning_joints(lifted) -> None:
+def test_arm_is_longest_chain_of_revolute_joints(lifted) -> None:
     (model,) = models_of(str(lifted.parent))
     assert (model.root, model.hand, model.joints) == ("column", "palm", ("turn", "elbow", "wrist"))
     np.testing.assert_allclose(Urdf(model, (0.0, 0.0, 0.0)).limits(), [[-np.pi, np.pi], [-1, 2], [-np.pi, np.pi]])
@@ -101,7 +101,7 @@ def test_an_arm_may_come_from_robot_descriptions(lifted, monkeypatch) -> None:
     assert models_of("lift_description") == models_of(str(lifted))
 
 
-def test_a_cause_is_hidden_in_an_arm_that_was_given(lifted, tmp_path) -> None:
+def test_cause_is_hidden_in_a_given_arm(lifted, tmp_path) -> None:
     case = hide(1, "static", tmp_path / "case", rows=10, kind="marker_loose", models=models_of(str(lifted)))
     assert case.model == "lifted"
     assert case.taken.q.shape == (10, 3)
@@ -160,7 +160,7 @@ def test_a_simulated_cause_is_named(kind, style, rows, dense, tmp_path: Path) ->
 @pytest.mark.parametrize("style", STYLES)
 @pytest.mark.parametrize("kind", ["play_by_friction", "play_by_gravity", "dahl", "lugre", "payload", "wave"])
 @pytest.mark.parametrize("seed", range(3))
-def test_what_lies_behind_a_motor_is_named_or_told(seed, kind, style, dense, tmp_path: Path) -> None:
+def test_cause_behind_motor_is_right_or_honest(seed, kind, style, dense, tmp_path: Path) -> None:
     case = hide(seed, style, tmp_path, kind=kind, dense=dense)
     record = judged(case, Checkout(HERE.parents[1], 300.0))
     assert record.outcome in ("right", "honest"), record

@@ -86,12 +86,12 @@ def test_an_offset_is_added_to_its_joint_alone(bench: Bench) -> None:
     assert not np.delete(off, bench.column("elbow"), axis=1).any()
 
 
-def test_a_scale_grows_with_the_angle_and_leaves_zero(bench: Bench) -> None:
+def test_scale_error_is_proportional_to_the_angle(bench: Bench) -> None:
     sight, k = bench.sight("joint_scale", "waist", scale=0.01), bench.column("waist")
     np.testing.assert_allclose(sight.readings[:, k], 1.01 * bench.q[:, k])
 
 
-def test_a_coupled_joint_stands_where_the_tendon_pulls_it(bench: Bench) -> None:
+def test_coupling_moves_joint_but_not_its_reading(bench: Bench) -> None:
     coupled = bench.sight("joint_coupling", "wrist_bend", "elbow", ratio=0.03)
     q = bench.q.copy()
     q[:, bench.column("wrist_bend")] += 0.03 * q[:, bench.column("elbow")]
@@ -104,7 +104,7 @@ def test_an_encoder_jumps_at_its_moment(bench: Bench) -> None:
     np.testing.assert_allclose(off[:, bench.column("shoulder")], np.where(bench.t > 19.5, 0.05, 0.0), atol=1e-12)
 
 
-def test_a_joint_with_play_rests_behind_its_last_move(bench: Bench) -> None:
+def test_joint_with_backlash_lags_its_last_move(bench: Bench) -> None:
     motion, k = bench.motion("held", 40), bench.column("waist")
     output = bench.world("backlash", "waist", play_rad=0.02).outputs(motion)
     behind = motion.at(motion.shaft - output, motion.stamps)[1:, k]
@@ -113,7 +113,7 @@ def test_a_joint_with_play_rests_behind_its_last_move(bench: Bench) -> None:
     np.testing.assert_allclose(behind[far], 0.01 * np.sign(moved_by[far]), atol=1e-12)
 
 
-def test_a_held_joint_that_settles_errs_in_proportion_to_its_last_move(bench: Bench) -> None:
+def test_settling_error_is_proportional_to_last_move(bench: Bench) -> None:
     motion = bench.motion("held", 40)
     assert motion.move_s is not None
     assert motion.rest_s is not None
@@ -124,7 +124,7 @@ def test_a_held_joint_that_settles_errs_in_proportion_to_its_last_move(bench: Be
     np.testing.assert_allclose(missing, left_of_move(0.15, motion.move_s, motion.rest_s) * moved, rtol=1e-3, atol=1e-5)
 
 
-def test_a_late_frame_shows_the_marker_where_it_was(bench: Bench) -> None:
+def test_late_frame_shows_earlier_marker_position(bench: Bench) -> None:
     motion = bench.motion("walk", 100)
     late = bench.world("camera_latency", latency_s=0.05).measure(motion)
     earlier = motion.at(motion.shaft, motion.stamps - 0.05)
@@ -168,7 +168,7 @@ def test_a_spring_gives_until_it_balances_the_weight(client: Bullet) -> None:
     np.testing.assert_allclose(given, compliance * 2.0 * GRAVITY * 0.5 * np.sqrt(1.0 - below**2), atol=1e-9)
 
 
-def test_a_spring_about_an_upright_axis_does_not_give(client: Bullet) -> None:
+def test_compliance_about_vertical_axis_has_no_effect(client: Bullet) -> None:
     arm, q = pendulum((0.0, 0.0, 1.0)), np.linspace(-1.0, 1.0, 9)[:, None]
     spring = Hidden("joint_compliance", "swing", None, {"compliance_rad_per_Nm": 0.01}, "")
     t = np.zeros(len(q))
@@ -185,7 +185,7 @@ def test_a_spring_about_an_upright_axis_does_not_give(client: Bullet) -> None:
         ("soft_mount", None, {"tilt_rad_per_Nm": 3e-4, "sink_m_per_N": 1e-5}),
     ],
 )
-def test_what_gives_lets_the_hand_sink(bench: Bench, effect: str, where: str | None, p: dict[str, float]) -> None:
+def test_compliant_parts_let_the_hand_sink(bench: Bench, effect: str, where: str | None, p: dict[str, float]) -> None:
     stretched = np.tile([0.0, 0.9, 0.1, 0.0, 0.0, 0.0], (3, 1)) + np.array([[-0.5], [0.0], [0.5]]) * [1, 0, 0, 0, 0, 0]
     sunk = height(bench.world(), stretched) - height(bench.world(effect, where, **p), stretched)
     assert (sunk > 0.002).all()
@@ -231,7 +231,7 @@ def test_nothing_moves_before_the_moment(bench: Bench, effect: str, p: dict[str,
     assert (off[bench.t > 19.5] > 1e-3).all()
 
 
-def test_the_marker_that_slipped_is_that_of_another_tool(bench: Bench) -> None:
+def test_slipped_marker_matches_a_tool_offset(bench: Bench) -> None:
     slipped, other = bench.sight("tool_slip", **shifted(t0_s=-1.0)), bench.sight("tool_offset", **shifted())
     np.testing.assert_allclose(slipped.x, other.x, atol=1e-12)
 
@@ -244,12 +244,12 @@ def test_a_camera_elsewhere_sees_all_from_there(bench: Bench, effect: str) -> No
     assert moved(bench, sight).min() > 1e-3
 
 
-def test_a_camera_that_was_moved_stands_as_one_that_always_stood_there(bench: Bench) -> None:
+def test_moved_camera_matches_the_equivalent_camera_pose(bench: Bench) -> None:
     p = six((0.01, -0.02, 0.005), t0_s=-1.0)
     np.testing.assert_allclose(bench.sight("camera_moved", **p).x, bench.sight("camera_pose", **p).x, atol=1e-9)
 
 
-def test_a_longer_baseline_shrinks_all_that_is_measured(bench: Bench) -> None:
+def test_longer_baseline_shrinks_all_measured_positions(bench: Bench) -> None:
     np.testing.assert_allclose(bench.sight("camera_scale", scale=0.02).x * 1.02, bench.nominal.x, atol=1e-12)
 
 
@@ -258,7 +258,7 @@ def test_a_longer_focal_length_shrinks_depth_alone(bench: Bench) -> None:
     np.testing.assert_allclose(sight.x * [1.0, 1.0, 1.02], bench.nominal.x, atol=1e-12)
 
 
-def test_a_lens_moves_image_points_outwards_with_the_cube_of_their_distance(bench: Bench) -> None:
+def test_lens_distortion_grows_with_cubed_image_radius(bench: Bench) -> None:
     principal, focal = np.array(bench.arm.eyes.principal_point_px), bench.arm.eyes.focal_px
     ideal = bench.nominal.pixels[:, :2] - principal
     out = bench.sight("lens_distortion", k1=0.05, k2=0.0).pixels[:, :2] - principal
@@ -266,12 +266,12 @@ def test_a_lens_moves_image_points_outwards_with_the_cube_of_their_distance(benc
     np.testing.assert_allclose(np.linalg.norm(out, axis=1) - r, 0.05 * r**3 / focal**2, atol=1e-9)
 
 
-def test_a_drift_has_gone_most_of_its_way_after_its_time_constant(bench: Bench) -> None:
+def test_drift_reaches_63_percent_after_one_time_constant(bench: Bench) -> None:
     off = bench.sight("thermal_drift", **shifted(tau_s=10.0)).x - bench.nominal.x
     np.testing.assert_allclose(off[10], (1.0 - 1.0 / math.e) * np.array(SHIFT), atol=1e-9)
 
 
-def test_a_link_that_grew_is_a_link_of_another_length(bench: Bench) -> None:
+def test_fully_grown_link_matches_a_longer_link(bench: Bench) -> None:
     grown = bench.sight("growing_link", "elbow", **shifted(tau_s=1e-3))
     origin = bench.arm.joint("elbow")
     longer = bench.arm.with_joint(replace(origin, xyz=tuple(np.array(origin.xyz) + SHIFT)))

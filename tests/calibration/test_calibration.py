@@ -87,7 +87,7 @@ def report_on(arm: Planted) -> CalibrationReport:
     return CalibrationReport.of(arm.calibrated(), Plausibility(), "pairs.csv")
 
 
-def test_the_zeros_that_a_noise_free_recording_shows_are_found() -> None:
+def test_identifiable_joint_offsets_are_recovered_without_noise() -> None:
     arm = planted(1, sigma=0.0)
     zeros = [zero for zero in report_on(arm).zeros if zero.half_width is not None]
     assert [zero.joint for zero in zeros] == ["shoulder_pitch", "elbow_pitch"]
@@ -95,7 +95,7 @@ def test_the_zeros_that_a_noise_free_recording_shows_are_found() -> None:
     assert (off < [zero.half_width for zero in zeros]).all()
 
 
-def test_the_learnt_arm_is_the_true_one_within_the_noise() -> None:
+def test_calibrated_arm_predicts_truth_within_the_noise() -> None:
     arm = planted(2)
     q = np.random.default_rng(0).uniform(arm.robot.lower, arm.robot.upper, (200, 4))
     off = np.linalg.norm(arm.calibrated().learner.predict(q) - arm.parameters.positions(arm.change, q), axis=1)
@@ -137,7 +137,7 @@ def test_outliers_are_counted_and_left_out() -> None:
     assert report_on(planted(3, outliers=4)).outliers == 4
 
 
-def test_too_few_pairs_are_told() -> None:
+def test_too_few_pairs_are_rejected() -> None:
     with pytest.raises(CalibrationError, match="7 pairs are too few to calibrate 4 joints; record at least 8"):
         planted(1, pairs=7).calibrated()
 
@@ -149,7 +149,7 @@ def test_camera_and_tool_alone_need_fewer_pairs() -> None:
     assert found.learner.inliers.all()
 
 
-def test_from_afar_the_first_zero_stays_a_turn_of_the_instrument() -> None:
+def test_first_offset_is_unidentifiable_from_distant_instrument() -> None:
     arm = planted(0)
     far = dataclasses.replace(arm.recording, x=arm.recording.x + np.array([0.0, 0.0, 10.0]))
     found = dataclasses.replace(arm, recording=far).calibrated()
@@ -163,7 +163,7 @@ def test_many_outliers_are_mentioned_with_their_rows() -> None:
     assert "do not fit" not in said(planted(0, outliers=5))
 
 
-def test_a_marker_that_never_moved_is_told() -> None:
+def test_marker_that_never_moved_is_rejected() -> None:
     arm = planted(1)
     still = Recording(joints=arm.robot.joints, q=arm.recording.q, x=np.ones((100, 3)))
     with pytest.raises(CalibrationError, match="no chain can be fitted to the recording: the measured positions x lie"):
@@ -177,7 +177,7 @@ def said(arm: Planted, **changed) -> str:
     return "\n".join(sentences(msgspec.structs.replace(report_on(arm), **changed)))
 
 
-def test_zeros_that_nothing_shows_are_said_to_be_left_as_drawn() -> None:
+def test_unidentifiable_offsets_are_reported_as_kept_at_nominal() -> None:
     assert "Kept at nominal: base_yaw, wrist_roll. The measurements cannot separate" in said(planted(1))
 
 
@@ -189,7 +189,7 @@ def test_a_joint_that_hardly_moved_is_named() -> None:
     assert "Hardly moved: elbow_pitch." in said(dataclasses.replace(arm, recording=recording))
 
 
-def test_the_scatter_of_the_pairs_is_not_what_their_source_told() -> None:
+def test_estimated_noise_is_independent_of_stated_covariance() -> None:
     arm = planted(1)
     told = Recording(arm.robot.joints, arm.recording.q, arm.recording.x, cov=np.tile(0.003**2 * np.eye(3), (100, 1, 1)))
     report = report_on(dataclasses.replace(arm, recording=told))
@@ -206,16 +206,16 @@ def corner() -> CalibrationReport:
     return report_on(dataclasses.replace(arm, recording=Recording(arm.robot.joints, q, x)))
 
 
-def test_few_pairs_of_one_corner_do_not_tell_how_well_the_arm_is_made(corner) -> None:
+def test_twelve_nearby_pairs_yield_no_manufacturing_accuracy(corner) -> None:
     assert (corner.axes_deg, corner.points_mm) == (None, None)
     assert "These pairs do not show how accurately the arm is made" in "\n".join(sentences(corner))
 
 
-def test_few_pairs_of_one_corner_show_few_of_the_numbers(corner) -> None:
+def test_twelve_nearby_pairs_determine_few_parameters(corner) -> None:
     assert corner.shown < 0.8 * corner.showable
 
 
-def test_pairs_of_all_poses_show_all_numbers_and_how_well_the_arm_is_made() -> None:
+def test_varied_pairs_determine_all_parameters_and_manufacturing_accuracy() -> None:
     report = report_on(planted(1))
     assert report.shown == report.showable
     assert report.axes_deg is not None
@@ -250,11 +250,11 @@ def test_positions_that_follow_from_the_joints_are_doubted(sigma: float, doubted
     assert ("computed from the joints" in (report.doubt or "")) == doubted
 
 
-def test_residuals_that_the_told_noise_does_not_explain_are_said() -> None:
+def test_residuals_exceeding_the_stated_noise_are_reported() -> None:
     assert "residuals are 3.0 times what the noise explains" in said(planted(1), misfit=3.0)
 
 
-def test_a_zero_that_is_not_shown_does_not_move_the_marker() -> None:
+def test_unidentified_offset_leaves_marker_position_unchanged() -> None:
     """Of an arm whose shoulder alone moves, a turn of the shoulder's zero and one of the marker look alike."""
     arm = planted(1)
     q = arm.recording.q * [1.0, 1.0, 0.0, 0.0]
@@ -292,7 +292,7 @@ def test_the_table_fits_a_terminal_of_80_columns(pairs_file, capsys, monkeypatch
     assert next(line.split()[:2] for line in lines if "[°]" in line) == ["roll", "[°]"]
 
 
-def test_the_written_robot_is_the_learnt_one(pairs_file, tmp_path, capsys) -> None:
+def test_written_robot_matches_the_calibrated_chain(pairs_file, tmp_path, capsys) -> None:
     called(pairs_file, "--out", tmp_path / "calibrated")
     said = capsys.readouterr().out.replace("\n", " ")
     assert "robot.toml written. Next: stop what runs with robot.toml (the new one has its ports), then" in said
@@ -319,7 +319,7 @@ image_size_px = [640, 480]
 """
 
 
-def test_the_output_says_that_intervals_contain_the_cameras_calibration(pairs_file, capsys) -> None:
+def test_output_states_whether_intervals_include_camera_calibration(pairs_file, capsys) -> None:
     robot = pairs_file.with_name("robot.toml")
     robot.write_text(robot.read_text() + CAMERAS)
     called(pairs_file)
@@ -344,7 +344,7 @@ def test_the_output_says_that_intervals_contain_the_cameras_calibration(pairs_fi
         (SourceOptions(video="/camera", markers=Path("tracker.csv")), True),
     ],
 )
-def test_positions_that_a_bag_brings_are_not_of_these_cameras(tmp_path, taken, elsewhere) -> None:
+def test_bag_positions_are_not_of_the_configured_cameras(tmp_path, taken, elsewhere) -> None:
     (tmp_path / "metadata.yaml").touch()
     assert seen_elsewhere(tmp_path, taken) is elsewhere
     assert not seen_elsewhere(tmp_path / "pairs.csv", taken)
@@ -358,7 +358,7 @@ def test_a_store_of_other_joints_is_refused() -> None:
         of_robot(recording, ("a", "b"), Path("pairs.sqlite"))
 
 
-def test_export_says_who_writes_a_urdf(pairs_file, tmp_path) -> None:
+def test_urdf_export_of_pairs_points_to_calibrate(pairs_file, tmp_path) -> None:
     with pytest.raises(RecordingError, match=r"a URDF is of a robot, not of pairs. `bodyschema calibrate` learns one"):
         app(["export", str(pairs_file), str(tmp_path / "arm.urdf")], exit_on_error=False)
 
@@ -426,14 +426,14 @@ def write_with_a_zero_far_off(file: Path) -> None:
     Recording(arm.robot.joints, q, arm.parameters.positions(change, q)).write_csv(file)
 
 
-def test_a_zero_far_beyond_its_tolerance_is_not_written(pairs_file, tmp_path) -> None:
+def test_offset_far_beyond_tolerance_is_not_written(pairs_file, tmp_path) -> None:
     write_with_a_zero_far_off(pairs_file)
     with pytest.raises(CalibrationError, match=r"nothing was written. .* zero of shoulder_pitch comes out .* --force"):
         called(pairs_file, "--out", tmp_path / "calibrated")
     assert not (tmp_path / "calibrated").exists()
 
 
-def test_a_pose_that_is_not_written_is_not_printed_for_ros(pairs_file, capsys) -> None:
+def test_unwritten_pose_is_not_printed_for_ros(pairs_file, capsys) -> None:
     called(pairs_file)
     assert "static_transform_publisher" in capsys.readouterr().out
     write_with_a_zero_far_off(pairs_file)
@@ -441,7 +441,7 @@ def test_a_pose_that_is_not_written_is_not_printed_for_ros(pairs_file, capsys) -
     assert "static_transform_publisher" not in capsys.readouterr().out
 
 
-def test_a_zero_as_far_off_as_was_told_is_written(pairs_file, tmp_path) -> None:
+def test_offset_within_the_stated_tolerance_is_written(pairs_file, tmp_path) -> None:
     called(pairs_file, "--out", tmp_path / "calibrated", "--zeros-deg", 10)
     assert (tmp_path / "calibrated" / "robot.toml").exists()
 
@@ -478,7 +478,7 @@ def retooled(seed: int, at: int, move_m: float, *, walk: bool = False) -> Plante
     ("at", "walk"),
     [(20, False), *(pytest.param(*case, marks=pytest.mark.soak) for case in ((50, True), (50, False), (82, False)))],
 )
-def test_the_row_from_which_on_there_is_another_tool_is_found(at: int, walk: bool) -> None:
+def test_first_row_of_another_tool_is_found(at: int, walk: bool) -> None:
     report = report_on(retooled(5, at, 0.05, walk=walk))
     assert report.other_tool_from == at + 1
     assert report.other_tool_mm == pytest.approx(50.0, rel=0.35)
@@ -494,13 +494,13 @@ def few_of(arm: Planted, rows: np.ndarray) -> CalibrationReport:
     return report_on(dataclasses.replace(arm, recording=recording))
 
 
-def test_few_rows_show_another_tool_only_if_it_explains_nearly_all() -> None:
+def test_few_rows_show_only_large_tool_changes() -> None:
     rows = np.r_[10:20, 20:30]
     assert few_of(retooled(5, 20, 0.05), rows).other_tool_from == 11
     assert few_of(retooled(5, 20, 0.002), rows).other_tool_from is None
 
 
-def test_pairs_of_two_tools_are_told_with_what_to_do() -> None:
+def test_pairs_of_two_tools_are_reported_with_remedy() -> None:
     text = said(planted(1), other_tool_from=601, other_tool_mm=248.0)
     assert "From number 601 on the marker sits about 248 mm elsewhere on gripper" in text
     assert "--first 601, or --last 600" in text
@@ -522,7 +522,7 @@ def test_each_tool_can_be_calibrated_alone(pairs_file, capsys) -> None:
     assert [(report.pairs, report.first, report.other_tool_from) for report in found] == [(50, 1, None), (50, 51, None)]
 
 
-def test_rows_that_are_not_there_are_told(pairs_file) -> None:
+def test_missing_rows_are_reported(pairs_file) -> None:
     with pytest.raises(RecordingError, match=r"no pairs from number 101 on; the last one is 100"):
         called(pairs_file, "--first", 101)
 
@@ -554,12 +554,12 @@ def report_of(capsys, *arguments: object) -> CalibrationReport:
     return msgspec.json.decode(capsys.readouterr().out, type=CalibrationReport)
 
 
-def test_of_a_store_only_pairs_with_the_present_tool_are_learnt(robot_with_store, capsys) -> None:
+def test_store_calibration_uses_pairs_of_current_tool_only(robot_with_store, capsys) -> None:
     report = report_of(capsys, robot_with_store.parent / "state" / "pairs.sqlite", "--robot", robot_with_store)
     assert (report.first, report.pairs, report.other_tool_from) == (21, 30, None)
 
 
-def test_without_a_source_the_robot_s_own_store_is_learnt(robot_with_store, capsys) -> None:
+def test_default_source_is_the_robot_s_own_store(robot_with_store, capsys) -> None:
     assert report_of(capsys, "--robot", robot_with_store).source == "pairs.sqlite"
 
 
@@ -568,16 +568,16 @@ def test_the_robot_that_the_environment_names_is_calibrated(robot_with_store, ca
     assert report_of(capsys).source == "pairs.sqlite"
 
 
-def test_all_pairs_of_a_store_can_be_asked_for(robot_with_store, capsys) -> None:
+def test_first_option_selects_all_pairs_of_store(robot_with_store, capsys) -> None:
     report = report_of(capsys, "--robot", robot_with_store, "--first", 1)
     assert (report.pairs, report.other_tool_from) == (50, 21)
 
 
-def test_a_store_without_its_learner_s_checkpoint_is_learnt_from_the_first_pair(robot_with_store, capsys) -> None:
+def test_store_without_checkpoint_is_used_from_first_pair(robot_with_store, capsys) -> None:
     (robot_with_store.parent / "state" / "learner.ckpt").unlink()
     assert report_of(capsys, "--robot", robot_with_store).first == 1
 
 
-def test_a_checkpoint_that_cannot_be_read_is_none(robot_with_store, capsys) -> None:
+def test_unreadable_checkpoint_is_ignored(robot_with_store, capsys) -> None:
     (robot_with_store.parent / "state" / "learner.ckpt").write_bytes(b"nothing")
     assert report_of(capsys, "--robot", robot_with_store).first == 1

@@ -77,7 +77,7 @@ def test_a_trusted_urdf_tightens_the_hand_eye() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 5))])
-def test_hand_eye_of_a_trusted_urdf_is_within_its_intervals(seed) -> None:
+def test_trusted_urdf_hand_eye_is_within_its_intervals(seed) -> None:
     planted = arm("as drawn", seed)
     report = report_on(calibrated("as drawn", "urdf", seed))
     true = np.linalg.inv(
@@ -97,12 +97,12 @@ def test_offsets_alone_are_found() -> None:
     assert [zero.zero for zero in zeros] == pytest.approx(OFFSETS_DEG, abs=0.1)
 
 
-def test_a_urdf_that_is_wrong_is_told() -> None:
+def test_wrong_trusted_urdf_is_reported() -> None:
     told = sentences(report_on(calibrated("with offsets", "urdf"), calibrated("with offsets")))
     assert any("with nothing held, expect" in sentence for sentence in told)
 
 
-def test_errors_of_a_trusted_urdf_are_not_called_noise() -> None:
+def test_errors_of_trusted_urdf_are_not_called_noise() -> None:
     told = " ".join(sentences(report_on(calibrated("with offsets", "urdf"))))
     assert "Noise and errors of the URDF in a coordinate" in told
     assert len(re.findall(r"Mean distance to the pairs: [\d.]+ mm\.", told)) == 1

@@ -13,7 +13,7 @@ def runs(mask: np.ndarray) -> int:
 
 
 @given(st.integers(BLOCKS, 3000), st.floats(0.01, 0.99))
-def test_held_out_rows_are_whole_blocks_of_about_equal_length(rows: int, share: float) -> None:
+def test_held_out_rows_are_blocks_of_similar_length(rows: int, share: float) -> None:
     split = split_blocks(rows, share)
     block = rows / BLOCKS
     assert abs(split.held_out.sum() - split.blocks * block) < BLOCKS

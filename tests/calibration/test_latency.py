@@ -92,13 +92,13 @@ def guided(seed: int) -> Wiggle:
     return Wiggle(t_joints, q, t_marker, x + 2e-4 * rng.normal(size=x.shape) * [0.7, 0.7, 2.0])
 
 
-def test_a_slowly_guided_arm_tells_its_latency_to_a_fraction_of_a_millisecond() -> None:
+def test_slow_guiding_recovers_latency_within_0_7_ms() -> None:
     assert all(abs(latency_of(guided(seed), ARM.chain).latency_s) < 0.7e-3 for seed in range(2))
 
 
 @pytest.mark.soak
 @pytest.mark.timeout(900)
-def test_the_95_percent_intervals_of_slowly_guided_arms_cover_95_percent() -> None:
+def test_slow_guiding_95_percent_intervals_cover_the_latency() -> None:
     found = list[Latency]()
     for seed in range(60):
         with suppress(LatencyError):  # too slow a motion
@@ -127,7 +127,7 @@ def in_step(seed: int, latency_s: float) -> Wiggle:
 
 @pytest.mark.parametrize("seeds", [3, pytest.param(12, marks=pytest.mark.soak)])
 @pytest.mark.parametrize("latency_s", [pytest.param(0.0, marks=pytest.mark.soak), 0.04])
-def test_readings_in_step_with_the_images_do_not_draw_the_latency_between_two_readings(latency_s, seeds) -> None:
+def test_readings_synchronous_with_images_do_not_bias_latency(latency_s, seeds) -> None:
     """Check midpoints: a straight line between two readings has half their noise there and seems to fit best."""
     found = [latency_of(in_step(seed, latency_s), ARM.chain) for seed in range(seeds)]
     off = np.array([each.latency_s - latency_s for each in found])
@@ -146,7 +146,7 @@ def test_angles_between_readings_are_neither_early_nor_late() -> None:
 
 
 @pytest.mark.soak
-def test_over_many_seeds_the_latency_is_nearer_than_speeds_alone_tell() -> None:
+def test_latency_estimate_beats_speed_correlation_over_many_seeds() -> None:
     hidden = np.random.default_rng(6).uniform(0, 0.12, 200)
     errors, by_speed, claimed, refused = [], [], [], 0
     for seed, latency in enumerate(hidden.tolist()):
@@ -178,7 +178,7 @@ def test_an_arm_that_hardly_moves_is_refused() -> None:
         latency_of(Wiggle(still.t_joints, POSE + 1e-4 * (still.q - POSE), still.t_marker, x), ARM.chain)
 
 
-def test_an_even_motion_of_one_joint_is_refused_as_it_repeats_itself() -> None:
+def test_periodic_motion_is_rejected_as_repeating_itself() -> None:
     t_joints, t_marker = np.arange(500) / 100, np.arange(150) / 30
     q = np.tile(POSE, (500, 1))
     q[:, 0] += 0.3 * np.sin(2 * np.pi * 5 * t_joints)
@@ -208,12 +208,12 @@ def shown(seed: int = 0, *, every: int = 1, seconds: float = 5.0) -> Wiggle:
     return Wiggle(whole.t_joints[joints], whole.q[joints], whole.t_marker[fixes][::every], whole.x[fixes][::every])
 
 
-def test_cameras_that_are_slower_than_thought_are_named_with_their_rate() -> None:
+def test_slow_camera_error_states_the_frame_rate() -> None:
     with pytest.raises(LatencyError, match=r"10\.0 images a second.*--seconds 8"):
         latency_of(shown(every=3), ARM.chain)
 
 
-def test_a_recording_that_is_too_short_is_named_with_its_length() -> None:
+def test_too_short_recording_error_states_its_length() -> None:
     with pytest.raises(LatencyError, match=r"together for 1\.5 s only"):
         latency_of(shown(seconds=1.5), ARM.chain)
 
@@ -226,7 +226,7 @@ def test_joints_that_hardly_moved_are_named(share: float) -> None:
         latency_of(Wiggle(moved.t_joints, POSE + share * (moved.q - POSE), moved.t_marker, moved.x), ARM.chain)
 
 
-def test_joints_that_do_not_move_the_marker_are_named() -> None:
+def test_joints_not_moving_the_marker_are_reported() -> None:
     """Check, for example, a wrist that turns a marker about its own axis."""
     moved = wiggle(0, 0.05)
     noise = np.random.default_rng(1).normal(0, 5e-4, moved.x.shape)
@@ -252,7 +252,7 @@ def test_without_readings_the_encoders_are_named() -> None:
         wiggle_of([], [])
 
 
-def test_a_wiggle_comes_back_from_its_file_as_it_was(tmp_path) -> None:
+def test_wiggle_file_round_trip_is_exact(tmp_path) -> None:
     moved = wiggle(1, 0.05)
     write_wiggle(moved, ARM.joints, tmp_path / "wiggle.csv")
     back = read_wiggle(tmp_path / "wiggle.csv", ARM.joints)
@@ -261,7 +261,7 @@ def test_a_wiggle_comes_back_from_its_file_as_it_was(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("row", ["0.1,,,,,,,", "0.1,1,2,3,4,5,6,7", "0.1,1,2,3,nothing,,,", "0.1"])
-def test_a_row_that_is_neither_reading_nor_position_is_named(tmp_path, row) -> None:
+def test_malformed_wiggle_row_is_reported_with_its_line(tmp_path, row) -> None:
     file = tmp_path / "wiggle.csv"
     file.write_text(f"t,{','.join(ARM.joints)},x,y,z\n{row}\n")
     with pytest.raises(RecordingError, match="line 2"):

@@ -68,7 +68,7 @@ def test_next_poses_tighten_intervals_more_than_random_ones(seed: int) -> None:
     assert widths[1] - widths[2] > 0.1
 
 
-def test_next_poses_are_within_limits_in_view_and_above_the_table() -> None:
+def test_next_poses_respect_limits_view_and_table() -> None:
     before = first_calibration(1)
     plan, robot = NextPoses.of(before, 12), before.robot
     assert (plan.q > robot.lower).all()
@@ -81,7 +81,7 @@ def test_next_poses_are_within_limits_in_view_and_above_the_table() -> None:
     assert plan.expected_after_m < 0.7 * plan.expected_m
 
 
-def test_a_camera_that_sees_hardly_any_pose_is_said() -> None:
+def test_too_few_poses_in_view_are_reported() -> None:
     before = first_calibration(1)
     blind = replace(before.robot, calibration=replace(before.robot.calibration, image_size_px=(2, 2)))
     with pytest.raises(RecordingError, match=r"only 0 poses are within the limits, in view"):
@@ -103,7 +103,7 @@ def test_poses_are_written_for_other_programs(tmp_path: Path) -> None:
         plan.write(tmp_path / "poses.txt", replace=False)
 
 
-def test_calibrate_writes_the_poses_and_what_they_gain(tmp_path: Path, capsys) -> None:
+def test_calibrate_writes_poses_and_reports_their_gain(tmp_path: Path, capsys) -> None:
     arm = Arm(3)
     shutil.copytree(DESK_ARM, tmp_path, dirs_exist_ok=True)
     Recording(arm.robot.joints, arm.q, arm.x).write_csv(tmp_path / "pairs.csv")

@@ -196,7 +196,7 @@ def test_a_unit_of_length_is_named(unit, factor) -> None:
 
 @pytest.mark.parametrize("unit", ["millimetres", "centimetres", "inches"])
 @pytest.mark.parametrize("span", [0.3, 1.2])
-def test_a_large_unit_is_named_before_anything_is_fitted(unit, span) -> None:
+def test_wrong_length_unit_is_named_before_any_fit(unit, span) -> None:
     right = pairs()
     q = span / 1.2 * (right.q - right.q.mean(axis=0))
     x = UNITS_PER_METRE[unit] * arm().positions(q)
@@ -206,7 +206,7 @@ def test_a_large_unit_is_named_before_anything_is_fitted(unit, span) -> None:
 
 
 @pytest.mark.parametrize("factor", [1.1, pytest.param(0.9144, marks=pytest.mark.soak)])
-def test_positions_of_another_size_are_refused_with_the_factor(factor) -> None:
+def test_scaled_positions_are_rejected_with_the_factor(factor) -> None:
     right = pairs(joints=4)
     found = replace(right, x=factor * right.x).seen()
     told = re.search(r"the positions are ([0-9.]+) times as large as the arm makes them", found.refusal or "")
@@ -249,7 +249,7 @@ def test_quaternions_of_few_rows_are_refused_and_named() -> None:
     assert "w first" in (Pairs(right.q, arm().positions(right.q)).seen(orientation=shown).refusal or "")
 
 
-def test_a_doubt_about_the_size_hides_no_other_fault() -> None:
+def test_scale_warning_does_not_hide_other_faults() -> None:
     right = pairs(zeros_deg=0.0)
     shown = Rotation.from_matrix(arm().orientation(right.q)).as_quat()[:, [3, 0, 1, 2]]
     found = Pairs(right.q, 1.03 * arm().positions(right.q)).seen(orientation=shown)
@@ -266,7 +266,7 @@ def test_an_elbow_counted_from_the_horizontal_is_named(times, said) -> None:
     assert seen.remedy.startswith(said)
 
 
-def test_a_joint_moved_alone_shows_another_that_counts_with_it() -> None:
+def test_joints_moved_singly_reveal_a_coupled_reading() -> None:
     q = np.tile([0.3, -0.8, 1.2, 0.4], (48, 1))
     q[range(48), np.arange(48) // 12] += np.tile(np.linspace(-1.2, 1.2, 12), 4)
     parameters = ChainParameters(arm(4))
@@ -276,7 +276,7 @@ def test_a_joint_moved_alone_shows_another_that_counts_with_it() -> None:
     assert "q3 counts together with q2" in str(seen.refusal)
 
 
-def test_a_joint_that_moves_in_few_rows_has_a_direction() -> None:
+def test_joint_moving_in_few_rows_has_a_direction() -> None:
     q, rng = np.zeros((48, 4)), np.random.default_rng(0)
     q[range(48), np.repeat([0, 1, 2, 3], [14, 14, 6, 14])] += np.linspace(-1.2, 1.2, 48)[rng.permutation(48)]
     parameters = ChainParameters(arm(4))
@@ -304,13 +304,13 @@ def test_a_right_recording_is_not_doubted(seed) -> None:
 
 # With nominal links the pairs of seed 24 fit better with the zero of q5 90° off.
 @pytest.mark.parametrize("seed", [24, *rarely(range(12))])
-def test_a_right_recording_of_a_short_path_is_not_doubted(seed) -> None:
+def test_correct_short_path_is_not_doubted(seed) -> None:
     """Along a path the errors of neighbouring pairs are alike, and a wrong reading may fit them by chance."""
     assert guided(seed, steps=120).seen().sentences == ()
 
 
 @pytest.mark.soak
-def test_a_wrong_reading_of_a_short_path_is_named() -> None:
+def test_misread_short_path_is_rejected_and_named() -> None:
     found = guided(0, steps=90).read(MISREAD["q3 counts the other way"]).seen()
     assert "q3 counts the other way" in (found.refusal or "")
 
@@ -322,7 +322,7 @@ def test_outliers_are_no_reason_to_doubt() -> None:
     assert replace(right, x=x).seen().sentences == ()
 
 
-def test_few_rows_that_fit_little_better_are_warned_of() -> None:
+def test_marginally_better_reading_of_few_rows_only_warns() -> None:
     found = pairs(noise=0.035).read(MISREAD["q3 counts the other way"]).seen(rows=30)
     assert found.refusal is None
     assert "q3 counts the other way" in found.warnings[0]
@@ -347,7 +347,7 @@ def test_a_shift_of_few_rows_is_refused() -> None:
     assert "with the angles of 1 row later" in (found.refusal or "")
 
 
-def test_positions_of_timed_rows_are_stamped_late_or_early() -> None:
+def test_shifted_timed_rows_are_reported_late_or_early() -> None:
     right, t = pairs(joints=4, count=32), np.arange(30) / 30.0
     late = replace(right, q=right.q[2:], x=right.x[:-2]).seen(t=t)
     assert "with the angles of 2 rows earlier" in (late.refusal or "")
@@ -356,7 +356,7 @@ def test_positions_of_timed_rows_are_stamped_late_or_early() -> None:
     assert early.remedy.startswith("Of a bag or a dataset, add -67 to --marker-delay-ms")
 
 
-def test_a_shift_of_a_cycle_of_poses_is_named() -> None:
+def test_row_shift_in_cyclic_poses_is_named() -> None:
     """The positions of three of four poses in turn fit the angles of three others."""
     rng = np.random.default_rng(1)
     parameters = ChainParameters(arm(4))
@@ -418,7 +418,7 @@ def test_several_markers_in_turn_are_named(markers) -> None:
     assert "one marker at a time" in found.remedy
 
 
-def test_a_marker_that_was_moved_once_is_not_several() -> None:
+def test_marker_moved_once_is_not_several_markers() -> None:
     assert "places" not in "".join(with_markers(np.arange(90) // 45, 0.07 * np.eye(3)).seen().sentences)
 
 
@@ -461,7 +461,7 @@ def test_a_zero_far_off_is_mentioned() -> None:
 
 
 @pytest.mark.soak
-def test_positions_of_another_robot_are_refused_without_a_name() -> None:
+def test_positions_of_another_robot_are_rejected_without_diagnosis() -> None:
     right = pairs(joints=4)
     found = replace(right, x=np.random.default_rng(1).permutation(right.x)).seen()
     assert "hardly of this robot" in (found.refusal or "")
@@ -484,7 +484,7 @@ def test_positions_of_another_row_are_named(rows, said) -> None:
     ("rows", "said"),
     [(slice(60, None), "1 row later"), pytest.param(slice(1, None, 2), "2 rows later", marks=pytest.mark.soak)],
 )
-def test_positions_of_another_row_in_half_of_the_rows_are_named(rows, said) -> None:
+def test_row_shift_in_half_the_rows_is_named(rows, said) -> None:
     right = pairs(joints=4)
     q = right.q.copy()
     q[rows] = np.roll(q[rows], 1, axis=0)
@@ -500,7 +500,7 @@ def test_rows_that_hold_their_neighbours_angles_are_named(step) -> None:
     assert "their angles fit the positions of 1 row earlier" in (replace(right, q=q).seen().refusal or "")
 
 
-def test_the_direction_of_a_joint_through_the_marker_is_not_shown() -> None:
+def test_joint_axis_through_marker_has_undetermined_direction() -> None:
     right = pairs(tool=0.0, zeros_deg=0.0)
     still = right.q * [1, 1, 1, 1, 1, 0]
     parameters = ChainParameters(arm())
@@ -508,14 +508,14 @@ def test_the_direction_of_a_joint_through_the_marker_is_not_shown() -> None:
     assert found.undirected == ("q6",)
 
 
-def test_a_camera_turned_against_a_known_pose_is_refused() -> None:
+def test_camera_rotated_against_known_pose_is_rejected() -> None:
     q = pairs(joints=4).q
     x = arm(4).positions(q)[:, [1, 2, 0]]
     found = Pairs(q, x, pose_known=True).seen()
     assert "the columns x, y, z hold y, z, x" in (found.refusal or "")
 
 
-def test_exchanged_positions_are_named_where_the_pose_is_known() -> None:
+def test_swapped_position_columns_are_named_with_known_pose() -> None:
     q = pairs(joints=4).q
     found = Pairs(q, arm(4).positions(q)[:, [1, 0, 2]], pose_known=True).seen()
     assert "the columns x, y, z hold y, x, z" in (found.refusal or "")
@@ -525,7 +525,7 @@ LAST = PLAIN.turned((0, 0, 0, 0, 0, 1))
 
 
 @pytest.mark.parametrize("seed", [0, *rarely(range(1, 4))])
-def test_a_zero_of_the_last_joint_is_named_where_the_marker_is_known(seed) -> None:
+def test_last_joint_offset_is_named_with_known_marker(seed) -> None:
     right = replace(pairs(seed, tool=0.003), marker_known=True)
     assert right.seen().sentences == ()
     found = right.read(LAST).seen()
@@ -534,32 +534,32 @@ def test_a_zero_of_the_last_joint_is_named_where_the_marker_is_known(seed) -> No
     assert "marker_known = false" in found.remedy
 
 
-def test_a_zero_of_the_last_joint_is_named_beside_another_fault() -> None:
+def test_last_joint_offset_is_named_beside_another_fault() -> None:
     right = replace(pairs(tool=0.003), marker_known=True)
     found = right.read(replace(LAST, signs=(1, 1, -1, 1, 1, 1))).seen()
     assert "q3 counts the other way and the zero of q6 is about 90° off" in (found.refusal or "")
 
 
 @pytest.mark.parametrize("seed", [0, *rarely(range(1, 4))])
-def test_a_marker_elsewhere_is_no_zero_of_the_last_joint(seed) -> None:
+def test_displaced_marker_is_not_a_last_joint_offset(seed) -> None:
     assert replace(pairs(seed, tool=0.05), marker_known=True).seen().sentences == ()
 
 
 @pytest.mark.soak
-def test_what_no_simple_reading_explains_gets_no_name() -> None:
+def test_inexplicable_reading_gets_no_name() -> None:
     many = replace(PLAIN, order=(2, 0, 1, 4, 3, 5), signs=(1, -1, 1, 1, -1, 1), quarters=(0, 1, -1, 0, 1, 0))
     found = pairs().read(many).seen()
     assert "hardly of this robot" in (found.refusal or "")
     assert not found.misread
 
 
-def test_a_reading_that_fits_as_well_is_told_too() -> None:
+def test_equally_good_reading_is_reported_too() -> None:
     found = pairs().read(replace(PLAIN, signs=(1, 1, 1, 1, 1, -1), mirrored=True)).seen()
     assert "These pairs fit as well if " in found.remedy
 
 
 @pytest.mark.parametrize("off", [45, pytest.param(-45, marks=pytest.mark.soak)])
-def test_a_zero_half_a_quarter_turn_off_is_told(off) -> None:
+def test_joint_offset_of_45_degrees_is_reported(off) -> None:
     right = pairs()
     found = replace(right, q=right.q - np.radians([0.0, 0.0, off, 0.0, 0.0, 0.0])).seen()
     assert "the zero of q3" in found.sentences[0].lower()
@@ -600,14 +600,14 @@ def misread_ur5(case: str | None) -> tuple[Config, Recording]:
 @pytest.mark.parametrize(
     "case", [pytest.param(case, marks=[] if case == QUICK else [pytest.mark.soak]) for case in CASES]
 )
-def test_a_misread_recording_of_a_real_arm_is_named(case) -> None:
+def test_misread_real_recording_is_rejected_and_named(case) -> None:
     config, recording = misread_ur5(case)
     assert case in (plausibility(config.robot, recording.q, recording.x).refusal or "")
 
 
 @real
 @pytest.mark.parametrize("known", [False, True])
-def test_a_wrist_turned_round_is_told_by_the_marker(known) -> None:
+def test_wrist_turned_180_degrees_is_reported_via_marker(known) -> None:
     config, recording = misread_ur5(None)
     robot = msgspec.structs.replace(config.robot.robot, marker_known=known)
     turned = recording.q + np.array([0.0, 0.0, 0.0, 0.0, np.pi, 0.0])
@@ -633,7 +633,7 @@ def test_real_recordings_are_not_doubted(name) -> None:
 @real
 @pytest.mark.parametrize("factor", [1.1, 0.9, 0.9144, 1.05, 1.0936])
 @pytest.mark.parametrize("name", ["panda_eyeinhand", "ur5_laser", "wam_laser", "tiago_eyehand"])
-@pytest.mark.soak  # of simulated arms: test_positions_of_another_size_are_refused_with_the_factor
+@pytest.mark.soak  # of simulated arms: test_scaled_positions_are_rejected_with_the_factor
 def test_a_real_recording_of_another_size_is_refused(name, factor) -> None:
     robot = Config.load(REAL_DATA / name / "robot.toml", {}).robot
     recording = Recording.read(REAL_DATA / name / "measured.csv", robot.joints)
@@ -655,7 +655,7 @@ def test_the_live_learner_names_a_wrong_reading(case) -> None:
     assert bool(findings.doubts) == (case is not None)
 
 
-def test_the_live_learner_waits_for_as_many_pairs_as_decide() -> None:
+def test_live_learner_waits_for_enough_undoubted_pairs() -> None:
     """Doubted pairs do not count."""
     wrong, rows = pairs().read(MISREAD["q3 counts the other way"]), [35, 40]
     learning = SimpleNamespace(
@@ -672,7 +672,7 @@ def test_the_live_learner_waits_for_as_many_pairs_as_decide() -> None:
     assert "q3 counts the other way" in findings.doubts[0]
 
 
-def test_a_sign_that_fits_better_by_chance_is_mentioned(tmp_path: Path) -> None:
+def test_sign_fitting_better_by_chance_only_warns(tmp_path: Path) -> None:
     for file in ("so101.urdf", "poses.csv"):
         (tmp_path / file).write_bytes((SO101 / file).read_bytes())
     (tmp_path / "robot.toml").write_text(SO101_ROBOT)

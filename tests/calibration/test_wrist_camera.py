@@ -47,7 +47,7 @@ def found() -> tuple[FloatArray, Calibration]:
     return T, Calibration.of(robot, recording, sigma_m=None, zeros_rad=1e-6)
 
 
-def test_the_camera_is_found_on_the_flange_without_a_guess(found) -> None:
+def test_flange_camera_pose_is_recovered_without_initial_guess(found) -> None:
     T, calibration = found
     pose = calibration.figures.geometry.T_parent_camera
     assert np.linalg.norm(pose[:3, 3] - T[:3, 3]) < 1e-3

@@ -92,21 +92,21 @@ def elsewhere(tmp_path: Path) -> Path:
     return tmp_path / "other" / "robot.toml"
 
 
-def test_what_is_restored_on_another_machine_is_what_was_backed_up(config, backed_up, elsewhere) -> None:
+def test_restored_files_on_another_machine_equal_the_backup(config, backed_up, elsewhere) -> None:
     again = put_back(backed_up, elsewhere)
     assert stored(again.store_file) == stored(config.store_file)
     assert elsewhere.read_bytes() == config.file.read_bytes()
     assert elsewhere.with_name("arm.urdf").read_text() == URDF
 
 
-def test_pairs_go_on_after_the_newest_that_was_restored(backed_up, elsewhere) -> None:
+def test_new_pair_follows_the_newest_restored_one(backed_up, elsewhere) -> None:
     again = put_back(backed_up, elsewhere)
     with PairStore(again.store_file, session_of(again, SystemClock())) as store:
         fill(store, 1)
     assert stored(again.store_file)[-1][0] == PAIRS + 1
 
 
-def test_a_backup_of_a_running_sampler_has_every_pair_to_its_last(config, file) -> None:
+def test_backup_of_running_sampler_has_no_missing_pairs(config, file) -> None:
     sampling, enough = threading.Event(), threading.Event()
 
     def sample() -> None:
@@ -141,9 +141,7 @@ def test_the_checkpoint_goes_on_with_the_restored_store(config, file, elsewhere,
     assert state.header.counters.pairs == learnt.header.counters.pairs
 
 
-def test_a_restored_store_is_another_one_so_that_no_learner_mixes_it_with_the_first(
-    config, backed_up, elsewhere
-) -> None:
+def test_restored_store_gets_a_new_identity(config, backed_up, elsewhere) -> None:
     again = put_back(backed_up, elsewhere)
     with PairReader(config.store_file) as one, PairReader(again.store_file) as other:
         assert one.identity != other.identity
@@ -164,13 +162,13 @@ def refused(file: Path, robot: Path) -> str:
     return str(refusal.value)
 
 
-def test_what_is_there_is_not_overwritten(config, backed_up) -> None:
+def test_existing_store_is_not_overwritten(config, backed_up) -> None:
     message = refused(backed_up, config.file)
     assert f"{config.store_file}: there already, and not what {backed_up} has" in message
     assert "Give --force" in message
 
 
-def test_force_keeps_what_was_there_under_another_name(config, backed_up) -> None:
+def test_force_keeps_old_store_under_another_name(config, backed_up) -> None:
     with PairStore(config.store_file, session_of(config, SystemClock())) as store:
         fill(store, 5)
     put_back(backed_up, config.file, force=True)
@@ -185,7 +183,7 @@ def test_another_robot_toml_is_not_overwritten(backed_up, elsewhere) -> None:
 
 
 @pytest.mark.soak
-def test_a_sampler_that_writes_the_store_is_not_disturbed(config, backed_up) -> None:
+def test_restore_is_refused_while_a_sampler_writes(config, backed_up) -> None:
     with (
         PairStore(config.store_file, session_of(config, SystemClock())),
         pytest.raises(StoreError, match="another sampler is writing"),
@@ -228,7 +226,7 @@ def test_a_damaged_store_in_it_is_refused(backed_up, elsewhere) -> None:
     assert "its checksum does not match" in said
 
 
-def test_a_file_that_unpacks_to_more_than_it_says_is_refused(backed_up, elsewhere) -> None:
+def test_member_longer_than_its_manifest_size_is_refused(backed_up, elsewhere) -> None:
     def swell(members: dict[str, bytes]) -> None:
         members[STORE] += bytes(10**7)
 
@@ -255,7 +253,7 @@ def test_a_robot_s_name_that_leads_elsewhere_is_refused(backed_up, elsewhere) ->
     assert "cannot be understood" in refused(altered(backed_up, lead_astray), elsewhere)
 
 
-def test_a_file_that_the_manifest_does_not_know_is_refused(backed_up, elsewhere) -> None:
+def test_member_absent_from_manifest_is_refused(backed_up, elsewhere) -> None:
     stranger = altered(backed_up, lambda members: members.update({"robot/stranger": b"x"}))
     assert "does not hold the files that its manifest.json says" in refused(stranger, elsewhere)
 
@@ -529,7 +527,7 @@ def test_a_backup_that_is_there_is_not_overwritten(config, backed_up) -> None:
     assert backed_up.read_bytes() == before
 
 
-def test_a_backup_that_cannot_be_finished_leaves_the_old_one_and_nothing_else(config, backed_up) -> None:
+def test_failed_backup_keeps_old_archive_without_leftovers(config, backed_up) -> None:
     before = backed_up.read_bytes()
     shutil.rmtree(config.state_dir)
     with pytest.raises(StoreError, match="there is no store"):
@@ -542,7 +540,7 @@ def test_only_its_owner_reads_it(backed_up) -> None:
     assert backed_up.stat().st_mode & 0o777 == 0o600
 
 
-def test_a_urdf_in_another_folder_is_kept_and_its_place_is_told(config, file, elsewhere, capsys) -> None:
+def test_restore_keeps_outside_urdf_and_names_its_place(config, file, elsewhere, capsys) -> None:
     urdf = config.file.parent.parent / "models" / "arm.urdf"
     urdf.parent.mkdir()
     config.robot.tree.file.rename(urdf)

@@ -128,7 +128,7 @@ def test_nothing_starts_with_a_wrong_description(robot, command, right, wrong, l
 
 
 @pytest.mark.parametrize("command", ["config", "run learner", "run", "replay walk.csv"])
-def test_more_joints_than_can_be_learnt_are_refused_with_the_limit_and_what_learns_them(tmp_path, command) -> None:
+def test_too_many_joints_error_names_limit_and_alternative(tmp_path, command) -> None:
     write_long_arm(tmp_path, joints=13)
     message = refused(*command.split(), cwd=tmp_path)
     assert message.startswith("robot.toml, line 4: 13 joints are too many for the learner: their map has 1,594,323")
@@ -161,7 +161,7 @@ def test_a_folder_for_robot_toml_is_refused(robot) -> None:
         ("a.txt", b"waist", "a.txt: recordings end in .csv or .parquet"),
     ],
 )
-def test_a_recording_that_cannot_be_read_is_refused_with_its_place(robot, name, content, said) -> None:
+def test_unreadable_recording_error_names_its_location(robot, name, content, said) -> None:
     (robot.parent / name).write_bytes(content)
     assert refused("replay", name, cwd=robot.parent).startswith(said)
 
@@ -176,7 +176,7 @@ def test_a_recording_that_is_not_there_is_refused(robot, name) -> None:
     assert refused("replay", name, cwd=robot.parent).startswith(f"{name}: there is no such file")
 
 
-def test_a_sampler_of_an_unreadable_recording_leaves_no_store(robot) -> None:
+def test_sampler_leaves_no_store_for_unreadable_recording(robot) -> None:
     fix(robot.parent / "walk.csv", "0.03,", "0.03x,")
     assert "walk.csv, line 2, column waist: '0.03x' is not a number" in refused("run", "sampler", cwd=robot.parent)
 
@@ -207,7 +207,7 @@ def test_a_letter_among_the_joint_angles_is_named(robot) -> None:
 
 
 @pytest.mark.parametrize("process", ["sampler", "learner"])
-def test_a_port_in_use_is_named_and_leaves_no_trace(robot, process) -> None:
+def test_port_in_use_error_names_endpoint_and_fix(robot, process) -> None:
     endpoint = getattr(Config.load(robot, {}).tables.zenoh, process)
     with ZenohSession(listen=endpoint):
         said = refused("run", process, cwd=robot.parent)
@@ -228,7 +228,7 @@ def test_a_port_in_use_is_named_and_leaves_no_trace(robot, process) -> None:
         ("locked/new", "cannot make the directory {}: Permission denied. Give another one with --state-dir"),
     ],
 )
-def test_a_folder_that_cannot_be_written_ends_the_sampler(robot, state_dir, said) -> None:
+def test_sampler_exits_on_unwritable_state_dir(robot, state_dir, said) -> None:
     folder = robot.parent / state_dir
     (robot.parent / "locked").mkdir(mode=0o555)
     done = run("run", "sampler", "--state-dir", folder, cwd=robot.parent, by=("-c", WITHOUT_ROOTS_RIGHTS))
@@ -258,7 +258,7 @@ def process_running(config: Config, process: str, by: tuple[str, ...] = DAEMON) 
             child.wait(LIMIT_S)
 
 
-def test_a_process_that_takes_the_connection_and_says_nothing_is_not_taken_for_none(free_endpoint) -> None:
+def test_silent_listener_is_not_reported_as_absent(free_endpoint) -> None:
     endpoint = free_endpoint()
     with (
         socket.create_server(("127.0.0.1", int(endpoint.rpartition(":")[2]))),
@@ -286,7 +286,7 @@ def learner_status(config: Config) -> LearnerStatus:
         return decode(bus.ask_one(KEYS.status("learner")), LearnerStatus)
 
 
-def test_a_prediction_before_any_pair_is_refused_where_the_camera_stands_anywhere(lonely_learner) -> None:
+def test_prediction_without_pairs_fails_for_unknown_camera_pose(lonely_learner) -> None:
     said = refused("predict", "--", "0.1", "-0.2", cwd=lonely_learner.file.parent)
     assert said == (
         "there is no model yet: robot.toml says [camera] pose_known = false, so positions have no frame until about "
@@ -303,7 +303,7 @@ def test_a_prediction_before_any_pair_is_refused_where_the_camera_stands_anywher
         (KEYS.model, b""),
     ],
 )
-def test_every_query_for_the_model_before_any_pair_gets_an_error_reply(lonely_learner, key, payload) -> None:
+def test_model_query_before_first_pair_gets_error_reply(lonely_learner, key, payload) -> None:
     with client(lonely_learner.tables.zenoh.learner) as bus, pytest.raises(RequestError, match="no frame"):
         bus.ask_one(key, payload)
 
@@ -322,7 +322,7 @@ def test_refused_requests_change_nothing_of_the_learner(lonely_learner) -> None:
     assert unchanged() == before
 
 
-def test_a_learner_without_a_sampler_says_where_it_looks_and_how_to_start_one(lonely_learner) -> None:
+def test_learner_without_sampler_names_endpoint_and_start_command(lonely_learner) -> None:
     status = learner_status(lonely_learner)
     assert (status.state, status.sampler_alive) == ("waiting", False)
     assert status.health[0] == (
@@ -331,24 +331,24 @@ def test_a_learner_without_a_sampler_says_where_it_looks_and_how_to_start_one(lo
     )
 
 
-def test_the_status_of_a_learner_alone_names_the_command_that_starts_a_sampler(lonely_learner) -> None:
+def test_status_of_lone_learner_names_sampler_command(lonely_learner) -> None:
     done = run_here("status", cwd=lonely_learner.file.parent)
     text = " ".join(done.stdout.split())
     assert done.returncode == 0
     assert f"sampler does not answer on {lonely_learner.tables.zenoh.sampler}. Start it with `bodyschema run s" in text
 
 
-def test_a_command_of_the_sampler_is_refused_by_the_learner(lonely_learner) -> None:
+def test_learner_refuses_a_sampler_command(lonely_learner) -> None:
     said = refused("command", "zero_force_on", "--to", "learner", cwd=lonely_learner.file.parent)
     assert said == "zero_force_on is a command of the sampler: drop --to"
 
 
-def test_a_command_that_the_sampler_does_not_know_is_the_learner_s(lonely_learner) -> None:
+def test_sampler_refuses_a_learner_command(lonely_learner) -> None:
     said = refused("command", "tool_changed", "--to", "sampler", cwd=lonely_learner.file.parent)
     assert said == "tool_changed is a command of the learner: drop --to"
 
 
-def test_a_target_that_is_no_position_is_refused_in_words(lonely_learner) -> None:
+def test_ik_rejects_a_non_finite_target(lonely_learner) -> None:
     said = refused("ik", "nan", "0", "1", cwd=lonely_learner.file.parent)
     assert said == "nan, 0, 1 is no position: give three finite numbers in metres"
 
@@ -358,7 +358,7 @@ def test_recording_without_a_sampler_is_refused(lonely_learner) -> None:
     assert said.startswith(f"nothing listens on {lonely_learner.tables.zenoh.sampler}. Start")
 
 
-def test_a_checkpoint_that_cannot_be_written_is_an_error_reply_and_learning_goes_on(lonely_learner) -> None:
+def test_unwritable_checkpoint_is_reported_and_learner_keeps_running(lonely_learner) -> None:
     said = refused("command", "checkpoint", cwd=lonely_learner.file.parent)
     assert said == (
         f"the checkpoint {lonely_learner.checkpoint_file} could not be written: Permission denied. "
@@ -367,7 +367,7 @@ def test_a_checkpoint_that_cannot_be_written_is_an_error_reply_and_learning_goes
     assert said in learner_status(lonely_learner).health
 
 
-def test_a_sampler_without_a_learner_goes_on_and_predictions_name_what_to_start(robot) -> None:
+def test_sampler_runs_without_learner_and_predict_names_remedy(robot) -> None:
     config, published = Config.load(robot, {}), Queue()
     with process_running(config, "sampler"), client(config.tables.zenoh.sampler) as bus:
         bus.subscribe(KEYS.status("sampler"), published.put)

@@ -32,7 +32,7 @@ def config(folder: Path) -> Config:
 EACH = pytest.mark.parametrize("file", ["servos.toml", "feetech.toml", "encoders.toml"])
 
 
-def test_the_written_file_is_the_users_with_the_port_of_the_bench(config, folder) -> None:
+def test_written_robot_file_keeps_servos_with_bench_port(config, folder) -> None:
     with BenchRun(config, folder / "bus") as run:
         written = Config.load(run.robot_file, {})
     assert written.tables.drivers.dynamixel is not None
@@ -44,7 +44,7 @@ def test_the_written_file_is_the_users_with_the_port_of_the_bench(config, folder
 
 @pytest.mark.usefixtures("patient_host")
 @EACH
-def test_the_driver_reads_the_bench_by_the_written_file(file, folder) -> None:
+def test_driver_reads_bench_through_the_written_file(file, folder) -> None:
     config = Config.load(folder / file, {})
     with BenchRun(config, folder / "bus") as run:
         with open_joints(Config.load(run.robot_file, {}), SystemClock()) as joints:
@@ -70,14 +70,14 @@ def test_a_bench_leaves_nothing_behind(file, folder) -> None:
         ("encoders.toml", "4 encoders", "doctor"),
     ],
 )
-def test_the_introduction_says_what_to_type(file, what, command, folder) -> None:
+def test_introduction_names_the_commands_to_type(file, what, command, folder) -> None:
     with BenchRun(Config.load(folder / file, {}), folder / "bus") as run:
         said = "\n".join(run.introduction())
     assert f"desk_arm: {what} on {folder / 'bus'} at " in said
     assert f"bodyschema {command} --robot {folder / 'bus.toml'}" in said
 
 
-def test_what_was_asked_for_happens_when_its_time_has_come(config, folder) -> None:
+def test_requested_fault_happens_at_its_time(config, folder) -> None:
     time = [0.0]
     with BenchRun(config, folder / "bus", faults=["unplug"], now=lambda: time[0]) as run:
         assert list(run.due()) == []
@@ -89,7 +89,7 @@ def test_what_was_asked_for_happens_when_its_time_has_come(config, folder) -> No
         assert (folder / "bus").is_symlink()
 
 
-def test_a_file_in_the_place_of_the_port_is_kept(config, folder) -> None:
+def test_existing_file_at_the_port_path_is_kept(config, folder) -> None:
     (folder / "bus").write_text("precious")
     with pytest.raises(ConfigError, match="is there already"):
         BenchRun(config, folder / "bus")
@@ -104,20 +104,20 @@ def test_a_bench_that_runs_keeps_its_port(config, folder) -> None:
         assert (folder / "bus").readlink() == terminal
 
 
-def test_the_port_of_a_bench_that_was_killed_is_taken_over(config, folder) -> None:
+def test_stale_port_of_a_killed_bench_is_replaced(config, folder) -> None:
     (folder / "bus").symlink_to("/dev/pts/99999")
     with BenchRun(config, folder / "bus"):
         assert (folder / "bus").exists()
 
 
-def test_a_robot_toml_in_the_place_of_its_own_is_kept(config, folder) -> None:
+def test_existing_foreign_robot_toml_is_kept(config, folder) -> None:
     (folder / "bus.toml").write_text("precious")
     with pytest.raises(ConfigError, match="no bench wrote it"), BenchRun(config, folder / "bus"):
         pass
     assert (folder / "bus.toml").read_text() == "precious"
 
 
-def test_a_robot_without_servos_is_told_what_to_add(folder) -> None:
+def test_missing_servos_error_names_the_table_to_add(folder) -> None:
     with pytest.raises(ConfigError, match=r"no servos are configured.*\[drivers\.dynamixel\]"):
         BenchRun(Config.load(folder / "robot.toml", {}), folder / "bus")
 

@@ -69,7 +69,7 @@ def test_a_folder_of_images_becomes_a_calibration(folder) -> None:
     assert (rig.model, rig.serials) == ("pinhole", ("A1", ""))
 
 
-def test_the_report_is_one_file_with_a_picture_of_every_image(folder) -> None:
+def test_report_is_self_contained_with_every_image(folder) -> None:
     text = (folder / "cameras_report.html").read_text(encoding="utf-8")
     pairs = photographed(count=COUNT)[1]
     assert text.count("<img ") == 2 * len(pairs)
@@ -84,7 +84,7 @@ def test_figures_fit_a_terminal_of_80_columns(folder) -> None:
     assert any(line.startswith("fx [px]") for line in lines)
 
 
-def test_the_check_of_a_bumped_camera_ends_with_exit_code_1(folder, tmp_path, capsys) -> None:
+def test_check_of_bumped_camera_exits_with_code_1(folder, tmp_path, capsys) -> None:
     truth, _, poses = photographed(count=COUNT)
     tilt = cv2.Rodrigues(np.radians([0.3, 0.0, 0.0]))[0]
     bumped = type(truth)(truth.left, truth.right, tilt @ truth.R, tilt @ truth.t_m)
@@ -122,7 +122,7 @@ def test_the_check_of_a_bumped_camera_ends_with_exit_code_1(folder, tmp_path, ca
         ),
     ],
 )
-def test_the_check_names_images_that_are_exchanged_or_upside_down(folder, tmp_path, capsys, left, right, said) -> None:
+def test_check_names_exchanged_or_upside_down_images(folder, tmp_path, capsys, left, right, said) -> None:
     pair = photographed(count=COUNT)[1][4]
     cv2.imwrite(str(tmp_path / "left1.png"), left(pair))
     cv2.imwrite(str(tmp_path / "right1.png"), right(pair))
@@ -133,7 +133,7 @@ def test_the_check_names_images_that_are_exchanged_or_upside_down(folder, tmp_pa
     assert said in wrong[0]
 
 
-def test_the_newest_view_is_checked_whatever_the_digits_of_its_number(folder, tmp_path, capsys) -> None:
+def test_check_picks_newest_view_by_numeric_order(folder, tmp_path, capsys) -> None:
     pair = photographed(count=COUNT)[1][4]
     for number in (2, 9, 10):
         cv2.imwrite(str(tmp_path / f"left{number}.png"), pair.left)
@@ -144,7 +144,7 @@ def test_the_newest_view_is_checked_whatever_the_digits_of_its_number(folder, tm
     assert "The calibration holds" in said
 
 
-def test_that_no_ruler_was_measured_is_said(folder) -> None:
+def test_unmeasured_ruler_is_reported(folder) -> None:
     said = " ".join((folder / "said.txt").read_text(encoding="utf-8").split())
     assert "No image shows whether the board has its stated size" in said
 
@@ -181,7 +181,7 @@ def test_pairs_are_found_by_their_names(tmp_path, left, right, patterns) -> None
     assert (pair.left, pair.right) == (tmp_path / left, tmp_path / right)
 
 
-def test_a_folder_without_pairs_says_how_to_name_them(tmp_path) -> None:
+def test_folder_without_pairs_error_names_expected_filenames(tmp_path) -> None:
     with pytest.raises(CalibrationError, match=r"no pairs of images. Name them left01.png and right01.png"):
         called("calibrate", "cameras", tmp_path)
 
@@ -193,7 +193,7 @@ def test_a_file_that_is_no_image_is_named(tmp_path) -> None:
         called("calibrate", "cameras", tmp_path)
 
 
-def test_the_wrong_number_of_squares_is_said(folder, tmp_path) -> None:
+def test_wrong_number_of_squares_is_reported(folder, tmp_path) -> None:
     with pytest.raises(CalibrationError, match=r"the board has 8x6 squares, not 7x5. Give --squares 8x6"):
         called("calibrate", "cameras", folder, "--squares", "7x5", "--out", tmp_path / "c.toml")
 
@@ -229,7 +229,7 @@ def test_the_ruler_on_the_print_scales_the_baseline(folder, tmp_path, capsys) ->
         (3.0, 0.0, ("3", "± 0")),
     ],
 )
-def test_a_value_has_as_many_places_as_its_interval(value, half_width, shown) -> None:
+def test_value_is_rounded_to_its_interval(value, half_width, shown) -> None:
     assert to_its_interval(value, half_width) == shown
 
 

@@ -86,7 +86,7 @@ def test_status_and_predict_load_no_numpy(robot) -> None:
     assert loaded & {"numpy", "scipy", "kbmaps", "lxml", "tomlkit", "bodyschema.daemon.config"} == set()
 
 
-def test_a_wrong_request_is_told_what_is_wrong_in_robot_toml(robot) -> None:
+def test_wrong_request_error_also_reports_toml_fault(robot) -> None:
     robot.write_text(robot.read_text() + "[daemon.more]\n")
     with pytest.raises(RequestError, match=r"has 1 numbers.* unknown key 'more'"):
         app(["predict", "0", "--robot", str(robot)], exit_on_error=False, result_action="return_value")
@@ -94,7 +94,7 @@ def test_a_wrong_request_is_told_what_is_wrong_in_robot_toml(robot) -> None:
 
 @pytest.mark.parametrize("words", ["status", "predict 0 0", "ik 0.1 0.2 0.3", "command pause"])
 @pytest.mark.parametrize(("missing", "fault"), [(True, "cannot read the URDF"), (False, "unknown key 'radius'")])
-def test_silence_is_told_before_a_fault_of_robot_toml(robot, capsys, words, missing, fault) -> None:
+def test_silent_daemon_is_reported_before_toml_fault(robot, capsys, words, missing, fault) -> None:
     """A client's machine need not have every file that robot.toml names."""
     if missing:
         robot.with_name("arm.urdf").unlink()
@@ -107,7 +107,7 @@ def test_silence_is_told_before_a_fault_of_robot_toml(robot, capsys, words, miss
     assert fault in cause
 
 
-def test_a_message_does_not_quote_a_file_without_end(robot) -> None:
+def test_error_message_truncates_a_very_long_key(robot) -> None:
     robot.write_text(robot.read_text() + f'["{"a=." * 100_000}"]\n')
     said = run("config", cwd=robot.parent).stderr
     assert "unknown table [a=.a=." in said
@@ -126,7 +126,7 @@ def test_a_client_config_agrees_with_the_whole(robot, monkeypatch) -> None:
 
 
 @pytest.mark.parametrize("first", ['<!DOCTYPE robot [<!ENTITY a "b">]>', '<?xml version="1.0" encoding="foo"?>'])
-def test_a_client_config_reads_a_urdf_as_strictly_as_the_whole(robot, first) -> None:
+def test_client_config_reads_urdf_as_strictly_as_config(robot, first) -> None:
     own = ClientConfig.load(robot, {})
     urdf = own.urdf
     urdf.write_text(first + re.sub(r"<\?xml.*?\?>", "", urdf.read_text()).strip())
@@ -158,7 +158,7 @@ def test_the_front_page_is_the_command_line_s(width, capsys, monkeypatch) -> Non
     assert [line.rstrip() for line in front_page(width).splitlines()] == shown
 
 
-def test_colours_and_ascii_panels_change_no_word_of_the_front_page() -> None:
+def test_colours_and_ascii_keep_the_front_page_wording() -> None:
     plain = front_page(80)
     assert re.sub(r"\x1b\[\d+m", "", front_page(80, colour=True)) == plain
     assert front_page(80, signs=ASCII) == plain.translate(str.maketrans(UNICODE, ASCII))
@@ -172,7 +172,7 @@ def test_help_names_every_command(tmp_path) -> None:
 @pytest.mark.parametrize(
     "command", [*COMMANDS, "calibrate cameras", "calibrate latency", "marker print", "marker learn"]
 )
-def test_each_command_says_what_it_needs_and_what_is_next(command, capsys) -> None:
+def test_each_help_page_states_needs_and_next_step(command, capsys) -> None:
     # As in a process of its own: a summary given to the same page before would be shown in its place.
     sys.modules.pop(MODULES[command.split()[0]], None)
     command_line(command.split()[0])([*command.split(), "--help"], exit_on_error=False, result_action="return_value")
@@ -188,7 +188,7 @@ def test_help_fits_a_terminal_of_80_columns(tmp_path) -> None:
     assert len([line for line in lines if line.startswith("│")]) == len(COMMANDS) + len(("--help", "--version"))
 
 
-def test_a_mistake_of_the_user_is_one_line_and_exit_code_1(tmp_path) -> None:
+def test_user_error_prints_one_line_and_exits_1(tmp_path) -> None:
     done = run("run", "sampler", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr == "bodyschema: robot.toml: there is no such file. `bodyschema init` writes one\n"
@@ -204,7 +204,7 @@ def test_robot_toml_may_be_named_in_the_environment(tmp_path, robot) -> None:
 # --- config
 
 
-def test_the_example_that_init_writes_is_in_order_once_the_urdf_fits(tmp_path, capsys) -> None:
+def test_init_example_is_valid_once_the_urdf_fits(tmp_path, capsys) -> None:
     called("init", "--robot", tmp_path / "robot.toml")
     urdf = URDF.replace("waist", "joint_1").replace("shoulder", "joint_2").replace('"base"', '"base_link"')
     (tmp_path / "my_robot.urdf").write_text(urdf)
@@ -212,7 +212,7 @@ def test_the_example_that_init_writes_is_in_order_once_the_urdf_fits(tmp_path, c
     assert "is in order: robot my_robot, 2 joints" in capsys.readouterr().out
 
 
-def test_init_with_a_urdf_fills_in_what_the_urdf_says(tmp_path) -> None:
+def test_init_fills_robot_toml_from_the_urdf(tmp_path) -> None:
     write_small_arm(tmp_path)
     called("init", "--robot", tmp_path / "new.toml", "--urdf", tmp_path / "arm.urdf")
     robot = Config.load(tmp_path / "new.toml", {}).robot
@@ -248,7 +248,7 @@ GRIPPER = """
 </robot>"""
 
 
-def test_init_leaves_a_gripper_and_what_mimics_it_out(tmp_path) -> None:
+def test_init_leaves_out_gripper_and_mimic_joints(tmp_path) -> None:
     write_small_arm(tmp_path)
     urdf = tmp_path / "arm.urdf"
     urdf.write_text(urdf.read_text().replace("</robot>", GRIPPER))
@@ -265,7 +265,7 @@ def test_init_takes_the_links_that_are_given(tmp_path) -> None:
     assert (robot.joints, robot.robot.marker_link, robot.camera.parent_link) == (("waist",), "upper", "base")
 
 
-def test_init_refuses_a_link_that_the_urdf_has_not(tmp_path) -> None:
+def test_init_refuses_a_link_absent_from_urdf(tmp_path) -> None:
     write_small_arm(tmp_path)
     with pytest.raises(ConfigError, match=r"has no link 'hnad'\. Did you mean 'hand'"):
         called("init", "--robot", tmp_path / "new.toml", "--urdf", tmp_path / "arm.urdf", "--marker-link", "hnad")
@@ -279,7 +279,7 @@ def test_init_refuses_a_urdf_in_which_nothing_moves(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("present", RENAMED.values(), ids=" ".join)
-def test_what_an_earlier_name_became_is_a_command(present, capsys) -> None:
+def test_renamed_commands_exist_under_the_present_name(present, capsys) -> None:
     command_line(present[0])([*present, "--help"], exit_on_error=False, result_action="return_value")
     page = capsys.readouterr().out
     assert f"Usage: bodyschema {present[0]}" in page
@@ -308,7 +308,7 @@ def test_the_earlier_names_answer_with_the_present_one(capsys) -> None:
     assert "bodyschema config init is now: bodyschema init\n" in capsys.readouterr().err
 
 
-def test_check_says_what_was_understood(robot, capsys) -> None:
+def test_check_prints_joint_ranges_and_calibration_state(robot, capsys) -> None:
     called("config", "--robot", robot)
     text = capsys.readouterr().out
     assert "waist: -171.9° to 171.9°" in text
@@ -333,7 +333,7 @@ def test_the_written_example_explains_every_key_in_place(tmp_path) -> None:
 # --- processes that are not there
 
 
-def test_a_command_to_nobody_says_what_to_start(robot) -> None:
+def test_unanswered_command_names_the_daemon_to_start(robot) -> None:
     with pytest.raises(
         BusError, match=r"nothing listens on tcp/127\.0\.0\.1:[0-9]+\. Start the daemon with `bodyschema run`"
     ):
@@ -346,7 +346,7 @@ def test_an_unknown_command_lists_the_known_ones(tmp_path, robot) -> None:
     assert "tool_changed" in done.stdout + done.stderr
 
 
-def test_a_sampler_without_a_driver_says_so_and_leaves_no_store(tmp_path, robot) -> None:
+def test_sampler_without_driver_fails_and_leaves_no_store(tmp_path, robot) -> None:
     done = run("run", "sampler", "--robot", robot, cwd=tmp_path)
     assert (done.returncode, "no driver is configured" in done.stderr) == (1, True)
     assert not (tmp_path / "state").exists()
@@ -355,7 +355,7 @@ def test_a_sampler_without_a_driver_says_so_and_leaves_no_store(tmp_path, robot)
 @pytest.mark.parametrize(
     ("value", "shown"), [(0.031, "0.031"), (0.5, "0.50"), (1.96, "2.0"), (123.4, "123"), (0.0, "0")]
 )
-def test_a_sigma_is_shown_with_two_digits_however_small(value: float, shown: str) -> None:
+def test_small_sigma_is_shown_with_two_digits(value: float, shown: str) -> None:
     assert two_digits(value) == shown
 
 
@@ -365,6 +365,6 @@ def test_a_demo_of_no_pairs_is_refused() -> None:
 
 
 @pytest.mark.parametrize("option", [("--sigma-mm", "1e308"), ("--marker-delay-ms", "nan")])
-def test_numbers_that_cannot_be_are_refused_before_anything_is_read(option) -> None:
+def test_impossible_option_values_are_refused_before_reading(option) -> None:
     with pytest.raises(CycloptsError, match=option[0]):
         called("calibrate", "a.csv", *option)

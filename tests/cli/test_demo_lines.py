@@ -37,16 +37,16 @@ def test_without_a_terminal_the_demo_says_nothing_twice(lines) -> None:
     assert len(lines(10, 10, 10, 20)) == 1 + 2
 
 
-def test_without_a_terminal_the_demos_lines_fit_80_columns(lines) -> None:
+def test_demo_lines_without_terminal_fit_80_columns(lines) -> None:
     assert max(len(line) for line in lines(900)) < 80
 
 
-def test_the_demos_lines_have_the_held_out_angle_where_orientations_are_learnt(lines) -> None:
+def test_demo_lines_show_held_out_angle_with_orientations(lines) -> None:
     said = lines(900, angle_rad=0.0123)
     assert "held out 123 mm 0.705°" in said[-1]
     assert max(len(line) for line in said) < 80
 
 
-def test_a_demo_that_stands_still_says_what_became_of_the_frames() -> None:
+def test_stalled_demo_reports_rejected_frames() -> None:
     sampler = cast(SamplerStatus, SimpleNamespace(frames=217, rejected={"not_new": 2, "no_marker": 215}))
     assert "has seen 217 frames, 215 rejected: no marker, 2 rejected: not new." in stalled(sampler)

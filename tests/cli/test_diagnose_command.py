@@ -128,19 +128,19 @@ def again(file, here) -> Ended:
 # --- output
 
 
-def test_a_cause_is_told_in_a_sentence_with_its_joint_and_number(told, robot) -> None:
+def test_cause_is_stated_with_joint_and_number(told, robot) -> None:
     assert told.code == 0
     sentence = " ".join(told.out.split("Error on data")[0].split())
     assert "EXPLAINED" in sentence
     assert f"Joint {robot.joints[2]} turns 2" in sentence
 
 
-def test_what_to_do_is_told(told) -> None:
+def test_remedy_is_printed(told) -> None:
     assert "What to do" in told.out
     assert "Multiply what the encoder of" in told.out
 
 
-def test_progress_goes_to_the_other_stream_in_plain_lines(told) -> None:
+def test_progress_goes_to_stderr_as_plain_text(told) -> None:
     assert "hypotheses" in told.err
     assert "\x1b" not in told.err
     assert "hypotheses" not in told.out
@@ -175,7 +175,7 @@ def printed(file: DiagnosisFile) -> str:
     return console.file.getvalue()
 
 
-def test_an_alternative_of_two_causes_of_a_joint_is_said_once(found) -> None:
+def test_shared_alternative_of_two_causes_is_printed_once(found) -> None:
     (cause,) = found.causes[:1]
     wave = Indistinguishable("unexplained", None, None, "this_motion", 0.5, "another error of shoulder_pitch")
     twice = (msgspec.structs.replace(cause, rivals=(wave,)),) * 2
@@ -193,7 +193,7 @@ def test_each_verdict_begins_differently(found) -> None:
         assert printed(msgspec.structs.replace(found, verdict=verdict)).startswith(f" {head} ")
 
 
-def test_rivals_are_told_with_what_would_tell_them_apart(found) -> None:
+def test_rival_causes_state_whether_motion_can_distinguish(found) -> None:
     rivals = (
         Indistinguishable("backlash", "wrist", None, "this_motion", 0.3),
         Indistinguishable("camera_pose", None, None, "any_motion", 0.2),
@@ -204,7 +204,7 @@ def test_rivals_are_told_with_what_would_tell_them_apart(found) -> None:
     assert "may be a wrong place of the camera (20 %); no motion tells them apart" in text
 
 
-def test_what_fits_no_effect_is_told_with_its_joints(found) -> None:
+def test_unexplained_residual_is_reported_with_its_joints(found) -> None:
     left = Unexplained(1.25, ("elbow", "time"), 1e-9, ("link 2 bends",))
     text = " ".join(printed(msgspec.structs.replace(found, verdict="unexplained", unexplained=left)).split())
     assert "About 1.25 mm (RMS) is left" in text
@@ -224,7 +224,7 @@ def test_out_gets_the_three_files(told, out) -> None:
     assert f"give it to any command as --robot {out / 'extended.toml'}; robot.toml is unchanged." in told.out
 
 
-def test_nothing_is_found_with_the_extended_simulation_as_the_nominal_one(told, out, file) -> None:
+def test_nothing_is_found_with_extended_simulation_as_nominal(told, out, file) -> None:
     extended = json.loads(diagnose(file, "--robot", out / "extended.toml", *FEW, "--json").out)
     assert extended["verdict"] == "nothing_found"
 
@@ -275,13 +275,13 @@ def test_the_running_samplers_pairs_are_diagnosed(live_robot, endpoint, recordin
     assert [cause["effect"] for cause in contents["causes"]] == ["joint_scale"]
 
 
-def test_a_sampler_without_pairs_is_said_to_have_none(live_robot, endpoint, recording) -> None:
+def test_live_diagnosis_reports_a_sampler_without_pairs(live_robot, endpoint, recording) -> None:
     with ZenohSession(listen=endpoint) as bus:
         Sampler(bus, "desk_arm", recording).pairs.clear()
         assert "the sampler has no pairs yet" in refused("--live", "--robot", live_robot)
 
 
-def test_a_sampler_that_does_not_run_is_said_not_to(live_robot) -> None:
+def test_live_diagnosis_reports_a_missing_sampler(live_robot) -> None:
     assert "nothing listens on" in refused("--live", "--robot", live_robot)
 
 
@@ -307,17 +307,17 @@ def test_a_missing_file_is_named(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("option", ["--effects", "--exclude"])
-def test_an_unknown_effect_is_named_with_the_nearest_known_one(file, option) -> None:
+def test_unknown_effect_error_suggests_nearest_known_effect(file, option) -> None:
     line = refused(file, "--robot", DESK_ARM, option, "backlash,joint_ofset")
     assert "'joint_ofset'" in line
     assert "Did you mean 'joint_offset'?" in line
 
 
-def test_outliers_cannot_be_asked_for_as_they_are_always_looked_for(file) -> None:
+def test_outliers_cannot_be_excluded_from_the_search(file) -> None:
     assert "always looked for" in refused(file, "--robot", DESK_ARM, "--exclude", "outliers")
 
 
-def test_no_number_in_the_recording_is_named_by_line_and_column(file, tmp_path) -> None:
+def test_nan_in_recording_error_names_line_and_column(file, tmp_path) -> None:
     lines = file.read_text().splitlines()
     cells = lines[9].split(",")
     cells[-1] = "nan"
@@ -350,7 +350,7 @@ def test_times_in_another_unit_are_seen(recording, tmp_path, unit, factor) -> No
     assert f"divide by {factor:g}" in line
 
 
-def test_all_joints_that_count_the_other_way_are_told_together_and_no_folder_is_left(recording, tmp_path) -> None:
+def test_reversed_joints_are_reported_together_without_output_folder(recording, tmp_path) -> None:
     file = written(recording, tmp_path, q=-recording.q)
     line = refused(file, "--robot", DESK_ARM, "--out", tmp_path / "found" / "here")
     assert "all joints count the other way" in line
@@ -373,7 +373,7 @@ def test_exchanged_columns_are_seen(recording, tmp_path) -> None:
     assert "the columns shoulder_pitch and elbow_pitch are exchanged" in refused(file, "--robot", DESK_ARM)
 
 
-def test_positions_that_have_nothing_to_do_with_the_arm_are_refused(recording, tmp_path) -> None:
+def test_positions_unrelated_to_the_arm_are_refused(recording, tmp_path) -> None:
     x = np.random.default_rng(9).permutation(recording.x)
     assert "hardly of this robot" in refused(written(recording, tmp_path, x=x), "--robot", DESK_ARM, *FEW)
 
@@ -384,7 +384,7 @@ def test_too_few_pairs_are_counted(recording, tmp_path) -> None:
     assert "12 pairs are too few" in refused(file, "--robot", DESK_ARM)
 
 
-def test_effects_that_this_recording_cannot_show_are_not_called_absent(robot, tmp_path) -> None:
+def test_latency_diagnosis_of_untimed_recording_is_refused(robot, tmp_path) -> None:
     file = tmp_path / "untimed.csv"
     walked(robot, timed=False).write_csv(file)
     line = refused(file, "--robot", DESK_ARM, "--effects", "camera_latency")
@@ -392,7 +392,7 @@ def test_effects_that_this_recording_cannot_show_are_not_called_absent(robot, tm
     assert "no times" in line
 
 
-def test_a_folder_that_cannot_be_written_is_named_before_anything_is_diagnosed(file, tmp_path) -> None:
+def test_unwritable_output_folder_fails_before_the_diagnosis(file, tmp_path) -> None:
     taken = tmp_path / "taken"
     taken.write_text("")
     ended = diagnose(file, "--robot", DESK_ARM, *FEW, "--out", taken)
@@ -400,7 +400,7 @@ def test_a_folder_that_cannot_be_written_is_named_before_anything_is_diagnosed(f
     assert str(taken) in ended.err
 
 
-def test_an_arm_that_never_moved_is_said_to_have_stood_still(recording, tmp_path) -> None:
+def test_recording_without_joint_motion_is_refused(recording, tmp_path) -> None:
     file = tmp_path / "still.csv"
     n = len(recording)
     dataclasses.replace(
@@ -409,7 +409,7 @@ def test_an_arm_that_never_moved_is_said_to_have_stood_still(recording, tmp_path
     assert "no joint ever moved" in refused(file, "--robot", DESK_ARM)
 
 
-def test_excluding_all_that_was_asked_for_leaves_nothing_to_look_for(file) -> None:
+def test_excluding_every_requested_effect_is_refused(file) -> None:
     line = refused(file, "--robot", DESK_ARM, "--effects", "backlash", "--exclude", "backlash")
     assert "nothing to look for" in line
 

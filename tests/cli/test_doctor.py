@@ -57,7 +57,7 @@ def state(tmp_path, monkeypatch, free_endpoint) -> None:
 @pytest.mark.parametrize(
     ("file", "what"), [("servos.toml", "servos"), ("feetech.toml", "servos"), ("encoders.toml", "encoders")]
 )
-def test_an_arm_on_the_bench_is_well_within_five_seconds(file, what, tmp_path, capsys) -> None:
+def test_healthy_bench_arm_passes_within_five_seconds(file, what, tmp_path, capsys) -> None:
     with BenchRun(Config.load(EXAMPLE.with_name(file)), tmp_path / "bus") as run:
         begin = time.monotonic()
         code = called("doctor", "--robot", run.robot_file, "--json")
@@ -78,7 +78,7 @@ def test_an_arm_on_the_bench_is_well_within_five_seconds(file, what, tmp_path, c
         ("feetech.toml", "overload@elbow_pitch", "free the joint, then switch its supply off and on"),
     ],
 )
-def test_what_is_wrong_is_exit_code_1_and_has_its_remedy(file, fault, fix, tmp_path, capsys) -> None:
+def test_overloaded_servo_exits_1_with_its_remedy(file, fault, fix, tmp_path, capsys) -> None:
     with BenchRun(Config.load(EXAMPLE.with_name(file)), tmp_path / "bus", faults=[fault]) as run:
         code = called("doctor", "--robot", run.robot_file, "--json")
     wrong = [check for check in json.loads(capsys.readouterr().out)["checks"] if check["state"] == "wrong"]
@@ -96,7 +96,7 @@ def test_a_sensor_without_a_value_is_wrong(tmp_path, capsys) -> None:
 
 
 @pytest.mark.usefixtures("state")
-def test_the_command_to_type_names_the_description_that_was_given(tmp_path, capsys) -> None:
+def test_suggested_command_names_the_given_robot_file(tmp_path, capsys) -> None:
     with BenchRun(Config.load(EXAMPLE), tmp_path / "bus", faults=["baud@elbow_pitch"]) as run:
         called("doctor", "--robot", run.robot_file, "--json")
     wrong = [check for check in json.loads(capsys.readouterr().out)["checks"] if check["state"] == "wrong"]
@@ -104,7 +104,7 @@ def test_the_command_to_type_names_the_description_that_was_given(tmp_path, caps
 
 
 @pytest.mark.usefixtures("state")
-def test_a_ros_2_robot_whose_router_is_not_there_is_wrong(tmp_path, free_endpoint, capsys) -> None:
+def test_ros_2_robot_without_router_is_wrong(tmp_path, free_endpoint, capsys) -> None:
     text = EXAMPLE.with_name("robot.toml").read_text()
     text = text.replace('"desk_arm.urdf"', f'"{EXAMPLE.with_name("desk_arm.urdf")}"')
     (tmp_path / "robot.toml").write_text(f'{text}\n[drivers.ros2]\nrouter = "{free_endpoint()}"\n')
@@ -116,14 +116,14 @@ def test_a_ros_2_robot_whose_router_is_not_there_is_wrong(tmp_path, free_endpoin
 
 
 @pytest.mark.usefixtures("state")
-def test_a_port_that_is_not_there_is_told_once(capsys) -> None:
+def test_missing_port_is_reported_once(capsys) -> None:
     assert called("doctor", "--robot", EXAMPLE, "--json") == 1
     checks = json.loads(capsys.readouterr().out)["checks"]
     assert [check["subject"] for check in checks if check["state"] == "wrong"] == ["port of arm"]
 
 
 @pytest.mark.usefixtures("state")
-def test_the_running_sampler_tells_of_the_servos_itself(tmp_path, monkeypatch, capsys) -> None:
+def test_running_sampler_supplies_servo_findings(tmp_path, monkeypatch, capsys) -> None:
     with BenchRun(Config.load(EXAMPLE), tmp_path / "bus") as run:
         config = Config.load(run.robot_file)
         holder = Holder(4711, "/usr/bin/python -m bodyschema run sampler --robot robot.toml")
@@ -147,13 +147,13 @@ def status(complaint: str) -> SamplerStatus:
 
 
 @pytest.mark.parametrize(("known", "state"), [(True, "ok"), (None, "ok"), (False, "warning")])
-def test_a_clock_that_is_not_kept_right_is_a_warning(known, state) -> None:
+def test_unsynchronised_clock_is_a_warning(known, state) -> None:
     (check,) = doctor.clock_checks(lambda: known)
     assert check.state == state
 
 
 @pytest.mark.parametrize(("free_mib", "state"), [(100, "wrong"), (500, "warning"), (5000, "ok")])
-def test_a_disk_that_is_nearly_full_is_told(tmp_path, monkeypatch, free_mib, state) -> None:
+def test_nearly_full_disk_is_reported(tmp_path, monkeypatch, free_mib, state) -> None:
     usage = type("Usage", (), {"free": free_mib * 2**20})
     monkeypatch.setattr(doctor.shutil, "disk_usage", lambda _: usage)
     (check,) = doctor.disk_checks(tmp_path / "not" / "yet" / "there")
@@ -168,7 +168,7 @@ def test_a_disk_that_is_nearly_full_is_told(tmp_path, monkeypatch, free_mib, sta
         ("bodyschema-router.service", "install router"),
     ],
 )
-def test_a_unit_that_starts_an_older_version_is_to_be_installed_again(tmp_path, name, fix) -> None:
+def test_unit_of_older_version_must_be_reinstalled(tmp_path, name, fix) -> None:
     file = tmp_path / FOLDER / name
     file.parent.mkdir(parents=True)
     file.write_text("[Service]\nExecStart=\nExecStart=/opt/arm/bin/python -P -m daemon sampler --robot robot.toml\n")
@@ -176,7 +176,7 @@ def test_a_unit_that_starts_an_older_version_is_to_be_installed_again(tmp_path, 
     assert (told.state, str(file) in told.said, fix in told.fix) == ("wrong", True, True)
 
 
-def test_a_unit_of_this_version_is_not_told_of(tmp_path) -> None:
+def test_unit_of_current_version_is_not_reported(tmp_path) -> None:
     file = tmp_path / FOLDER / "bodyschema-sampler@.service"
     file.parent.mkdir(parents=True)
     file.write_text("[Service]\nExecStart=/opt/arm/bin/python -P -m bodyschema run sampler --robot robot.toml\n")
@@ -193,7 +193,7 @@ def test_a_process_that_answers_is_ok(endpoint) -> None:
         assert f"answers on {endpoint}" in doctor.zenoh_check("sampler", Route((endpoint,)), "x/alive").said
 
 
-def test_somebody_else_on_the_endpoint_is_wrong() -> None:
+def test_foreign_process_on_the_endpoint_is_wrong() -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
         server.listen()
@@ -239,23 +239,23 @@ def changed(file: Path, statement: str) -> Check:
     return check
 
 
-def test_a_sound_store_is_told_to_be_sound(stored) -> None:
+def test_sound_store_is_reported_as_sound(stored) -> None:
     (check,) = doctor.store_checks(stored)
     assert (check.state, check.said) == ("ok", f"all 5 pairs in {stored} are as they were written")
 
 
-def test_a_changed_pair_is_told_by_number(stored) -> None:
+def test_changed_pair_is_reported_by_number(stored) -> None:
     check = changed(stored, "UPDATE pairs SET q = '[0.3]' WHERE seq = 3")
     assert check.state == "warning"
     assert "1 pair of" in check.said
     assert "(number 3)" in check.said
 
 
-def test_a_changed_note_is_told(stored) -> None:
+def test_changed_note_is_reported(stored) -> None:
     assert "1 notes on runs or servos" in changed(stored, "UPDATE sessions SET host = 'there'").said
 
 
-def test_damaged_pages_are_told_with_what_mends_them(stored) -> None:
+def test_damaged_pages_are_reported_with_the_repair(stored) -> None:
     data = stored.read_bytes()
     page = data.index(b"here") // 4096
     stored.write_bytes(data[: page * 4096] + bytes(4096) + data[(page + 1) * 4096 :])

@@ -84,7 +84,7 @@ def test_no_reader_takes_a_file_without_end(tmp_path: Path, name: str, make: Cal
 
 
 @pytest.mark.parametrize("make", MADE)
-def test_no_image_is_read_from_a_file_without_end(tmp_path: Path, make: Callable[[Path], None]) -> None:
+def test_device_or_endless_file_yields_no_image(tmp_path: Path, make: Callable[[Path], None]) -> None:
     make(tmp_path / "a.png")
     assert read_image(tmp_path / "a.png") is None
 
@@ -98,7 +98,7 @@ def test_no_store_is_opened_where_something_else_is(tmp_path: Path, make: Callab
         pass
 
 
-def test_an_image_of_more_pixels_than_memory_is_none(tmp_path: Path) -> None:
+def test_image_with_too_many_pixels_is_not_read(tmp_path: Path) -> None:
     (tmp_path / "a.png").write_bytes(b"P6\n40000 40000\n255\n" + bytes(100))
     assert read_image(tmp_path / "a.png") is None
 
@@ -107,7 +107,7 @@ def test_an_image_of_more_pixels_than_memory_is_none(tmp_path: Path) -> None:
     ("make", "said"),
     [(a_device, "a device, not a file"), (a_pipe, "a pipe, not a file"), (a_sparse_file, "than 3 MiB")],
 )
-def test_it_is_said_why_a_file_is_not_read(tmp_path: Path, make: Callable[[Path], None], said: str) -> None:
+def test_unfit_file_error_names_the_reason(tmp_path: Path, make: Callable[[Path], None], said: str) -> None:
     make(tmp_path / "a")
     with pytest.raises(UnfitFile, match=said):
         read_at_most(tmp_path / "a", 3 * 2**20)
@@ -124,7 +124,7 @@ def test_it_is_said_why_a_file_is_not_read(tmp_path: Path, make: Callable[[Path]
         "a = [{ b" + ". b" * 200 + " = 1}]",
     ],
 )
-def test_a_key_of_many_parts_is_found_behind_quotes(tmp_path: Path, text: str) -> None:
+def test_excess_key_parts_behind_quotes_are_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "robot.toml").write_text(text)
     with pytest.raises(ConfigError, match="a key has more than 100 parts"):
         read_toml(tmp_path / "robot.toml")

@@ -31,7 +31,7 @@ NOMINAL = nominal_model()
         (resource.RLIM_INFINITY, resource.RLIM_INFINITY, None),
     ],
 )
-def test_the_limit_is_raised_as_far_as_it_may(
+def test_descriptor_limit_is_raised_within_hard_limit(
     monkeypatch: pytest.MonkeyPatch, soft: int, hard: int, then: int | None
 ) -> None:
     raised: list[object] = []
@@ -41,7 +41,7 @@ def test_the_limit_is_raised_as_far_as_it_may(
     assert raised == ([] if then is None else [(then, hard)])
 
 
-def test_too_low_a_limit_is_told_at_the_start(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_low_descriptor_limit_error_names_ulimit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(resource, "getrlimit", lambda _: (20, 20))
     with pytest.raises(ConfigError, match=r"may open 20 files and needs 64. `ulimit -n 1024` in the shell"):
         allow_enough_files()

@@ -50,7 +50,7 @@ def test_no_name_or_path_has_a_nul(tmp_path: Path, old: str, key: str) -> None:
     ("value", "said"),
     [("[1000000000, 1000000000]", "16384"), ("[640, 100000]", "16384"), ("[0, 480]", ">= 1"), ("[-640, 480]", ">= 1")],
 )
-def test_an_image_has_a_size_that_a_sensor_can_have(tmp_path: Path, value: str, said: str) -> None:
+def test_impossible_image_size_is_refused(tmp_path: Path, value: str, said: str) -> None:
     refused(tmp_path, "[640, 480]", value, rf"line \d+: camera.image_size_px: expected `int` .*{said}")
 
 
@@ -88,7 +88,7 @@ def in_folder(folder: Path) -> Config:
 
 
 @pytest.mark.parametrize("name", ["a\nExecStartPre=true", "a\rb", "a\tb", "a\x1bb", "a\u2028b", "a\udc80b"])
-def test_a_folders_name_adds_no_line_to_a_unit(tmp_path: Path, name: str) -> None:
+def test_control_character_in_unit_folder_is_refused(tmp_path: Path, name: str) -> None:
     config = in_folder(tmp_path / name)
     for make in (lambda: of_robot("sampler", config, "pi", HERE), lambda: of_host([config], "pi", HERE)):
         with pytest.raises(ConfigError, match="cannot stand in a unit of systemd"):

@@ -42,7 +42,7 @@ def servos(file: Path) -> dict[str, tuple[int, str]]:
     return {servo.joint: (servo.id, servo.model) for servo in table.servos}
 
 
-def test_the_joints_get_the_servos_in_the_order_of_their_ids(four, tmp_path, capsys) -> None:
+def test_joints_get_servos_in_order_of_id(four, tmp_path, capsys) -> None:
     new("--from", four, "--robot", tmp_path / "robot.toml", "--yes")
     assert list(servos(tmp_path / "robot.toml").items()) == list(
         zip(JOINTS, [(1, "XM430-W350"), (2, "XM430-W350"), (3, "XL330-M288"), (7, "MX-28")], strict=True)
@@ -56,7 +56,7 @@ def test_port_and_rate_are_those_of_the_scan(four, tmp_path) -> None:
     assert (bus.port, bus.baud) == ("/dev/ttyUSB0", 57600)
 
 
-def test_what_is_left_to_look_at_is_marked(four, tmp_path) -> None:
+def test_values_still_to_check_are_marked(four, tmp_path) -> None:
     new("--from", four, "--robot", tmp_path / "robot.toml", "--yes")
     text = (tmp_path / "robot.toml").read_text()
     assert "# CHECK each with `bodyschema watch joints`" in text
@@ -72,7 +72,7 @@ def test_it_asks_which_servo_moves_which_joint(four, tmp_path, monkeypatch) -> N
     assert Config.load(tmp_path / "robot.toml", {}).robot.joints == ("base_yaw", "shoulder_pitch", "wrist_roll")
 
 
-def test_joints_without_and_servos_too_many_are_told(tmp_path, capsys) -> None:
+def test_missing_and_surplus_servos_are_reported(tmp_path, capsys) -> None:
     new("--from", scan(tmp_path / "a", (1, "MX-28")), "--robot", tmp_path / "few.toml", "--yes")
     assert "wrist_roll: no servo, so it is not in joints" in capsys.readouterr().out
     many = scan(tmp_path / "b", *((id, "MX-28") for id in range(6)))
@@ -97,7 +97,7 @@ def test_a_file_is_not_replaced(four, tmp_path) -> None:
 
 
 @pytest.mark.parametrize(("text", "said"), [("{}", "is no scan"), ("nonsense", "is no scan"), (None, "cannot be read")])
-def test_a_file_that_is_no_scan_is_refused_with_the_command_that_writes_one(tmp_path, text, said) -> None:
+def test_invalid_scan_file_error_names_the_scan_command(tmp_path, text, said) -> None:
     if text is not None:
         (tmp_path / "found.json").write_text(text)
     with pytest.raises(ConfigError, match=f"{said}.*bodyschema scan --json"):
@@ -123,13 +123,13 @@ def test_servos_of_two_makes_make_no_arm(tmp_path) -> None:
     assert not (tmp_path / "robot.toml").exists()
 
 
-def test_a_servo_at_a_rate_that_robot_toml_cannot_name_is_not_used(tmp_path) -> None:
+def test_servo_at_unsupported_rate_is_not_used(tmp_path) -> None:
     found = scan(tmp_path / "found.json", (1, "MX-28"), baud=500_000)
     with pytest.raises(ConfigError, match="no servo was found that can be used"):
         new("--from", found, "--robot", tmp_path / "robot.toml", "--yes")
 
 
-def test_the_zero_of_a_model_is_told(tmp_path) -> None:
+def test_default_zero_of_a_model_is_written(tmp_path) -> None:
     new("--from", scan(tmp_path / "found.json", (1, "SCS0009")), "--robot", tmp_path / "robot.toml", "--yes")
     assert "# zero_ticks = 512 " in (tmp_path / "robot.toml").read_text()
 
@@ -142,7 +142,7 @@ def test_the_zero_of_a_model_is_told(tmp_path) -> None:
         ("feetech.toml", ["STS3215", "STS3250", "STS3215", "STS3215"]),
     ],
 )
-def test_the_servos_of_a_bench_are_found_and_written(file, models, tmp_path) -> None:
+def test_bench_servos_are_found_and_written(file, models, tmp_path) -> None:
     with BenchRun(Config.load(EXAMPLE / file, {}), tmp_path / "bus"):
         new("--port", tmp_path / "bus", "--baud", 1000000, "--robot", tmp_path / "robot.toml", "--yes")
     assert [model for _, model in servos(tmp_path / "robot.toml").values()] == models

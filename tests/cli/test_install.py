@@ -51,7 +51,7 @@ def test_without_yes_it_asks(tmp_path, monkeypatch, answer, written) -> None:
     assert (tmp_path / FILE).exists() == written
 
 
-def test_rules_that_are_there_are_left_as_they_are(tmp_path, capsys) -> None:
+def test_existing_udev_rules_are_left_unchanged(tmp_path, capsys) -> None:
     install("--yes", "--root", tmp_path)
     install("--root", tmp_path)
     assert "there already" in capsys.readouterr().out
@@ -71,14 +71,14 @@ def test_a_dry_run_of_uninstall_removes_nothing(tmp_path) -> None:
     assert (tmp_path / FILE).exists()
 
 
-def test_udev_takes_the_rules_in_on_this_machine_alone(tmp_path) -> None:
+def test_rules_under_another_root_do_not_reload_udev(tmp_path) -> None:
     ran: list[object] = []
     rules_file = UdevRules(tmp_path, ran.append)
     rules_file.install(rules_file.texts())
     assert ran == []
 
 
-def test_a_file_that_cannot_be_written_names_the_command(tmp_path, monkeypatch) -> None:
+def test_unwritable_rules_file_error_names_sudo_command(tmp_path, monkeypatch) -> None:
     (tmp_path / "etc").write_text("no folder")
     monkeypatch.setattr(machine_files.os, "geteuid", lambda: 1000)
     with pytest.raises(ConfigError, match=r"sudo .* install udev --yes$"):

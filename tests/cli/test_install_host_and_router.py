@@ -90,7 +90,7 @@ def test_systemd_finds_the_learner_of_several_in_order(tmp_path, robots) -> None
     assert_in_order(tmp_path, "bodyschema-learner@lab.service")
 
 
-def test_no_sampler_is_installed_with_the_learner_of_several(tmp_path, robots) -> None:
+def test_shared_learner_installs_no_sampler(tmp_path, robots) -> None:
     install("service", "--robot", robots, "--user", "daemon", "--yes", "--root", tmp_path)
     assert not list((tmp_path / FOLDER).glob("bodyschema-sampler*"))
     with pytest.raises(ConfigError, match="each robot has a sampler of its own"):
@@ -110,7 +110,7 @@ def test_a_robot_is_not_given_a_second_learner(tmp_path, robots) -> None:
         install(*alone)
 
 
-def test_the_learner_of_several_is_not_called_like_one_of_them(tmp_path, robots) -> None:
+def test_shared_learner_rejects_the_name_of_a_robot(tmp_path, robots) -> None:
     with pytest.raises(ConfigError, match="left is one of the robots"):
         install("service", "--robot", robots, "--name", "left", "--user", "daemon", "--yes", "--root", tmp_path)
 
@@ -124,7 +124,7 @@ def test_uninstall_removes_the_learner_of_several(tmp_path, robots) -> None:
 # --- the router
 
 
-def test_the_router_is_started_with_its_file_and_sees_its_certificates(tmp_path, router_file) -> None:
+def test_router_unit_runs_and_mounts_its_file(tmp_path, router_file) -> None:
     install("router", router_file, "--user", "daemon", "--yes", "--root", tmp_path)
     unit = (tmp_path / FOLDER / "bodyschema-router.service").read_text("utf-8")
     assert values(unit, "ExecStart")[0].endswith(f"router {router_file}")
@@ -155,7 +155,7 @@ def test_uninstall_removes_the_router_and_needs_no_file(tmp_path, router_file, c
     assert "has installed nothing here" in capsys.readouterr().out
 
 
-def test_the_router_s_unit_in_deploy_is_the_one_that_is_written(router_file) -> None:
+def test_shipped_router_unit_matches_the_generated_unit(router_file) -> None:
     etc = Path("/etc/bodyschema")
     config = RouterConfig(etc / "router.toml", RouterConfig.load(router_file).tables, Identity(etc / "ca.pem"))
     shown = (ROOT / "deploy" / "systemd" / "bodyschema-router.service").read_text(encoding="utf-8")

@@ -103,7 +103,7 @@ def test_the_sandbox_leaves_little_exposed(tmp_path, config, process) -> None:
 
 @analyze
 @pytest.mark.parametrize("process", PROCESSES)
-def test_it_does_also_where_the_other_process_is_on_another_machine(tmp_path, config, process) -> None:
+def test_sandbox_exposure_stays_low_with_remote_peer(tmp_path, config, process) -> None:
     zenoh = config.tables.zenoh.__class__(sampler="tcp/192.0.2.1:7447")
     tables = config.tables.__class__(**{**_fields(config.tables), "zenoh": zenoh})
     written(tmp_path, config.with_tables(tables))
@@ -119,14 +119,14 @@ def values(text: str, key: str) -> list[str]:
     return re.findall(rf"^{key}=(.*)$", text, re.MULTILINE)
 
 
-def test_the_sampler_may_open_the_named_ports_and_cameras_and_nothing_else(config) -> None:
+def test_sampler_opens_only_configured_ports_and_cameras(config) -> None:
     own = of_robot("sampler", config, "daemon", HERE)
     assert values(own, "DeviceAllow") == [f"{PORT} rw", f"{EYES[0]} rw", f"{EYES[1]} rw"]
     assert values(template("sampler", HERE), "DevicePolicy") == ["closed"]
     assert values(template("sampler", HERE), "DeviceAllow") == []
 
 
-def test_what_a_driver_of_another_package_opens_or_hears_is_allowed_to_the_sampler_alone(config) -> None:
+def test_only_sampler_may_use_plugin_devices_and_network(config) -> None:
     plugin = PluginConfig("field_bus", devices=("/dev/field_bus0",), network=True)
     drivers = config.tables.drivers.__class__(plugin=plugin)
     config = config.with_tables(config.tables.__class__(**{**_fields(config.tables), "drivers": drivers}))
@@ -142,17 +142,17 @@ def test_the_learner_may_open_no_device(config) -> None:
     assert values(template("learner", HERE), "PrivateDevices") == ["yes"]
 
 
-def test_a_port_that_is_no_device_needs_no_rule(tmp_path) -> None:
+def test_port_without_device_node_needs_no_rule(tmp_path) -> None:
     robot = write_small_arm(tmp_path, STEREO + HARDWARE.replace(PORT, "./bus"))
     assert devices_of(Config.load(robot, {})) == list(EYES)
 
 
-def test_nobody_outside_this_machine_is_reached_while_all_endpoints_are_on_it(config) -> None:
+def test_local_endpoints_allow_no_remote_address(config) -> None:
     assert values(template("sampler", HERE), "IPAddressDeny") == ["any"]
     assert values(of_robot("sampler", config, "daemon", HERE), "IPAddressAllow") == []
 
 
-def test_certificates_are_seen_and_the_router_on_another_machine_is_reached(config) -> None:
+def test_remote_router_is_allowed_and_certificates_mounted(config) -> None:
     zenoh = ZenohConfig(router="tls/192.0.2.1:7447", tls=TlsConfig(ca="/home/pi/keys/ca.pem"))
     tables = config.tables.__class__(**{**_fields(config.tables), "zenoh": zenoh})
     own = of_robot("learner", config.with_tables(tables), "daemon", HERE)
@@ -160,25 +160,25 @@ def test_certificates_are_seen_and_the_router_on_another_machine_is_reached(conf
     assert values(own, "IPAddressAllow") == ["any"]
 
 
-def test_what_a_home_holds_is_seen_as_far_as_it_is_needed() -> None:
+def test_only_needed_home_folders_are_visible() -> None:
     folders = ["/home/pi/arm/.venv", "/home/pi/arm", "/usr/lib", "/opt/arm", "/root/.pyenv/versions/3.11"]
     assert hidden(map(Path, folders)) == [Path("/home/pi/arm"), Path("/root/.pyenv/versions/3.11")]
 
 
-def test_a_state_dir_of_one_s_own_can_be_written(tmp_path) -> None:
+def test_custom_state_dir_is_writable(tmp_path) -> None:
     robot = write_small_arm(tmp_path, '[daemon]\nstate_dir = "/srv/pairs of 100 %"\n')
     own = of_robot("sampler", Config.load(robot, {}), "daemon", HERE)
     assert values(own, "ReadWritePaths") == ['"-/srv/pairs of 100 %%"']
 
 
-def test_a_new_systemd_starts_a_service_that_fails_again_less_and_less_often() -> None:
+def test_new_systemd_gets_growing_restart_delays() -> None:
     new = replace(HERE, systemd=254)
     assert values(template("sampler", new), "RestartSteps") == ["6"]
     assert values(template("sampler", HERE), "RestartSteps") == []  # 252 would complain of it
 
 
 @pytest.mark.parametrize("process", PROCESSES)
-def test_the_units_in_deploy_are_those_that_are_written(process) -> None:
+def test_shipped_units_match_the_generated_units(process) -> None:
     shown = (ROOT / "deploy" / "systemd" / f"bodyschema-{process}@.service").read_text(encoding="utf-8")
     assert shown == template(process, Installed(("/opt/bodyschema/bin/bodyschema",), (), 252))
 
@@ -193,7 +193,7 @@ def test_documented_patterns_of_units_end_in_service() -> None:
 # --- the command
 
 
-def test_yes_writes_the_units_and_says_how_to_start_them(tmp_path, robot, capsys) -> None:
+def test_yes_writes_units_and_prints_start_command(tmp_path, robot, capsys) -> None:
     install("--robot", robot, "--user", "daemon", "--yes", "--root", tmp_path)
     assert len(ServiceFiles("arm", root=tmp_path).installed()) == 4
     enable = "sudo systemctl enable --now bodyschema-sampler@arm.service bodyschema-learner@arm.service"
@@ -219,7 +219,7 @@ def test_installing_makes_the_state_dir(tmp_path, robot) -> None:
         assert folder.owner() == folder.parent.owner() == "daemon"
 
 
-def test_units_that_are_there_are_left_as_they_are(tmp_path, robot, capsys) -> None:
+def test_existing_units_are_left_unchanged(tmp_path, robot, capsys) -> None:
     for _ in range(2):
         install("--robot", robot, "--user", "daemon", "--yes", "--root", tmp_path)
     assert "All of it is there already" in capsys.readouterr().out
@@ -267,24 +267,24 @@ def test_a_robot_without_hardware_is_refused(tmp_path) -> None:
     ("user", "said"),
     [("root", "is not to run as root"), ("nobody", "is not to run as nobody"), ("gnome", "no user 'gnome'")],
 )
-def test_who_the_service_is_to_run_as_has_to_be_a_user_and_not_root(user, said) -> None:
+def test_service_user_must_exist_and_not_be_root(user, said) -> None:
     with pytest.raises(ConfigError, match=said):
         user_for(user)
 
 
-def test_the_service_is_that_of_who_called_sudo(monkeypatch) -> None:
+def test_service_runs_as_the_sudo_user(monkeypatch) -> None:
     monkeypatch.setenv("SUDO_USER", "daemon")
     assert user_for(None) == "daemon"
 
 
-def test_systemd_is_told_on_this_machine_alone(tmp_path, config) -> None:
+def test_systemd_is_reloaded_on_this_machine_alone(tmp_path, config) -> None:
     ran: list[object] = []
     ServiceFiles("arm", root=tmp_path, run=ran.append).install({})
     ServiceFiles("arm", run=ran.append).install({})
     assert ran == [("systemctl", "daemon-reload")]
 
 
-def test_a_folder_that_cannot_be_written_names_the_command(tmp_path, config, monkeypatch) -> None:
+def test_unwritable_unit_folder_error_names_sudo_command(tmp_path, config, monkeypatch) -> None:
     (tmp_path / "etc").write_text("no folder")
     monkeypatch.setattr(machine_files.os, "geteuid", lambda: 1000)
     with pytest.raises(ConfigError, match=r"sudo .* install service --yes$"):

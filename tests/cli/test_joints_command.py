@@ -44,7 +44,7 @@ def signs(config: Config, *path: tuple[int, float], begin=(0.0, 0.0, 0.5, 0.0)) 
     return check.said
 
 
-def test_a_raised_arm_is_said_to_go_where_the_urdf_says(config) -> None:
+def test_raised_arm_is_reported_in_urdf_direction(config) -> None:
     chain, q = config.robot.chain, np.array([0.0, 0.0, 0.5, 0.0])
     up = q.copy()
     up[PITCH] += 0.3
@@ -62,11 +62,11 @@ def test_turned_back_it_goes_the_other_way(config) -> None:
     assert {there.split("went ")[1].split()[0], back.split("went ")[1].split()[0]} == {"left", "right"}
 
 
-def test_after_a_rest_the_next_joint_is_told(config) -> None:
+def test_next_joint_is_reported_after_a_rest(config) -> None:
     assert signs(config, (YAW, 0.5), (ELBOW, -0.2)).startswith("elbow_pitch -11°")
 
 
-def test_a_joint_that_does_not_move_the_marker_is_told_by_its_turn(config) -> None:
+def test_joint_not_moving_marker_is_reported_by_rotation(config) -> None:
     assert (
         signs(config, (ROLL, 0.5))
         == "wrist_roll +29°: by the URDF it turned counter-clockwise, its axis pointing at you"
@@ -133,7 +133,7 @@ def test_once_gives_one_line_of_json(file, ids, tmp_path, capsys) -> None:
     ]
 
 
-def test_the_speed_of_encoders_that_do_not_tell_it_is_that_of_their_angles() -> None:
+def test_missing_encoder_speed_is_derived_from_angles() -> None:
     speeds = Speeds(1)
     for k in range(100):
         speeds.take(0.01 * k, np.array([0.3 * 0.01 * k]))
@@ -160,12 +160,12 @@ def test_the_screen_shows_a_joint_in_degrees() -> None:
     assert len(row.rstrip()) <= 80
 
 
-def test_the_screen_says_what_moved_and_what_to_do() -> None:
+def test_screen_shows_marker_motion_and_remedy() -> None:
     assert "the marker went up" in shown()
     assert "direction = -1" in shown()
 
 
-def test_signs_of_a_ros_2_robot_are_not_in_our_keys() -> None:
+def test_ros_2_advice_names_no_servo_keys() -> None:
     said = signs_in(is_ros2=True, is_plugin=False)
     text = " ".join(shown(said, high=1.4, within_limits=False).split())
     assert "[drivers.ros2.names] or the URDF" in text
@@ -173,17 +173,17 @@ def test_signs_of_a_ros_2_robot_are_not_in_our_keys() -> None:
     assert "zero_ticks" not in text
 
 
-def test_what_is_not_measured_is_a_dash() -> None:
+def test_unmeasured_value_is_a_dash() -> None:
     row = next(line for line in shown(current=None, temperature_c=None).splitlines() if line.startswith("elbow "))
     assert row.split()[4:6] == ["-", "-"]
 
 
-def test_an_angle_beyond_the_limits_is_told() -> None:
+def test_angle_beyond_the_limits_is_reported() -> None:
     assert "elbow was from +0° to +80°, its limits are -57° to +57°" in shown(high=1.4, within_limits=False)
 
 
 @pytest.mark.usefixtures("patient_host")
-def test_one_table_tells_what_is_wrong_with_any_servo(tmp_path, capsys) -> None:
+def test_watch_reports_an_overloaded_servo(tmp_path, capsys) -> None:
     with BenchRun(Config.load(EXAMPLE), tmp_path / "bus", faults=["overload@wrist_roll"]) as run:
         app(["watch", "joints", "--robot", str(run.robot_file), "--once", "--json"], result_action="return_value")
     (complaint,) = json.loads(capsys.readouterr().out)["health"]

@@ -29,28 +29,28 @@ def seen(folder: Path, every: int) -> Sources:
     return walk.sources(fixes=steps)
 
 
-def test_where_the_marker_is_often_missed_it_is_said_why(tmp_path) -> None:
+def test_often_missed_marker_is_reported_with_reason(tmp_path) -> None:
     found = collected(seen(tmp_path, 2), 5.0, lambda _: None)
     assert found.said == "the marker was found in 20 of 40 images: 20 at border"
 
 
-def test_nothing_is_said_of_a_marker_that_is_found(tmp_path) -> None:
+def test_found_marker_causes_no_complaint(tmp_path) -> None:
     assert collected(seen(tmp_path, 1), 5.0, lambda _: None).said == ""
 
 
-def test_a_marker_that_is_never_found_is_named_with_the_reasons(tmp_path) -> None:
+def test_never_found_marker_error_names_the_reasons(tmp_path) -> None:
     with pytest.raises(LatencyError, match="found in none of 40 images: 40 at border"):
         collected(seen(tmp_path, 1000), 5.0, lambda _: None)
 
 
-def test_encoders_that_are_lost_are_told_with_what_to_do(tmp_path) -> None:
+def test_lost_encoders_error_names_cause_and_remedy(tmp_path) -> None:
     walk = Walk(RobotDescription.load(write_small_arm(tmp_path)), 40)
     lost = walk.sources(readings=[*walk.readings[:20], SourceLost("joint 'waist' (ID 1): a garbled answer")])
     with pytest.raises(LatencyError, match=r"lost while the arm was moved \(joint 'waist' .* answer\). Try again"):
         collected(lost, 5.0, lambda _: None)
 
 
-def test_a_recording_and_the_simulation_are_not_both_taken(tmp_path) -> None:
+def test_recording_and_simulation_exclude_each_other(tmp_path) -> None:
     words = ["calibrate", "latency", str(tmp_path / "w.csv"), "--sim", "--robot", str(write_small_arm(tmp_path))]
     with pytest.raises(BodyschemaError, match="not both"):
         app(words, exit_on_error=False, result_action="return_value")
@@ -93,7 +93,7 @@ BOTH = "latency_s = 0.0341\nlatency_sigma_s = 0.0012\n"
 
 
 @pytest.mark.usefixtures("known")
-def test_without_a_table_of_cameras_the_values_are_told(tmp_path, capsys) -> None:
+def test_missing_camera_table_prints_values_for_manual_entry(tmp_path, capsys) -> None:
     file = measured_by(tmp_path, "")
     out = capsys.readouterr().out
     assert BOTH in out

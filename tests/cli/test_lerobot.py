@@ -173,7 +173,7 @@ def test_dynamixel_offsets_correct_the_readings(inverted, tmp_path) -> None:
     assert math.degrees(readings[1] - readings[0]) == pytest.approx(3.0, abs=0.05)
 
 
-def test_offsets_stay_within_what_a_servo_keeps() -> None:
+def test_offsets_stay_within_the_servo_s_range() -> None:
     moved = [MotorCalibration(1, 0, offset, 0, 4095).moved(100, "feetech").homing_offset for offset in (-2040, 0, 7)]
     assert moved == [-2040 - 100 + 4096, -100, -93]
 
@@ -201,7 +201,7 @@ def test_calibrate_shows_the_difference_and_writes_nothing(tmp_path, capsys) -> 
 
 
 @pytest.mark.parametrize(("arm", "warned"), [("follower", False), ("leader", True)])
-def test_a_calibration_with_other_zeros_is_told(arm, warned, tmp_path, capsys) -> None:
+def test_calibration_with_other_zeros_is_reported(arm, warned, tmp_path, capsys) -> None:
     planted(tmp_path / "r.csv", robot_of("follower", tmp_path / "robot.toml"))
     calibrate(tmp_path / "r.csv", "--lerobot", SO101 / f"{arm}.json")
     said = capsys.readouterr().out
@@ -209,7 +209,7 @@ def test_a_calibration_with_other_zeros_is_told(arm, warned, tmp_path, capsys) -
 
 
 @pytest.mark.parametrize("command", ["calibrate", "diagnose"])
-def test_a_wrong_calibration_is_told_before_the_recording_is_read(command, tmp_path) -> None:
+def test_missing_calibration_fails_before_recording_is_read(command, tmp_path) -> None:
     robot_of("follower", tmp_path / "robot.toml")
     (tmp_path / "r.csv").write_text("unread")
     words = [command, str(tmp_path / "r.csv"), "--lerobot", str(tmp_path / "none.json")]

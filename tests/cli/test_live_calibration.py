@@ -102,7 +102,7 @@ def test_it_ends_by_itself_when_nothing_is_missing(views) -> None:
 
 
 @pytest.mark.soak
-def test_serials_that_are_given_come_before_those_of_the_cameras(views) -> None:
+def test_given_serials_override_those_of_the_cameras(views) -> None:
     seen, frames = held(views)
     found, _ = live(PluggedEyes(frames), seen).run()
     assert calibrated(found, KnownCameras(left_serial="L", lens="pinhole"), lambda _: None, RIGHT).rig.serials == (
@@ -111,7 +111,7 @@ def test_serials_that_are_given_come_before_those_of_the_cameras(views) -> None:
     )
 
 
-def test_a_refusal_is_shown_and_views_are_taken_on(views) -> None:
+def test_refused_calibration_is_shown_and_capture_continues(views) -> None:
     shown: list[Shown] = []
     tries: list[int] = []
 
@@ -127,7 +127,7 @@ def test_a_refusal_is_shown_and_views_are_taken_on(views) -> None:
     assert any(each.refusal == "the left focal length is known to 2 % only" for each in shown)
 
 
-def test_stopping_makes_the_calibration_of_what_there_is(views) -> None:
+def test_stopping_calibrates_from_the_views_so_far(views) -> None:
     seen, frames = held(views)
     eyes = PluggedEyes(frames)
 
@@ -140,7 +140,7 @@ def test_stopping_makes_the_calibration_of_what_there_is(views) -> None:
     assert (len(found.views), result.rig.made.views) == (10, 10)
 
 
-def test_stopping_too_early_says_what_is_missing(views) -> None:
+def test_stopping_too_early_names_missing_views(views) -> None:
     seen, frames = held(views, range(3))
     with pytest.raises(CalibrationError, match="too few views: both eyes saw the board in 3, at least 8"):
         live(PluggedEyes(frames), seen).run()
@@ -152,7 +152,7 @@ def test_cameras_that_saw_no_board_say_so() -> None:
         live(PluggedEyes(frames), seen).run()
 
 
-def test_views_survive_cameras_that_are_unplugged_on_the_way(views, impatient) -> None:
+def test_views_survive_unplugged_cameras(views, impatient) -> None:
     shown: list[Shown] = []
     seen, frames = held(views, range(10))
     eyes = PluggedEyes([*frames[:9], SourceLost("the left camera is gone"), *frames[9:]])
@@ -162,7 +162,7 @@ def test_views_survive_cameras_that_are_unplugged_on_the_way(views, impatient) -
     assert any("the cameras are lost (the left camera is gone)" in text for each in shown for text in each.trouble)
 
 
-def test_other_cameras_that_are_plugged_in_on_the_way_are_refused(views, impatient) -> None:
+def test_different_cameras_plugged_in_midway_are_refused(views, impatient) -> None:
     shown: list[Shown] = []
     seen, frames = held(views, range(10))
     eyes = PluggedEyes([*frames[:8], SourceLost("unplugged"), *frames[8:]], [RIGHT, ("A1", "C3"), RIGHT])
@@ -198,7 +198,7 @@ def text_of(shown: Shown, width: int = 80) -> str:
     return console.export_text()
 
 
-def test_the_screen_says_what_to_show_next_and_what_was_seen(views) -> None:
+def test_screen_shows_the_next_and_the_taken_view(views) -> None:
     text = text_of(shown_of(views, 2))
     assert "Next: tilt the board's" in text
     assert "Now:  taken: view 1" in text
@@ -211,7 +211,7 @@ def test_the_screen_fits_a_terminal_of_80_columns(views) -> None:
     assert len(text_of(shown).splitlines()) < 24
 
 
-def test_lines_tell_each_view_and_do_not_repeat_themselves(views) -> None:
+def test_lines_report_each_view_without_repetition(views) -> None:
     said: list[str] = []
     lines = Lines(said.append, SystemClock())
     shown = shown_of(views, 2)
@@ -222,7 +222,7 @@ def test_lines_tell_each_view_and_do_not_repeat_themselves(views) -> None:
     assert said[1:] == ["hold it still"]
 
 
-def test_lines_do_not_repeat_a_complaint_after_each_view(views) -> None:
+def test_lines_report_a_complaint_only_once(views) -> None:
     said: list[str] = []
     lines = Lines(said.append, SystemClock())
     for k in (2, 4):
@@ -239,7 +239,7 @@ def test_where_there_is_no_terminal_lines_are_printed(views, capsys) -> None:
 # --- the check
 
 
-def test_the_check_waits_until_the_board_is_held_still(views, tmp_path) -> None:
+def test_check_waits_until_the_board_is_still(views, tmp_path) -> None:
     rig = known_rig(webcams(np.random.default_rng(21)))
     write_rig(rig, tmp_path / "cameras.toml")
     nothing = View("nothing", None, None)

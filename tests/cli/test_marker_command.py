@@ -24,7 +24,7 @@ def printed(capsys: pytest.CaptureFixture[str]) -> VisionConfig:
     return msgspec.convert(tomllib.loads(capsys.readouterr().out)["vision"], VisionConfig)
 
 
-def test_the_colour_of_a_ball_that_moves_before_the_robots_own_cameras_is_learnt(tmp_path, capsys) -> None:
+def test_colour_of_moving_ball_is_learnt_automatically(tmp_path, capsys) -> None:
     for k in range(8):
         image = np.full((120, 160, 3), 120, np.uint8)
         cv2.circle(image, (20 + 15 * k, 60), 12, (30, 200, 30), -1, cv2.LINE_AA)
@@ -42,7 +42,7 @@ def test_a_click_needs_an_image(tmp_path) -> None:
         called("marker", "learn", "--at", 3, 4)
 
 
-def test_the_tables_of_a_printed_cube_are_those_of_its_size_on_paper(tmp_path, capsys) -> None:
+def test_printed_cube_tables_use_its_size_on_paper(tmp_path, capsys) -> None:
     called(
         "marker", "print", "--shape", "cube", "--ids", "3-8", "--out", tmp_path / "cube.pdf", "--ruler-mm", 0.98 * 210
     )
@@ -56,7 +56,7 @@ def test_the_tables_of_a_printed_cube_are_those_of_its_size_on_paper(tmp_path, c
     ("ids", "said"),
     [("5", "both rulers: each is 50 mm."), ("0-5", "both rulers: 160 mm below the picture, 110 mm beside it.")],
 )
-def test_what_to_measure_on_the_print_is_said(ids, said, tmp_path, capsys) -> None:
+def test_lengths_to_measure_on_the_print_are_named(ids, said, tmp_path, capsys) -> None:
     called("marker", "print", "--ids", ids, "--out", tmp_path / "tags.svg")
     assert said in capsys.readouterr().err
 

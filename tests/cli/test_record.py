@@ -70,7 +70,7 @@ def record(*arguments: object) -> None:
     app(["record", *map(str, arguments)], result_action="return_value")
 
 
-def test_numbers_that_are_missing_are_told(sampler, robot, tmp_path, capsys) -> None:
+def test_missing_pair_numbers_are_reported(sampler, robot, tmp_path, capsys) -> None:
     sampler.pairs = [pair(seq) for seq in (3, 4, 7, 8, 10)]
     record(tmp_path / "a.csv", "--robot", robot)
     assert "3 pairs between them are missing (numbers 5 to 6, 9)" in capsys.readouterr().out
@@ -88,7 +88,7 @@ def test_all_pages_of_the_history_are_copied_exactly(sampler, robot, tmp_path, e
     assert "number 5" in capsys.readouterr().out
 
 
-def test_copying_begins_where_it_is_told(sampler: FakeSampler, robot: Path, tmp_path: Path) -> None:
+def test_copying_begins_at_the_requested_pair(sampler: FakeSampler, robot: Path, tmp_path: Path) -> None:
     sampler.pairs = [pair(seq) for seq in range(1, 6)]
     record(tmp_path / "a.csv", "--robot", robot, "--from", 4)
     recording = Recording.read(tmp_path / "a.csv", JOINTS)
@@ -173,7 +173,7 @@ def test_another_store_is_not_mixed_in(history: History, sampler: FakeSampler, t
         history.page()
 
 
-def test_a_followed_recording_ends_in_order_on_a_signal(sampler: FakeSampler, robot: Path, tmp_path: Path) -> None:
+def test_followed_recording_ends_cleanly_on_sigint(sampler: FakeSampler, robot: Path, tmp_path: Path) -> None:
     sampler.pairs = [pair(1)]
     command = [sys.executable, "-m", "bodyschema", "record", str(tmp_path / "a.csv"), "--robot", str(robot), "--follow"]
     environment = os.environ | {"PYTHONUNBUFFERED": "1"}

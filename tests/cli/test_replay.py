@@ -87,12 +87,12 @@ def job(folder: Path, recording: Recording, sigma_m: float | None) -> Job:
     return Job(Config.load(write_small_arm(folder)), recording, split, None, sigma_m, any_step=True, folder=folder)
 
 
-def test_noise_that_only_the_command_states_counts_in_the_judgement(tmp_path: Path) -> None:
+def test_command_noise_applies_without_recorded_noise(tmp_path: Path) -> None:
     assert job(tmp_path, poses(), 3e-5).noise_m == 3e-5
     assert job(tmp_path, poses(), None).noise_m == 0.0
 
 
-def test_noise_that_the_recording_states_goes_before_that_of_the_command(tmp_path: Path) -> None:
+def test_recorded_noise_overrides_command_noise(tmp_path: Path) -> None:
     recording = replace(poses(), cov=np.tile(4e-6 * np.eye(3), (40, 1, 1)))
     np.testing.assert_allclose(job(tmp_path, recording, 3e-5).noise_m, np.full((12, 3), 2e-3))
 
@@ -115,7 +115,7 @@ def test_without_robot_toml_the_remedy_is_named(tmp_path: Path) -> None:
         replay(tmp_path / "a.csv", "--robot", tmp_path / "robot.toml")
 
 
-def test_an_unreadable_recording_ends_with_exit_code_1_and_one_line(tmp_path: Path, robot: Path) -> None:
+def test_unreadable_recording_exits_1_with_one_line(tmp_path: Path, robot: Path) -> None:
     source = tmp_path / "a.csv"
     source.write_text("waist,shoulder,x,y,z\n0,0,1,2,3\n0,0,1,,3\n")
     before = sorted(tmp_path.iterdir())
@@ -170,7 +170,7 @@ def test_the_report_is_wrapped_to_the_terminal() -> None:
     assert max(map(len, as_text(report(), 200).splitlines())) > 80
 
 
-def test_the_report_says_that_the_errors_have_the_measurements_noise() -> None:
+def test_report_states_that_errors_include_measurement_noise() -> None:
     said = " ".join(as_text(report()).split())
     assert "the errors above count the noise of the measurements" in said
     assert (
@@ -178,7 +178,7 @@ def test_the_report_says_that_the_errors_have_the_measurements_noise() -> None:
     )
 
 
-def test_the_report_says_how_far_orientations_are_off_where_there_are_any() -> None:
+def test_report_states_orientation_errors_where_present() -> None:
     angle = AngleFigures.of(np.radians([0.1, 0.1, 0.4]), np.radians(0.05))
     said = " ".join(as_text(report(angle=angle)).split())
     assert "orientation on the held-out rows: mean 0.200°, median 0.100°" in said
@@ -191,7 +191,7 @@ def test_a_doubt_about_the_recording_is_a_warning() -> None:
 
 
 @pytest.mark.soak
-def test_a_guided_recording_is_learnt_by_the_two_processes(tmp_path: Path, robot: Path) -> None:
+def test_two_processes_learn_a_guided_recording(tmp_path: Path, robot: Path) -> None:
     guided(robot).write_csv(tmp_path / "a.csv")
     ended = command_line(tmp_path / "a.csv", "--json", "--speed", 0, "--keep", tmp_path / "kept")
     assert ended.returncode == 0, ended.stderr
@@ -233,7 +233,7 @@ def test_ending_the_replay_ends_its_two_processes(tmp_path: Path, robot: Path) -
 
 @pytest.mark.skipif(not REAL_DATA.is_dir(), reason=NO_REAL_DATA)
 @pytest.mark.soak
-def test_a_real_eye_in_hand_recording_is_learnt_in_a_frame_that_nobody_knew() -> None:
+def test_real_eye_in_hand_recording_learns_unknown_frame() -> None:
     folder = REAL_DATA / "panda_eyeinhand"
     ended = command_line(folder / "measured.csv", "--any-step", "--json", "--sigma-mm", 1, "--speed", 1)
     assert ended.returncode == 0, ended.stderr
@@ -248,7 +248,7 @@ def test_a_real_eye_in_hand_recording_is_learnt_in_a_frame_that_nobody_knew() ->
 @pytest.mark.skipif(not REAL_DATA.is_dir(), reason=NO_REAL_DATA)
 @pytest.mark.parametrize("name", ["panda_eyeinhand", "ur5_laser", "wam_laser", "ur10_laser_a", "ur10_laser_b"])
 @pytest.mark.timeout(900)
-def test_real_recordings_are_predicted_better_than_by_the_aligned_model(name: str) -> None:
+def test_learner_beats_aligned_model_on_real_recordings(name: str) -> None:
     ended = command_line(REAL_DATA / name / "measured.csv", "--any-step", "--json")
     assert ended.returncode == 0, ended.stderr
     report = json.loads(ended.stdout)

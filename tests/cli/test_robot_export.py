@@ -69,7 +69,7 @@ def rms_mm(told: str) -> list[float]:
     return [float(line.split("│")[2]) for line in told.splitlines() if line.count("│") > 3]
 
 
-def test_gain_of_a_correction_is_that_of_its_reader(extended, measured, tmp_path, capsys) -> None:
+def test_correction_gain_matches_the_example_reader(extended, measured, tmp_path, capsys) -> None:
     export(extended, tmp_path / "correction.json", "--measured", measured)
     told = capsys.readouterr().out
     recording = Recording.read(measured, load_simulation(extended).robot.joints)
@@ -83,7 +83,7 @@ def test_gain_of_a_correction_is_that_of_its_reader(extended, measured, tmp_path
     assert rms_mm(told)[2] > 0.0  # the play of the first row is known to the simulation alone
 
 
-def test_gain_of_a_correction_is_read_from_the_file(extended, measured, tmp_path, capsys, monkeypatch) -> None:
+def test_correction_gain_is_computed_from_the_file(extended, measured, tmp_path, capsys, monkeypatch) -> None:
     def spoilt(simulation: Simulation, file: Path, heading: str, covariance: object) -> list[str]:
         return write_correction(Simulation(simulation.robot), file, heading)
 
@@ -93,7 +93,7 @@ def test_gain_of_a_correction_is_read_from_the_file(extended, measured, tmp_path
     assert own == nominal
 
 
-def test_the_covariance_of_a_diagnosis_is_in_its_correction(extended, tmp_path, capsys) -> None:
+def test_correction_contains_the_covariance_of_the_diagnosis(extended, tmp_path, capsys) -> None:
     export(extended, tmp_path / "without.json")
     assert "not in it: the pose's covariance" in " ".join(capsys.readouterr().out.split())
     covariance = np.eye(6).ravel().tolist()
@@ -114,7 +114,7 @@ def test_gain_of_settings_of_drivers_is_printed(extended, measured, tmp_path, ca
     assert "zeros and scales of drivers.txt" in told
 
 
-def test_a_jump_of_an_encoder_is_a_zero_of_the_drivers_afterwards(extended, measured, tmp_path, capsys) -> None:
+def test_encoder_jump_exports_as_driver_zero(extended, measured, tmp_path, capsys) -> None:
     export(extended, tmp_path / "drivers.txt", "--measured", measured)
     as_offset = rms_mm(capsys.readouterr().out)
     text = extended.read_text().replace('"joint_offset"', '"encoder_jump"')
@@ -139,7 +139,7 @@ def test_small_errors_within_tolerance_are_counted_apart(extended, tmp_path, cap
     assert "with 3 effects and 1 small error within tolerance written" in capsys.readouterr().out
 
 
-def test_without_mujoco_the_file_is_written_and_not_replayed(extended, measured, tmp_path, capsys, monkeypatch) -> None:
+def test_export_without_mujoco_writes_file_without_replay(extended, measured, tmp_path, capsys, monkeypatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "mujoco", None)
     export(extended, tmp_path / "model.xml", "--measured", measured)
     assert (tmp_path / "model.xml").exists()

@@ -57,7 +57,7 @@ def screen(told: ScanReport) -> str:
     return console.file.getvalue()
 
 
-def test_servos_that_are_as_they_should_be_are_well(config, arm, port) -> None:
+def test_servos_matching_robot_toml_are_ok(config, arm, port) -> None:
     told = report(config, arm, port)
     assert (states(told), told.is_well) == (["ok"] * 4, True)
 
@@ -79,7 +79,7 @@ def test_a_missing_servo_is_named_with_its_joint(config, arm, port) -> None:
         ({"is_double": True}, "double", "give the other another ID"),
     ],
 )
-def test_a_servo_that_is_not_as_it_should_be_is_told_with_what_to_do(config, arm, port, change, state, fix) -> None:
+def test_deviating_servo_is_reported_with_its_remedy(config, arm, port, change, state, fix) -> None:
     arm[1] = replace(arm[1], **change)
     told = report(config, arm, port)
     assert states(told) == ["ok", state, "ok", "ok"]
@@ -88,7 +88,7 @@ def test_a_servo_that_is_not_as_it_should_be_is_told_with_what_to_do(config, arm
     assert not told.is_well
 
 
-def test_a_servo_that_robot_toml_does_not_name_is_a_stranger(config, arm, port) -> None:
+def test_servo_absent_from_robot_toml_is_a_stranger(config, arm, port) -> None:
     told = report(config, [*arm, FoundServo(port, 1_000_000, "Dynamixel 2.0", 9, "XL330-M288")], port)
     assert ([servo.id for servo in told.strangers], told.is_well) == ([9], False)
     assert "ID 9 (XL330-M288) is on a port of robot.toml, but not in it" in screen(told)
@@ -98,12 +98,12 @@ def test_servos_of_other_ports_are_no_strangers(config, arm, port) -> None:
     assert report(config, [*arm, FoundServo("/dev/ttyACM7", 1_000_000, "Dynamixel 2.0", 9)], port).is_well
 
 
-def test_without_a_robot_whoever_answers_is_well(arm, port) -> None:
+def test_any_answering_servo_passes_without_a_robot(arm, port) -> None:
     assert report(None, arm, port).is_well
     assert not report(None, [], port).is_well
 
 
-def test_a_port_that_could_not_be_opened_is_told(port) -> None:
+def test_unopenable_port_is_reported(port) -> None:
     told = report_of([ScannedBus(port, (), f"{port} is in use by another program. End that one")], None)
     assert "is in use by another program" in screen(told)
     assert not told.is_well
@@ -117,7 +117,7 @@ def test_the_table_fits_80_columns_and_shows_everything(config, arm, port) -> No
     ]  # fmt: skip
 
 
-def test_the_troubles_of_a_servo_are_under_the_table(arm, port) -> None:
+def test_servo_troubles_are_listed_below_the_table(arm, port) -> None:
     arm[0] = replace(arm[0], troubles=("it is overloaded: free the joint, then switch its supply off and on",))
     assert "ID 1: it is overloaded" in screen(report(None, arm, port))
 
@@ -140,7 +140,7 @@ def test_a_bench_is_found_by_the_command(tmp_path, capsys) -> None:
     assert [joint["servo"]["id"] for joint in told["joints"]] == [1, 2, 3, 4]
 
 
-def test_an_unknown_rate_is_refused_with_the_known_ones() -> None:
+def test_unknown_rate_error_lists_known_rates() -> None:
     with pytest.raises(ConfigError, match=r"--baud 1234 is no rate.*57600"):
         app(["scan", "--baud", "1234"], exit_on_error=False, result_action="return_value")
 

@@ -57,14 +57,14 @@ def bench(tmp_path: Path, patient_host: None) -> Iterator[Bench]:
         yield Bench(dry_run, bench_robot_file(config, dry_run, port))
 
 
-def test_a_dry_run_shows_the_table_and_writes_nothing(bench, capsys) -> None:
+def test_dry_run_shows_table_and_writes_nothing(bench, capsys) -> None:
     assert bench("return_delay=0", *ELBOW, "--dry-run") == 0
     assert "elbow_pitch   3  return_delay (9)  250 (500 µs)  →  0 (0 µs)" in capsys.readouterr().out
     assert (bench.elbow("return_delay"), bench.elbow("torque")) == (250, 1)
     assert not bench.robot.with_name("bus.state").exists()
 
 
-def test_what_was_written_is_what_the_sdk_reads(bench) -> None:
+def test_sdk_reads_the_written_settings(bench) -> None:
     assert bench("return_delay=0", "operating_mode=current", *ELBOW, "--yes") == 0
     port = sdk.PortHandler(str(bench.robot.with_name("bus")))
     port.setBaudRate(1_000_000)
@@ -89,7 +89,7 @@ def test_undo_takes_back_one_command_after_the_other(bench) -> None:
         bench("--undo", "--yes")
 
 
-def test_undo_leaves_alone_what_somebody_else_changed(bench, capsys) -> None:
+def test_undo_skips_settings_changed_by_others(bench, capsys) -> None:
     bench("return_delay=0", *ELBOW, "--yes")
     bench.dry_run.arm.servo("elbow_pitch")["return_delay"] = 7
     assert bench("--undo", "--yes") == 0
@@ -105,7 +105,7 @@ def test_a_rate_is_changed_and_taken_back(bench) -> None:
     assert bench.dry_run.arm.servo("base_yaw").baud == 1_000_000
 
 
-def test_zero_tells_the_ticks_of_here_and_writes_nothing(bench, capsys) -> None:
+def test_zero_prints_current_ticks_and_writes_nothing(bench, capsys) -> None:
     assert bench("--zero", *ELBOW) == 0
     ticks = 2048 - round(0.2 * 4096 / (2 * 3.141592653589793))  # it counts against the joint
     assert f"elbow_pitch  zero_ticks = {ticks}" in capsys.readouterr().out
@@ -132,7 +132,7 @@ def test_zero_in_the_servo_makes_here_the_zero(bench) -> None:
         (("return_delay=0", "--joint", "elbow"), "Did you mean 'elbow_pitch'"),
     ],
 )
-def test_what_cannot_be_is_refused_and_nothing_is_written(bench, words, said) -> None:
+def test_invalid_settings_are_refused_and_nothing_is_written(bench, words, said) -> None:
     with pytest.raises(BodyschemaError, match=said):
         bench(*words, "--yes")
     assert bench.elbow("torque") == 1
@@ -144,7 +144,7 @@ def test_a_servo_that_does_not_answer_is_named(bench) -> None:
         bench("return_delay=0", *ELBOW, "--yes")
 
 
-def test_a_log_whose_last_line_a_crash_cut_off_is_read(bench) -> None:
+def test_log_with_truncated_last_line_is_read(bench) -> None:
     bench("return_delay=0", *ELBOW, "--yes")
     log = ServoLog(bench.robot.with_name("bus.state"))
     with log.file.open("ab") as stream:

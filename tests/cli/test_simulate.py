@@ -84,7 +84,7 @@ def test_json_without_a_file_is_refused(tmp_path) -> None:
         called("simulate", "--like", tmp_path / "like.csv", "--robot", robot, "--json")
 
 
-def test_without_a_file_the_rows_go_to_standard_output(tmp_path, capsys) -> None:
+def test_rows_go_to_stdout_without_a_file(tmp_path, capsys) -> None:
     measured(tmp_path / "like.csv")
     out = simulated(tmp_path)
     capsys.readouterr()
@@ -114,7 +114,7 @@ def test_noise_of_unknown_size_is_refused(tmp_path) -> None:
         simulated(tmp_path, "--noise")
 
 
-def test_what_needs_times_that_are_not_there_is_said(tmp_path, capsys) -> None:
+def test_camera_latency_without_times_warns(tmp_path, capsys) -> None:
     measured(tmp_path / "like.csv", times=False)
     simulated(tmp_path, tables=LATE)
     assert "camera_latency changes nothing: the recording has no column t" in capsys.readouterr().err
@@ -135,14 +135,14 @@ def test_config_check_names_the_effects(tmp_path, capsys) -> None:
     assert "effect joint_offset at waist: offset_rad = 0.05" in capsys.readouterr().out
 
 
-def test_a_spring_without_a_load_is_said_to_change_nothing(tmp_path, capsys) -> None:
+def test_spring_without_load_is_reported_as_ineffective(tmp_path, capsys) -> None:
     file = write_small_arm(tmp_path, '[[effects]]\neffect = "joint_compliance"\nwhere = "waist"\n' + SPRING)
     file.write_text(file.read_text().replace("[camera]", 'hold = "torque_free"\n[camera]'))
     called("config", "--robot", file)
     assert "the guiding hand bears" in capsys.readouterr().out
 
 
-def test_a_wrong_effect_is_refused_wherever_the_file_is_read(tmp_path) -> None:
+def test_wrong_effect_is_refused_when_loading_config(tmp_path) -> None:
     with pytest.raises(ConfigError, match=r"robot\.toml, line 11: effect 1: .*looks like degrees"):
         Config.load(write_small_arm(tmp_path, EFFECT.replace("0.05", "5.0")))
 
@@ -152,7 +152,7 @@ def test_the_environment_changes_no_effects(tmp_path) -> None:
     assert config.simulation.effects[0].value("offset_rad") == 0.05
 
 
-def test_a_calibrated_robot_has_no_effects_since_it_was_learnt_without_them(tmp_path) -> None:
+def test_calibrated_robot_file_contains_no_effects(tmp_path) -> None:
     from bodyschema.robot.calibrated import CalibratedGeometry
     from bodyschema.robot.calibrated_files import write_calibrated
 
@@ -174,7 +174,7 @@ def moved(recording: Recording, by) -> Recording:
     return Recording(joints=recording.joints, q=recording.q, x=recording.x + by, t=recording.t)
 
 
-def test_a_shift_is_the_distance_and_alignment_takes_it_away(tmp_path, capsys) -> None:
+def test_constant_shift_is_measured_and_removed_by_alignment(tmp_path, capsys) -> None:
     moved(measured(tmp_path / "a.csv"), [0.003, 0.0, -0.004]).write_csv(tmp_path / "b.csv")
     report = compared(capsys, tmp_path / "a.csv", tmp_path / "b.csv")
     assert report["distances"] == pytest.approx({"mean_mm": 5, "rms_mm": 5, "median_mm": 5, "max_mm": 5})
@@ -183,7 +183,7 @@ def test_a_shift_is_the_distance_and_alignment_takes_it_away(tmp_path, capsys) -
     assert report["aligned"]["shift_mm"] == pytest.approx([-3, 0, 4], abs=1e-9)
 
 
-def test_a_turn_is_told_by_its_angle(tmp_path, capsys) -> None:
+def test_rotation_is_reported_by_its_angle(tmp_path, capsys) -> None:
     recording = measured(tmp_path / "a.csv")
     angle = np.radians(2.0)
     R = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
@@ -201,7 +201,7 @@ def test_the_worst_rows_come_first_with_their_numbers(tmp_path, capsys) -> None:
     assert [(row["row"], round(row["distance_mm"], 6)) for row in worst[:2]] == [(31, 20.0), (7, 10.0)]
 
 
-def test_rows_at_other_joint_angles_are_left_out_and_said(tmp_path, capsys) -> None:
+def test_rows_without_counterpart_are_skipped_and_reported(tmp_path, capsys) -> None:
     recording = measured(tmp_path / "a.csv")
     q = recording.q.copy()
     q[4, 1] += 0.01
@@ -213,7 +213,7 @@ def test_rows_at_other_joint_angles_are_left_out_and_said(tmp_path, capsys) -> N
     assert "Not compared" in " ".join(capsys.readouterr().out.split())
 
 
-def test_recordings_of_different_lengths_are_matched_by_their_joint_angles(tmp_path, capsys) -> None:
+def test_recordings_of_different_lengths_match_by_joint_angles(tmp_path, capsys) -> None:
     recording = measured(tmp_path / "a.csv")
     recording.rows(np.arange(ROWS) % 3 == 1).write_csv(tmp_path / "b.csv")
     report = compared(capsys, tmp_path / "a.csv", tmp_path / "b.csv")
@@ -221,7 +221,7 @@ def test_recordings_of_different_lengths_are_matched_by_their_joint_angles(tmp_p
     assert report["distances"]["max_mm"] == 0.0
 
 
-def test_recordings_without_a_common_row_are_refused_with_a_remedy(tmp_path) -> None:
+def test_recordings_without_common_row_are_refused_with_remedy(tmp_path) -> None:
     recording = measured(tmp_path / "a.csv")
     Recording(joints=JOINTS, q=recording.q + 0.1, x=recording.x).write_csv(tmp_path / "b.csv")
     with pytest.raises(RecordingError, match=r"no row at the joint angles.*differs by 0\.1.*simulate --like"):
@@ -241,7 +241,7 @@ def test_columns_in_another_order_are_the_same_joints(tmp_path, capsys) -> None:
     assert compared(capsys, tmp_path / "a.csv", tmp_path / "b.csv")["compared"] == ROWS
 
 
-def test_with_a_robot_its_joints_are_those_of_robot_toml(tmp_path, capsys) -> None:
+def test_compare_with_a_robot_uses_its_joints(tmp_path, capsys) -> None:
     measured(tmp_path / "a.csv")
     robot = write_small_arm(tmp_path)
     assert compared(capsys, tmp_path / "a.csv", tmp_path / "a.csv", "--robot", robot)["joints"] == list(JOINTS)

@@ -94,7 +94,7 @@ def test_one_segment_is_not_said_to_be_several(config) -> None:
     assert "612 in 1 segment, " in shown(Seen(msgspec.structs.replace(SAMPLER, segment=1), None), config)
 
 
-def test_a_told_tool_change_is_shown_as_told(config) -> None:
+def test_user_reported_tool_change_is_shown_as_reported(config) -> None:
     change = msgspec.structs.replace(
         LEARNER.last_change, found=False, kind="tool", earliest_seq=601, latest_seq=601, moved_m=None
     )
@@ -102,19 +102,19 @@ def test_a_told_tool_change_is_shown_as_told(config) -> None:
     assert "change tool at pair 601 (told); 12 pairs since" in text
 
 
-def test_a_change_that_was_rolled_back_is_none_in_force(config) -> None:
+def test_rolled_back_change_is_not_in_force(config) -> None:
     learner = msgspec.structs.replace(LEARNER, changes=2, last_change=None, pairs_since_change=600)
     assert "change none in force of 2 reported or detected; 600 pairs count" in " ".join(
         shown(Seen(None, learner), config).split()
     )
 
 
-def test_a_process_that_does_not_answer_is_named_with_the_command_that_starts_it(config) -> None:
+def test_silent_process_is_named_with_its_start_command(config) -> None:
     text = " ".join(shown(Seen(SAMPLER, None), config).split())
     assert f"learner does not answer on {config.tables.zenoh.learner}. Start it with `bodyschema run learner`" in text
 
 
-def test_json_has_both_processes_and_null_for_who_is_not_there() -> None:
+def test_json_has_null_for_a_missing_process() -> None:
     seen = json.loads(as_json(Seen(SAMPLER, None)))
     assert (seen["sampler"]["pairs"], seen["learner"]) == (612, None)
 
@@ -139,13 +139,13 @@ def status(config: Config, *options: str) -> None:
     app(["status", "--robot", str(config.file), *options], exit_on_error=False, result_action="return_value")
 
 
-def test_the_command_ends_with_exit_code_1_when_nobody_answers(config) -> None:
+def test_status_exits_1_when_no_process_answers(config) -> None:
     with pytest.raises(SystemExit) as ended:
         status(config)
     assert ended.value.code == 1
 
 
-def test_the_command_prints_json_of_a_sampler_without_a_learner(config, capsys) -> None:
+def test_json_shows_a_sampler_without_learner(config, capsys) -> None:
     with sampler_running(config):
         status(config, "--json")
     seen = json.loads(capsys.readouterr().out)

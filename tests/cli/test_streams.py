@@ -22,7 +22,7 @@ def run(command: str, cwd: Path, **environment: str) -> subprocess.CompletedProc
 
 
 @pytest.mark.parametrize("command", ["--version", "config --json"])
-def test_a_full_disk_under_the_output_is_one_line(tmp_path: Path, command: str) -> None:
+def test_full_disk_under_stdout_gives_one_line(tmp_path: Path, command: str) -> None:
     write_small_arm(tmp_path)
     done = run(f"$B {command} > /dev/full", tmp_path)
     assert (done.returncode, done.stderr) == (1, b"bodyschema: the output cannot be written: No space left on device\n")
@@ -56,7 +56,7 @@ def test_help_is_shown_however_narrow_the_terminal(tmp_path: Path, columns: str)
         ),
     ],
 )
-def test_an_unexpected_error_of_the_system_is_one_line(tmp_path: Path, command: str, said: str) -> None:
+def test_unexpected_system_error_gives_one_line(tmp_path: Path, command: str, said: str) -> None:
     robot = write_small_arm(tmp_path)
     (tmp_path / "a.csv").write_text("waist,shoulder,x,y,z\n0,0,1,2,3\n")
     done = run(command, tmp_path, BODYSCHEMA_ROBOT=str(robot))
@@ -65,7 +65,7 @@ def test_an_unexpected_error_of_the_system_is_one_line(tmp_path: Path, command: 
 
 
 @pytest.mark.parametrize(("module", "words"), [("textwrap", "--help"), ("cyclopts", "status")])
-def test_ctrl_c_while_modules_are_loaded_shows_no_traceback(tmp_path: Path, module: str, words: str) -> None:
+def test_ctrl_c_during_imports_shows_no_traceback(tmp_path: Path, module: str, words: str) -> None:
     (tmp_path / f"{module}.py").write_text("raise KeyboardInterrupt\n")
     done = run(f"$B {words}", tmp_path, PYTHONPATH=str(tmp_path))
     assert (done.returncode, done.stdout, done.stderr) == (130, b"", b"")

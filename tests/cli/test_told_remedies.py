@@ -25,7 +25,7 @@ GIVEN = ["doctor", "--robot", "arm/left.toml"]
         (["doctor", "--robot"], None),
     ],
 )
-def test_the_option_is_found_as_it_may_be_written(arguments, robot) -> None:
+def test_robot_option_is_found_in_either_spelling(arguments, robot) -> None:
     assert given_robot(arguments) == robot
 
 
@@ -48,7 +48,7 @@ def test_a_command_that_takes_it_has_it(said, typed) -> None:
     assert as_typed(said, GIVEN) == typed
 
 
-def test_without_the_option_a_message_stays_as_it_is() -> None:
+def test_message_stays_unchanged_without_robot_option() -> None:
     assert as_typed("`bodyschema scan --robot robot.toml`", ["doctor"]) == "`bodyschema scan --robot robot.toml`"
 
 

@@ -60,7 +60,7 @@ def run(*words: str) -> None:
     app(list(words), result_action="return_value")
 
 
-def test_pictures_are_written_with_what_was_seen_in_them(tmp_path, capsys) -> None:
+def test_saved_pictures_show_the_other_camera_s_ray(tmp_path, capsys) -> None:
     write_images(tmp_path)
     file = write_robot(tmp_path, IMAGES.format(speed=0.0))
     run("watch", "cameras", "--robot", str(file), "--out", str(tmp_path / "seen"), "--every", "0")
@@ -73,7 +73,7 @@ def test_pictures_are_written_with_what_was_seen_in_them(tmp_path, capsys) -> No
     assert (row[:, 2] - row[:, 0]).min() > 60
 
 
-def test_cameras_that_nobody_calibrated_are_shown_as_they_are(tmp_path, capsys) -> None:
+def test_uncalibrated_cameras_are_shown_unrectified(tmp_path, capsys) -> None:
     write_images(tmp_path)
     file = write_robot(tmp_path, IMAGES.format(speed=0.0), "")
     run("watch", "cameras", "--robot", str(file), "--out", str(tmp_path / "seen"), "--every", "0")
@@ -142,19 +142,19 @@ def test_a_port_that_is_taken_is_named() -> None:
             raise AssertionError
 
 
-def test_joints_without_cameras_are_told_which_table_is_missing(tmp_path) -> None:
+def test_joints_without_cameras_error_names_missing_table(tmp_path) -> None:
     config = Config.load(write_robot(tmp_path, SERVOS), {})
     with pytest.raises(ConfigError, match=r"no cameras are configured. Add the table \[vision.cameras\]"):
         check_sources(config, sim=False)
 
 
-def test_cameras_that_nothing_calibrates_are_refused_with_both_ways_out(tmp_path) -> None:
+def test_uncalibrated_cameras_error_names_both_remedies(tmp_path) -> None:
     config = Config.load(write_robot(tmp_path, SERVOS + IMAGES.format(speed=1.0), ""), {})
     with pytest.raises(ConfigError, match=r"nothing says how the cameras see.*calibrate cameras.*\[camera\]"):
         check_sources(config, sim=False)
 
 
-def test_images_that_are_not_on_the_encoders_clock_are_refused(tmp_path) -> None:
+def test_images_off_the_encoder_clock_are_refused(tmp_path) -> None:
     config = Config.load(write_robot(tmp_path, SERVOS + IMAGES.format(speed=0.0)), {})
     with pytest.raises(ConfigError, match="speed 0 are not on the encoders' clock"):
         check_sources(config, sim=False)
@@ -182,7 +182,7 @@ def test_config_check_names_a_damaged_calibration(tmp_path, capsys) -> None:
     assert "is in order" not in capsys.readouterr().out
 
 
-def test_images_that_calibrated_cameras_took_are_rectified_whatever_the_cameras_serials(tmp_path, capsys) -> None:
+def test_calibrated_image_files_need_no_matching_serials(tmp_path, capsys) -> None:
     write_images(tmp_path)
     rig = known_rig(webcams(np.random.default_rng(1), size_px=(320, 240)), serials=("A1", "B2"))
     write_rig(rig, tmp_path / "c.toml")
@@ -197,19 +197,19 @@ def test_doctor_names_a_camera_that_is_not_there(tmp_path) -> None:
     assert [(check.state, "is not there" in check.said) for check in checks] == [("wrong", True)]
 
 
-def test_doctor_opens_what_is_there(tmp_path) -> None:
+def test_doctor_opens_the_configured_images(tmp_path) -> None:
     write_images(tmp_path)
     checks = list(camera_checks(Config.load(write_robot(tmp_path, IMAGES.format(speed=1.0)), {})))
     assert [check.state for check in checks] == ["ok"]
     assert "320x240 pixels" in checks[0].said
 
 
-def test_two_cameras_that_are_plugged_in_are_the_eyes_of_a_new_robot() -> None:
+def test_two_plugged_in_cameras_become_robot_eyes() -> None:
     text = robot_toml(EXAMPLE, Seen(["/dev/v4l/by-id/a", "/dev/v4l/by-id/b"]))
     assert 'left = "/dev/v4l/by-id/a"\nright = "/dev/v4l/by-id/b"\n' in text
 
 
-def test_without_cameras_the_tables_are_an_example_that_does_nothing() -> None:
+def test_camera_tables_without_cameras_are_commented_out() -> None:
     lines = robot_toml(EXAMPLE).split("docs/cameras.md has the rest.\n")[1].splitlines()
     assert all(line.startswith("#") for line in lines)
     assert json.dumps("/dev/v4l/by-id/usb-LEFT-video-index0") in "\n".join(lines)
@@ -224,7 +224,7 @@ def swapped(folder: Path) -> None:
         cv2.imwrite(str(right), images[1])
 
 
-def test_what_is_the_matter_in_most_frames_is_said_in_words_with_a_remedy(tmp_path, capsys) -> None:
+def test_commonest_frame_fault_is_explained_with_its_remedy(tmp_path, capsys) -> None:
     swapped(tmp_path)
     robot = write_robot(tmp_path, IMAGES.format(speed=0.0))
     run("watch", "cameras", "--robot", str(robot), "--out", str(tmp_path / "out"), "--every", "0")
@@ -232,7 +232,7 @@ def test_what_is_the_matter_in_most_frames_is_said_in_words_with_a_remedy(tmp_pa
     assert "the marker in 0; rows differ: 4. Are the cameras exchanged, one upside down, or moved?" in said
 
 
-def test_files_of_a_camera_with_its_cap_on_are_said_to_be_black(tmp_path, capsys) -> None:
+def test_black_image_files_suggest_a_lens_cap(tmp_path, capsys) -> None:
     write_images(tmp_path)
     for right in tmp_path.glob("r_*.png"):
         cv2.imwrite(str(right), np.full((240, 320, 3), 5, np.uint8))

@@ -40,7 +40,7 @@ def test_monotonic_time_never_goes_back(clock: Clock) -> None:
     assert times == sorted(times)
 
 
-def test_wall_time_says_that_it_is_utc_to_the_millisecond(clock: Clock) -> None:
+def test_wall_time_is_utc_with_milliseconds(clock: Clock) -> None:
     shown = clock.utc()
     assert datetime.fromisoformat(shown).utcoffset() == timedelta(0)
     assert len(shown) == len("2026-01-01T00:00:00.000+00:00")

@@ -479,7 +479,7 @@ def test_reading_before_opening_is_an_error(rig: Rig) -> None:
         rig.source.read(0.05)
 
 
-def test_times_are_finite_and_strictly_increase_also_after_opening_again(rig: Rig) -> None:
+def test_times_increase_strictly_across_reopening(rig: Rig) -> None:
     times = []
     for _ in range(2):
         with rig.opened():
@@ -509,7 +509,7 @@ def test_reading_after_closing_is_an_error(rig: Rig) -> None:
         rig.source.read(0.05)
 
 
-def test_an_error_in_the_block_passes_through_the_closing(rig: Rig) -> None:
+def test_error_in_block_survives_closing(rig: Rig) -> None:
     with pytest.raises(ZeroDivisionError), rig.opened():
         raise ZeroDivisionError
 
@@ -566,14 +566,14 @@ def is_frozen(array: np.ndarray, shape: tuple[int, ...]) -> bool:
     return whole and (array.shape, array.dtype) == (shape, np.float64)
 
 
-def test_a_joint_source_gives_a_finite_angle_for_each_joint_it_names(joints) -> None:
+def test_joint_source_gives_finite_angle_per_joint(joints) -> None:
     source, readings = joints
     assert isinstance(source, JointSource)
     assert len(source.joints) > 0
     assert all(type(reading) is JointReading and is_frozen(reading.q, (len(source.joints),)) for reading in readings)
 
 
-def test_a_marker_source_gives_finite_positions_or_a_reason(seen) -> None:
+def test_marker_source_gives_finite_position_or_reason(seen) -> None:
     source, items = seen
     assert isinstance(source, MarkerSource)
     assert all(type(item) is MarkerMiss or is_frozen(item.x, (3,)) for item in items)
@@ -588,7 +588,7 @@ def test_a_fix_has_a_positive_definite_covariance(seen) -> None:
             assert np.linalg.eigvalsh(fix.cov)[0] > 0
 
 
-def test_a_fix_that_tells_how_the_marker_is_turned_does_so_by_a_unit_quaternion(seen) -> None:
+def test_oriented_fix_has_unit_quaternion(seen) -> None:
     for fix in seen[1]:
         if isinstance(fix, MarkerFix) and fix.R is not None:
             assert is_frozen(fix.R, (4,))
@@ -599,7 +599,7 @@ def test_a_fix_that_tells_how_the_marker_is_turned_does_so_by_a_unit_quaternion(
             assert np.linalg.eigvalsh(fix.cov_R)[0] > 0
 
 
-def test_a_camera_gives_two_colour_images_of_its_calibration_s_size(frames) -> None:
+def test_camera_gives_colour_images_of_calibrated_size(frames) -> None:
     camera, items = frames
     assert isinstance(camera, StereoCamera)
     width, height = camera.calibration.image_size_px
@@ -609,7 +609,7 @@ def test_a_camera_gives_two_colour_images_of_its_calibration_s_size(frames) -> N
             assert (image.shape, image.dtype) == ((height, width, 3), np.uint8)
 
 
-def test_eyes_give_two_colour_images_of_one_size_and_say_how_sure_the_time_is(looks) -> None:
+def test_stereo_eyes_give_equal_sizes_and_time_uncertainty(looks) -> None:
     source, items = looks
     assert isinstance(source, StereoEyes)
     width, height = source.image_size_px
@@ -637,7 +637,7 @@ def read_through(make: Make, attempts: int = 5) -> list[Any]:
 
 
 @pytest.mark.parametrize("make", THROUGH)
-def test_joints_through_a_bench_are_those_of_the_source_at_its_times(make: Make) -> None:
+def test_emulated_servos_reproduce_source_joints_and_times(make: Make) -> None:
     told = read_through(make)
     assert [reading.t for reading in told] == TIMES.tolist()
     expected = [[0.01 * k, 0.1, -0.01 * k, 0.2] for k in range(ROWS)]

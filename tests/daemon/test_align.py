@@ -24,7 +24,7 @@ def buffer() -> JointBuffer:
 
 
 @given(fraction=st.floats(0.01, 0.99), start=st.floats(-3, 3), rate=st.floats(-5, 5))
-def test_a_joint_that_moves_evenly_is_met_exactly_between_its_readings(fraction, start, rate) -> None:
+def test_constant_velocity_joint_is_interpolated_exactly(fraction, start, rate) -> None:
     buffer = JointBuffer(REVOLUTE, max_gap_s=0.1)
     for step in range(4):
         t = 10 + 0.05 * step
@@ -33,14 +33,14 @@ def test_a_joint_that_moves_evenly_is_met_exactly_between_its_readings(fraction,
     assert buffer.at(t, 0.0)[0] == pytest.approx(start + rate * t, abs=1e-12)
 
 
-def test_a_frame_at_the_time_of_a_reading_gets_that_reading(buffer) -> None:
+def test_frame_at_reading_time_gets_that_reading(buffer) -> None:
     readings = [reading(0.0, 0.1, 0.2), reading(0.01, 0.3, 0.7), reading(0.02, 0.5, 0.9)]
     for each in readings:
         buffer.put(each)
     assert [buffer.at(each.t, 0.0) is each.q for each in readings] == [True, True, True]
 
 
-def test_a_frame_at_the_time_of_a_reading_needs_no_other_reading_near_it(buffer) -> None:
+def test_frame_at_reading_time_needs_no_neighbouring_reading(buffer) -> None:
     buffer.put(reading(0.0, 1.0, 1.0))
     buffer.put(reading(5.0, 2.0, 2.0))
     assert buffer.at(5.0, 0.0).tolist() == [2.0, 2.0]
@@ -65,7 +65,7 @@ def test_a_frame_before_all_readings_has_no_joints(buffer) -> None:
     assert buffer.at(0.5, 0.0) is Reason.NO_JOINTS
 
 
-def test_a_frame_whose_reading_does_not_come_has_no_joints(buffer) -> None:
+def test_frame_without_later_reading_has_no_joints(buffer) -> None:
     buffer.put(reading(1.0, 1.0, 1.0))
     assert buffer.at(1.05, 0.01) is Reason.NO_JOINTS
 
@@ -103,7 +103,7 @@ def test_encoders_that_run_ahead_wait_for_the_frames() -> None:
     assert np.array_equal(found[:, 0], times)
 
 
-def test_frames_that_ask_for_no_joints_make_room_for_the_encoders() -> None:
+def test_skipped_frames_make_room_for_encoder_readings() -> None:
     buffer = JointBuffer(REVOLUTE, max_gap_s=1.0, capacity=4)
     for i in range(40):
         buffer.put(reading(float(i), 0.0, 0.0))
@@ -129,7 +129,7 @@ def test_closing_lets_waiting_encoders_go() -> None:
     assert buffer.at(1.0, 0.0) is Reason.NO_JOINTS
 
 
-def test_a_revolute_joint_is_interpolated_the_short_way_across_the_wrap() -> None:
+def test_revolute_interpolation_takes_short_way_across_wrap() -> None:
     buffer = JointBuffer(REVOLUTE, max_gap_s=0.1)
     buffer.put(reading(0.0, np.pi - 0.01, 0.0))
     buffer.put(reading(0.1, -np.pi + 0.01, 0.0))
@@ -137,18 +137,18 @@ def test_a_revolute_joint_is_interpolated_the_short_way_across_the_wrap() -> Non
     assert np.cos(angle) == pytest.approx(-1.0, abs=1e-12)
 
 
-def test_a_prismatic_joint_knows_no_wrap() -> None:
+def test_prismatic_difference_does_not_wrap() -> None:
     far = joint_difference(np.array([4.0, 4.0]), np.array([0.0, 0.0]), np.array([True, False]))
     assert far.tolist() == pytest.approx([4.0, 4.0 - 2 * np.pi])
 
 
 @given(st.lists(st.floats(-50, 50), min_size=2, max_size=2))
-def test_the_revolute_difference_is_never_more_than_half_a_turn(angles) -> None:
+def test_revolute_difference_never_exceeds_half_a_turn(angles) -> None:
     difference = joint_difference(np.array(angles), np.zeros(2), REVOLUTE)
     assert (np.abs(difference) <= np.pi + 1e-12).all()
 
 
-def test_live_encoders_never_wait_for_frames_and_the_oldest_readings_go() -> None:
+def test_live_encoders_drop_oldest_readings_instead_of_waiting() -> None:
     buffer = JointBuffer(REVOLUTE, max_gap_s=0.1, capacity=10, live=True)
     for step in range(100):
         buffer.put(reading(0.01 * step, 0.0, 0.0))  # not live, the eleventh would wait forever
@@ -157,9 +157,7 @@ def test_live_encoders_never_wait_for_frames_and_the_oldest_readings_go() -> Non
 
 
 @given(rate=st.floats(-5, 5), during_s=st.floats(0.001, 0.3))
-def test_how_far_an_even_motion_goes_while_the_time_is_uncertain_is_known_also_beyond_what_is_kept(
-    rate, during_s
-) -> None:
+def test_displacement_covers_time_uncertainty_beyond_kept_readings(rate, during_s) -> None:
     buffer = JointBuffer(REVOLUTE, max_gap_s=0.1, kept_s=0.1)
     for step in range(60):
         buffer.put(reading(0.01 * step, rate * 0.01 * step, 0.0))
@@ -168,7 +166,7 @@ def test_how_far_an_even_motion_goes_while_the_time_is_uncertain_is_known_also_b
     assert moved.tolist() == pytest.approx([rate * during_s, 0.0], abs=1e-9)
 
 
-def test_after_asking_how_far_the_joints_moved_the_frame_itself_still_has_its_angles() -> None:
+def test_querying_displacement_keeps_angles_of_the_frame() -> None:
     buffer = JointBuffer(REVOLUTE, max_gap_s=0.1, kept_s=0.1)
     for step in range(60):
         buffer.put(reading(0.01 * step, 0.01 * step, 0.0))

@@ -64,7 +64,7 @@ def written(file: Path, old: LearningState) -> Path:
     return file
 
 
-def test_what_is_read_is_what_was_written_bit_by_bit(written, old) -> None:
+def test_checkpoint_round_trip_is_bit_exact(written, old) -> None:
     assert same(old, read_checkpoint(written, robot="arm"))
 
 
@@ -72,7 +72,7 @@ def test_before_the_first_checkpoint_there_is_none(file) -> None:
     assert read_checkpoint(file, robot="arm") is None
 
 
-def test_a_new_checkpoint_takes_the_place_of_the_old_one_which_stays_as_the_previous(written, old, new) -> None:
+def test_new_checkpoint_keeps_old_one_as_previous(written, old, new) -> None:
     write(written, new)
     present, previous = generations(written)
     assert same(new, read_checkpoint(present, robot="arm"))
@@ -87,7 +87,7 @@ def test_of_many_checkpoints_two_are_kept(written, old, new) -> None:
     assert same(new, read_checkpoint(generations(written)[1], robot="arm"))
 
 
-def test_a_file_system_without_hard_links_keeps_the_previous_too(written, old, new, monkeypatch) -> None:
+def test_previous_checkpoint_is_kept_without_hard_links(written, old, new, monkeypatch) -> None:
     def refuse(*_: object) -> None:
         raise PermissionError(1, "Operation not permitted")
 
@@ -98,14 +98,14 @@ def test_a_file_system_without_hard_links_keeps_the_previous_too(written, old, n
 
 
 @pytest.mark.parametrize("name", ["net_nlms", "q", "x"])
-def test_a_state_with_a_number_that_is_not_finite_is_not_written(written, old, new, name) -> None:
+def test_non_finite_state_is_not_written(written, old, new, name) -> None:
     poisoned = {**new.arrays, name: np.full_like(new.arrays[name], np.nan)}
     with pytest.raises(CheckpointError, match=f"was not written: {name} is not finite"):
         write(written, LearningState(new.header, poisoned))
     assert same(old, read_checkpoint(written, robot="arm"))
 
 
-def test_a_full_disk_is_named_and_leaves_the_old_checkpoint(written, old, new) -> None:
+def test_full_disk_error_keeps_old_checkpoint(written, old, new) -> None:
     written.with_name("learner.ckpt.tmp").symlink_to("/dev/full")
     with pytest.raises(CheckpointError, match=f"{written} could not be written: the disk is full. Free some space"):
         write(written, new)
@@ -113,7 +113,7 @@ def test_a_full_disk_is_named_and_leaves_the_old_checkpoint(written, old, new) -
     assert not written.with_name("learner.ckpt.tmp").exists()
 
 
-def test_a_file_in_the_place_of_the_folder_is_named(tmp_path, old) -> None:
+def test_file_in_place_of_folder_is_reported(tmp_path, old) -> None:
     (tmp_path / "state").touch()
     with pytest.raises(CheckpointError, match=r"state is not a folder. Learning continues; give a folder as state_dir"):
         write(tmp_path / "state" / "learner.ckpt", old)
@@ -160,7 +160,7 @@ def test_a_flipped_bit_anywhere_is_found(written) -> None:
             read_checkpoint(written, robot="arm")
 
 
-def test_what_is_set_aside_is_kept_beside_what_was_before(written) -> None:
+def test_setting_aside_keeps_earlier_set_aside_files(written) -> None:
     content = written.read_bytes()
     first = set_aside(written)
     written.write_bytes(b"second")

@@ -13,7 +13,7 @@ def load(folder: Path, tables: str = "", environment: dict[str, str] | None = No
     return Config.load(write_small_arm(folder, tables), environment or {})
 
 
-def test_a_table_that_is_not_there_has_its_defaults(tmp_path) -> None:
+def test_absent_table_uses_defaults(tmp_path) -> None:
     assert load(tmp_path).tables.zenoh == ZenohConfig()
 
 
@@ -52,7 +52,7 @@ def test_the_environment_reaches_the_robot(tmp_path) -> None:
     assert load(tmp_path, environment={"BODYSCHEMA_ROBOT_NAME": "twin"}).robot.name == "twin"
 
 
-def test_the_path_of_robot_toml_in_the_environment_is_no_setting(tmp_path) -> None:
+def test_robot_toml_path_variable_is_not_a_setting(tmp_path) -> None:
     assert load(tmp_path, environment={"BODYSCHEMA_ROBOT": "elsewhere.toml"}).robot.name == "arm"
 
 
@@ -60,7 +60,7 @@ def test_state_dir_is_relative_to_robot_toml(tmp_path) -> None:
     assert load(tmp_path, '[daemon]\nstate_dir = "state"\n').store_file == tmp_path / "state" / "pairs.sqlite"
 
 
-def test_without_state_dir_state_is_kept_where_the_system_wants_it(tmp_path, monkeypatch) -> None:
+def test_default_state_dir_follows_xdg_state_home(tmp_path, monkeypatch) -> None:
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "xdg"))
     assert load(tmp_path).state_dir == tmp_path / "xdg" / "bodyschema" / "arm"
 
@@ -120,7 +120,7 @@ def test_an_unknown_key_in_the_environment_is_refused(tmp_path) -> None:
         load(tmp_path, environment={"BODYSCHEMA_DAEMON_MIN_STEP": "1"})
 
 
-def test_a_missing_file_names_the_command_that_writes_one(tmp_path) -> None:
+def test_missing_file_error_names_init_command(tmp_path) -> None:
     with pytest.raises(ConfigError, match=r"there is no such file\. `bodyschema init` writes one"):
         Config.load(tmp_path / "robot.toml", {})
 
@@ -141,7 +141,7 @@ def test_a_missing_table_is_named(tmp_path) -> None:
         ("robot.name", '"my arm"', r"line \d+: robot.name: 'my arm' is no name .* Take letters, digits"),
     ],
 )
-def test_a_number_of_another_unit_is_refused_with_its_line(tmp_path, key: str, value: str, said: str) -> None:
+def test_value_in_wrong_unit_is_rejected_with_line(tmp_path, key: str, value: str, said: str) -> None:
     file = write_small_arm(tmp_path, "[vision]\n")
     table, name = key.split(".")
     text = file.read_text().replace('name = "arm"\n', "") if name == "name" else file.read_text()
@@ -150,7 +150,7 @@ def test_a_number_of_another_unit_is_refused_with_its_line(tmp_path, key: str, v
         Config.load(file, {})
 
 
-def test_a_camera_that_stands_as_far_as_a_laser_tracker_is_none_in_millimetres(tmp_path) -> None:
+def test_distant_camera_is_not_mistaken_for_millimetres(tmp_path) -> None:
     file = write_small_arm(tmp_path)
     file.write_text(file.read_text().replace("[camera]\n", "[camera]\nxyz = [8.0, -6.0, 1.5]\n"))
     assert Config.load(file, {}).robot.camera.xyz == (8.0, -6.0, 1.5)
@@ -159,7 +159,7 @@ def test_a_camera_that_stands_as_far_as_a_laser_tracker_is_none_in_millimetres(t
 ONE_EYE = "eyes = 1\nfocal_px = 600.0\nprincipal_point_px = [319.5, 239.5]\nimage_size_px = [640, 480]\n"
 
 
-def test_one_camera_alone_has_a_calibration_without_a_baseline(tmp_path) -> None:
+def test_single_camera_calibration_has_no_baseline(tmp_path) -> None:
     calibration = load(tmp_path, f"{ONE_EYE}[vision]\nradius_m = 0.02\n").robot.calibration
     assert calibration is not None
     assert not calibration.is_stereo
@@ -182,6 +182,6 @@ def test_one_camera_alone_has_a_calibration_without_a_baseline(tmp_path) -> None
         ),
     ],
 )
-def test_what_one_camera_alone_cannot_do_without_is_named(tmp_path, tables, said) -> None:
+def test_missing_or_wrong_single_camera_setting_is_named(tmp_path, tables, said) -> None:
     with pytest.raises((ConfigError, RobotError), match=said):
         load(tmp_path, tables)

@@ -31,7 +31,7 @@ def test_every_reason_has_words_and_a_remedy(reason) -> None:
     assert REMEDIES[reason].endswith((".", "?"))
 
 
-def test_a_reason_of_a_newer_version_is_shown_as_it_came() -> None:
+def test_unknown_reason_of_newer_version_is_shown() -> None:
     assert words_of("too_cold") == "too cold"
 
 

@@ -63,7 +63,7 @@ def fill(store: PairStore, count: int) -> None:
         store.append(1, "utc", frozen_array([0.1]), fix)
 
 
-def test_each_session_keeps_what_its_pairs_were_measured_with(file) -> None:
+def test_each_session_keeps_device_record_of_its_pairs(file) -> None:
     for _ in range(2):
         with PairStore(file, SESSION) as store:
             assert not DeviceWatch(Joints(), store, SystemClock()).look()
@@ -83,7 +83,7 @@ def test_each_session_keeps_what_its_pairs_were_measured_with(file) -> None:
         ({"zero_ticks": 1000}, "zero_ticks in robot.toml was 2048, is 1000"),
     ],
 )
-def test_a_change_against_the_last_session_is_told_once_with_what_to_do(file, caplog, changes, said) -> None:
+def test_device_change_since_last_session_is_reported_once(file, caplog, changes, said) -> None:
     with PairStore(file, SESSION) as store:
         DeviceWatch(Joints(), store, SystemClock()).look()
         fill(store, 1)
@@ -95,7 +95,7 @@ def test_a_change_against_the_last_session_is_told_once_with_what_to_do(file, ca
     assert re.search(said, message)
 
 
-def test_a_change_while_the_sampler_runs_is_kept_from_the_next_pair_on(file) -> None:
+def test_device_change_while_running_applies_from_next_pair(file) -> None:
     with PairStore(file, SESSION) as store:
         joints = Joints()
         watch = DeviceWatch(joints, store, SystemClock())
@@ -107,7 +107,7 @@ def test_a_change_while_the_sampler_runs_is_kept_from_the_next_pair_on(file) -> 
         assert [one.from_seq for one in store.reader.devices()] == [1, 4]
 
 
-def test_what_no_pair_was_measured_with_is_forgotten(file) -> None:
+def test_device_record_without_pairs_is_forgotten(file) -> None:
     with PairStore(file, SESSION) as store:
         DeviceWatch(Joints(), store, SystemClock()).look()
         fill(store, 1)
@@ -117,7 +117,7 @@ def test_what_no_pair_was_measured_with_is_forgotten(file) -> None:
             assert watch.look() == bool(offset)
 
 
-def test_how_fast_a_servo_answers_is_no_other_calibration() -> None:
+def test_changed_return_delay_is_not_a_device_change() -> None:
     assert differences([ELBOW], [ELBOW | {"return_delay_s": 0.0}]) == []
 
 
@@ -133,7 +133,7 @@ def as_schema_1(file: Path) -> None:
     connection.close()
 
 
-def test_a_store_of_schema_1_is_read_as_it_is(file) -> None:
+def test_schema_1_store_is_read_unchanged(file) -> None:
     with PairStore(file, SESSION) as store:
         fill(store, 2)
     as_schema_1(file)
@@ -143,7 +143,7 @@ def test_a_store_of_schema_1_is_read_as_it_is(file) -> None:
     assert file.read_bytes() == before
 
 
-def test_a_store_of_schema_1_is_brought_to_this_one_with_its_pairs(file) -> None:
+def test_writing_to_schema_1_store_migrates_its_pairs(file) -> None:
     with PairStore(file, SESSION) as store:
         fill(store, 2)
         identity = store.identity
@@ -155,7 +155,7 @@ def test_a_store_of_schema_1_is_brought_to_this_one_with_its_pairs(file) -> None
         assert [one.from_seq for one in store.reader.devices()] == [3]
 
 
-def test_mcap_files_carry_what_the_joints_were_read_with(file, tmp_path) -> None:
+def test_mcap_file_carries_device_record(file, tmp_path) -> None:
     reader = pytest.importorskip("mcap.reader")
     with PairStore(file, SESSION) as store:
         DeviceWatch(Joints(), store, SystemClock()).look()
@@ -168,7 +168,7 @@ def test_mcap_files_carry_what_the_joints_were_read_with(file, tmp_path) -> None
     assert msgspec.json.decode(found["devices/1"]["elbow"]) == ELBOW
 
 
-def test_a_servo_that_is_not_well_shows_in_the_table_within_80_columns() -> None:
+def test_unhealthy_servo_shows_in_80_column_table() -> None:
     hot = ServoStatus("arm", 3, "PH54-200-S500", 46, 0, 0, 24.0, 81.0, 0.12, ["it is too hot: let it cool down"])
     well = ServoStatus("arm", 4, "MX-28", 24, 0, 0, None, None, None, [])
     console = Console(file=StringIO(), width=80)

@@ -83,20 +83,20 @@ def told(model: Model, topic: Topic, times=(0.0,)) -> list:
     return topic.told
 
 
-def test_it_is_told_with_the_stamp_of_the_robot() -> None:
+def test_expected_position_carries_robot_timestamp() -> None:
     assert told(Model(), Topic()) == [TOLD]
 
 
-def test_it_is_told_no_more_often_than_wanted() -> None:
+def test_publishing_rate_is_limited() -> None:
     assert len(told(Model(), Topic(), np.arange(0.0, 0.995, 0.01))) == 10
 
 
-def test_without_a_model_nothing_is_told() -> None:
+def test_nothing_is_published_without_model() -> None:
     assert told(Model(has_frame=False), Topic()) == []
 
 
 @pytest.mark.parametrize("has_sigma", [False, True])
-def test_where_no_data_was_it_is_told_only_with_how_sure_it_is(has_sigma) -> None:
+def test_extrapolated_position_is_published_only_with_sigma(has_sigma) -> None:
     assert bool(told(Model(in_support=False), Topic(has_sigma=has_sigma))) == has_sigma
 
 
@@ -129,7 +129,7 @@ def test_the_topic_comes_with_the_robot_s_joints(tmp_path) -> None:
     assert found[1].period_s == pytest.approx(1 / 30)
 
 
-def test_the_joints_of_a_ros_2_robot_are_read_by_its_driver(tmp_path) -> None:
+def test_joints_of_ros2_robot_use_ros2_driver(tmp_path) -> None:
     source = open_joints(load(tmp_path, ROBOT), SystemClock())
     assert source.joints == ("waist", "shoulder")
     assert type(source).__name__ == "Ros2Joints"
@@ -148,6 +148,6 @@ def test_the_joints_of_a_ros_2_robot_are_read_by_its_driver(tmp_path) -> None:
         ('[drivers.ros2.marker]\nframe = "eye"\ntopic = "9"\n', "no name of a topic"),
     ],
 )
-def test_a_mistake_in_the_table_is_told(tmp_path, tables, says) -> None:
+def test_mistake_in_table_is_reported(tmp_path, tables, says) -> None:
     with pytest.raises(ConfigError, match=says):
         load(tmp_path, tables)

@@ -87,14 +87,14 @@ class Fed:
         return self.learning.counters.pairs, self.learning.counters.last_seq
 
 
-def test_what_was_stored_before_is_learnt_from_history_page_by_page() -> None:
+def test_stored_pairs_are_learnt_page_by_page() -> None:
     fed = Fed(stored=20)
     fed.settle()
     assert fed.learnt == (20, 20)
     assert fed.learning.counters.gaps_recovered == 20
 
 
-def test_published_pairs_are_learnt_in_order_without_asking_for_history_again() -> None:
+def test_published_pairs_are_learnt_without_querying_history() -> None:
     fed = Fed(stored=5)
     fed.settle()
     asked = fed.history.asked
@@ -103,7 +103,7 @@ def test_published_pairs_are_learnt_in_order_without_asking_for_history_again() 
     assert (fed.learnt, fed.history.asked) == ((20, 20), asked)
 
 
-def test_a_gap_is_filled_from_history_before_what_came_after_it_is_learnt() -> None:
+def test_gap_is_filled_from_history_before_later_pairs() -> None:
     fed = Fed(stored=5)
     fed.settle()
     fed.history.pairs = PAIRS[:20]
@@ -113,7 +113,7 @@ def test_a_gap_is_filled_from_history_before_what_came_after_it_is_learnt() -> N
 
 
 @pytest.mark.parametrize("again", [[4], [0, 4], [4, 4, 3]])
-def test_a_pair_that_comes_again_is_not_learnt_again(again) -> None:
+def test_repeated_pair_is_not_learnt_again(again) -> None:
     fed = Fed(stored=5)
     fed.settle()
     fed.publish(*(PAIRS[k] for k in again))
@@ -122,7 +122,7 @@ def test_a_pair_that_comes_again_is_not_learnt_again(again) -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_however_publications_are_lost_doubled_and_shuffled_each_pair_is_learnt_once(seed) -> None:
+def test_lost_doubled_shuffled_publications_are_learnt_once(seed) -> None:
     rng = np.random.default_rng(seed)
     fed = Fed()
     for end in (10, 25, 40):
@@ -136,7 +136,7 @@ def test_however_publications_are_lost_doubled_and_shuffled_each_pair_is_learnt_
     assert fed.learnt == (40, 40)
 
 
-def test_more_publications_than_there_is_room_for_are_made_up_from_history() -> None:
+def test_queue_overflow_is_recovered_from_history() -> None:
     fed = Fed(stored=1)
     fed.settle()
     fed.history.pairs = PAIRS[:10]
@@ -145,7 +145,7 @@ def test_more_publications_than_there_is_room_for_are_made_up_from_history() -> 
     assert fed.learnt == (10, 10)
 
 
-def test_while_nobody_answers_the_feed_asks_again_and_then_catches_up() -> None:
+def test_unanswered_feed_retries_and_catches_up() -> None:
     fed = Fed(stored=10)
     fed.history.answers = False
     fed.feed.step(0.0)
@@ -157,7 +157,7 @@ def test_while_nobody_answers_the_feed_asks_again_and_then_catches_up() -> None:
     assert fed.learnt == (10, 10)
 
 
-def test_what_comes_while_paused_is_learnt_after_resume() -> None:
+def test_pairs_published_while_paused_are_learnt_after_resume() -> None:
     fed = Fed(stored=5)
     fed.settle()
     fed.feed.pause()
@@ -174,7 +174,7 @@ def test_what_comes_while_paused_is_learnt_after_resume() -> None:
 # --- pairs that the sampler no longer keeps
 
 
-def test_a_new_learner_begins_with_the_oldest_pair_that_is_left(caplog) -> None:
+def test_new_learner_starts_at_oldest_kept_pair(caplog) -> None:
     fed = Fed(stored=20)
     fed.history.gone = 12
     fed.settle()
@@ -183,7 +183,7 @@ def test_a_new_learner_begins_with_the_oldest_pair_that_is_left(caplog) -> None:
     assert "has no pairs 1 to 12 any more" in caplog.text
 
 
-def test_a_learner_that_was_away_too_long_goes_on_and_counts_what_it_missed() -> None:
+def test_returning_learner_continues_and_counts_missed_pairs() -> None:
     fed = Fed(stored=5)
     fed.settle()
     fed.history.pairs, fed.history.gone = PAIRS[:30], 20
@@ -193,7 +193,7 @@ def test_a_learner_that_was_away_too_long_goes_on_and_counts_what_it_missed() ->
     assert (fed.learning.counters.missed, fed.feed.problem) == (15, None)
 
 
-def test_pairs_that_go_while_a_learner_catches_up_are_skipped_too() -> None:
+def test_pairs_deleted_during_catch_up_are_skipped() -> None:
     fed = Fed(stored=30)
     fed.history.goes = 10  # with each answer
     fed.settle()
@@ -233,7 +233,7 @@ def wrong(pair: Pair) -> list[bytes]:
 
 
 @pytest.mark.parametrize("kind", range(6))
-def test_a_pair_that_is_none_is_refused_counted_and_not_learnt(kind) -> None:
+def test_invalid_pair_is_refused_and_counted(kind) -> None:
     fed = Fed(stored=5)
     fed.settle()
     fed.feed.offer(wrong(PAIRS[5])[kind])
@@ -241,7 +241,7 @@ def test_a_pair_that_is_none_is_refused_counted_and_not_learnt(kind) -> None:
     assert (fed.learnt, fed.learning.counters.refused) == ((5, 5), 1)
 
 
-def test_after_a_pair_that_is_none_the_right_one_is_learnt() -> None:
+def test_valid_pair_is_learnt_after_invalid_one() -> None:
     fed = Fed(stored=5)
     fed.settle()
     fed.feed.offer(wrong(PAIRS[5])[2])
@@ -250,7 +250,7 @@ def test_after_a_pair_that_is_none_the_right_one_is_learnt() -> None:
     assert fed.learnt == (8, 8)
 
 
-def test_pairs_of_another_store_are_not_mixed_in_and_the_remedy_is_named() -> None:
+def test_pairs_of_another_store_are_rejected_with_remedy() -> None:
     fed = Fed(stored=5)
     fed.settle()
     fed.publish(make_pair(6, PAIRS[5].q, PAIRS[5].x, store="other"))
@@ -260,7 +260,7 @@ def test_pairs_of_another_store_are_not_mixed_in_and_the_remedy_is_named() -> No
     assert "reset_to_prior" in fed.feed.problem
 
 
-def test_an_older_copy_of_the_store_is_told() -> None:
+def test_older_copy_of_store_is_reported() -> None:
     fed = Fed(stored=10)
     fed.settle()
     fed.history.pairs = PAIRS[:4]
@@ -271,7 +271,7 @@ def test_an_older_copy_of_the_store_is_told() -> None:
 
 
 @pytest.mark.parametrize("spoilt", [[7], [1], [6, 7, 8], [1, 20]])
-def test_stored_pairs_that_are_none_are_refused_and_those_after_them_learnt(spoilt) -> None:
+def test_invalid_stored_pairs_are_refused_later_ones_learnt(spoilt) -> None:
     fed = Fed(stored=20)
     for seq in spoilt:
         fed.history.pairs[seq - 1] = replace(PAIRS[seq - 1], x=np.array([np.nan, 0.0, 1.0]))
@@ -281,7 +281,7 @@ def test_stored_pairs_that_are_none_are_refused_and_those_after_them_learnt(spoi
     assert f"pair {spoilt[-1]} is not a PairMessage" in fed.feed.refused
 
 
-def test_a_history_that_is_refused_is_told_until_it_is_given() -> None:
+def test_refused_history_is_reported_until_granted() -> None:
     fed = Fed(stored=10)
     fed.history.refusal = "the store is damaged"
     fed.feed.step(0.0)
@@ -314,7 +314,7 @@ def test_before_any_pair_nothing_has_an_age() -> None:
     assert (fed.feed.behind, age_s(fed)) == (0, None)
 
 
-def test_a_learner_that_is_behind_is_as_old_as_its_newest_pair() -> None:
+def test_lagging_learner_has_age_of_newest_learnt_pair() -> None:
     fed = timed(10)
     fed.settle()
     fed.feed.pause()
@@ -325,7 +325,7 @@ def test_a_learner_that_is_behind_is_as_old_as_its_newest_pair() -> None:
     assert age_s(fed) == pytest.approx(25.0 + 3.0)
 
 
-def test_pages_of_history_that_are_left_count_as_behind() -> None:
+def test_unread_history_pages_count_as_behind() -> None:
     fed, seen = timed(40), []
     learn = fed.learning.learn
 
@@ -339,7 +339,7 @@ def test_pages_of_history_that_are_left_count_as_behind() -> None:
     assert (fed.feed.behind, seen[PAGE][0]) == (0, 40 - PAGE)
 
 
-def test_a_learner_that_has_all_pairs_ages_from_the_newest() -> None:
+def test_up_to_date_learner_ages_from_newest_pair() -> None:
     fed = timed(5)
     fed.settle()
     fed.publish(TIMED[5])
@@ -349,7 +349,7 @@ def test_a_learner_that_has_all_pairs_ages_from_the_newest() -> None:
 
 
 @pytest.mark.parametrize("payload", [b"", b"{}", encode({"store": "another", "seq": 9, "utc": ""})])
-def test_what_is_no_pair_of_this_store_is_not_counted(payload: bytes) -> None:
+def test_foreign_or_invalid_payload_leaves_backlog_unchanged(payload: bytes) -> None:
     fed = timed(5)
     fed.settle()
     fed.feed.offer(payload)
@@ -357,7 +357,7 @@ def test_what_is_no_pair_of_this_store_is_not_counted(payload: bytes) -> None:
 
 
 @pytest.mark.parametrize("utc", ["", "yesterday", "2026-11-21T12:00:00", "1970-01-01T00:00:00+00:00"])
-def test_a_time_that_tells_nothing_makes_nothing_older(utc: str) -> None:
+def test_unusable_utc_does_not_increase_age(utc: str) -> None:
     fed = timed(5)
     fed.settle()
     fed.publish(replace(TIMED[5], utc=utc))

@@ -38,12 +38,12 @@ def walk() -> Walk:
     return Walk(Gate(DaemonConfig(), TWO_REVOLUTE))
 
 
-def test_the_first_measurement_is_the_first_of_segment_one(walk) -> None:
+def test_first_measurement_starts_segment_one(walk) -> None:
     assert walk.offer(10, 20) == 1
 
 
 @given(step=st.floats(1.001, 2.999), direction=st.floats(0, 2 * np.pi))
-def test_a_step_of_one_to_three_degrees_in_any_direction_goes_on_with_the_segment(step, direction) -> None:
+def test_step_of_one_to_three_degrees_continues_segment(step, direction) -> None:
     walk = Walk(Gate(DaemonConfig(), TWO_REVOLUTE))
     walk.offer(10, 20)
     assert walk.offer(10 + step * np.cos(direction), 20 + step * np.sin(direction)) == 1
@@ -62,7 +62,7 @@ def test_small_steps_add_up_to_a_pair(walk) -> None:
     assert verdicts == [Reason.TOO_NEAR, Reason.TOO_NEAR, 1] * 2
 
 
-def test_a_larger_step_is_the_first_pair_of_a_new_segment(walk) -> None:
+def test_larger_step_starts_new_segment(walk) -> None:
     walk.offer(0, 0)
     assert [walk.offer(3.1, 0), walk.offer(5.1, 0)] == [2, 2]
 
@@ -72,7 +72,7 @@ def test_a_pause_starts_a_new_segment(walk) -> None:
     assert walk.offer(2, 0, after_s=1.1) == 2
 
 
-def test_a_short_loss_of_the_marker_keeps_the_segment(walk) -> None:
+def test_short_marker_loss_keeps_segment(walk) -> None:
     walk.offer(0, 0)
     assert walk.offer(2, 0, after_s=0.9) == 1
 
@@ -83,18 +83,18 @@ def test_a_broken_segment_ends_even_without_a_pause(walk) -> None:
     assert walk.offer(2, 0) == 2
 
 
-def test_an_arm_at_rest_gives_no_pair_however_long_it_rests(walk) -> None:
+def test_resting_arm_gives_no_further_pair(walk) -> None:
     walk.offer(0, 0)
     assert {walk.offer(0.1, 0, after_s=10.0) for _ in range(5)} == {Reason.TOO_NEAR}
 
 
-def test_a_restart_goes_on_after_the_last_pair_in_a_new_segment() -> None:
+def test_restart_continues_from_last_pair_in_new_segment() -> None:
     last = Pair("store", 7, 4, 1e9, "", frozen_array(at_deg(10, 20)), frozen_array(HERE), frozen_array(np.eye(3)))
     walk = Walk(Gate(DaemonConfig(), TWO_REVOLUTE, last))
     assert [walk.offer(10.5, 20), walk.offer(12, 20), walk.offer(14, 20)] == [Reason.TOO_NEAR, 5, 5]
 
 
-def test_a_prismatic_joint_counts_with_its_metres_per_degree() -> None:
+def test_prismatic_step_is_scaled_by_metres_per_degree() -> None:
     walk = Walk(Gate(DaemonConfig(metres_per_degree=0.01), np.array([True])))
     walk.t += FRAME_S
     walk.gate.offer(walk.t, np.array([0.5]), HERE)
@@ -107,13 +107,13 @@ def test_an_angle_that_wraps_is_no_jump(walk) -> None:
     assert walk.offer(-179, 0) == 1
 
 
-def test_a_marker_that_jumps_for_one_frame_is_refused_and_changes_nothing(walk) -> None:
+def test_single_frame_marker_jump_is_rejected(walk) -> None:
     walk.offer(0, 0)
     assert walk.offer(2, 0, x=moved(0, 1.0, 0)) is Reason.IMPLAUSIBLE_SPEED
     assert walk.offer(2, 0) == 1
 
 
-def test_a_marker_that_stays_where_it_jumped_is_believed_in_a_new_segment(walk) -> None:
+def test_persistent_marker_jump_starts_new_segment(walk) -> None:
     walk.offer(0, 0)
     there = moved(0, 0.25, 0)  # a longer tool
     verdicts = [walk.offer(2.0 * i, 0, x=there) for i in range(1, 5)]
@@ -129,12 +129,12 @@ def test_marks_that_flicker_between_places_are_not_confirmed(walk) -> None:
     assert verdicts == {Reason.IMPLAUSIBLE_SPEED}
 
 
-def test_after_a_long_loss_the_marker_may_be_anywhere(walk) -> None:
+def test_marker_may_be_anywhere_after_long_loss(walk) -> None:
     walk.offer(0, 0)
     assert walk.offer(2, 0, x=moved(0, 5.0, 0), after_s=1.5) == 2
 
 
-def test_an_arm_at_rest_is_believed_at_its_last_fix_not_at_its_last_pair(walk) -> None:
+def test_speed_check_uses_last_fix_not_last_pair(walk) -> None:
     walk.offer(0, 0)
     for i in range(1, 60):
         walk.offer(0.01, 0, x=moved(0, 0.02 * i, 0))

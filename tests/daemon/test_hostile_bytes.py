@@ -109,9 +109,7 @@ def test_any_bytes_are_a_message_or_an_error(kind: type, encoding: str, data: by
 
 @quick
 @given(st.data(), st.sampled_from(KINDS), st.sampled_from([wire.JSON, wire.MSGPACK]))
-def test_any_values_in_a_messages_fields_are_a_message_or_an_error(
-    data: st.DataObject, kind: type, encoding: str
-) -> None:
+def test_arbitrary_message_fields_decode_or_are_refused(data: st.DataObject, kind: type, encoding: str) -> None:
     names = [field.encode_name for field in msgspec.structs.fields(kind)]
     values = data.draw(st.dictionaries(st.sampled_from(names), anything, max_size=len(names)))
     payload = wire.encode(values, encoding)
@@ -170,7 +168,7 @@ def test_wild_numbers_get_finite_answers_or_errors(answers: Answers, x: list, q:
 
 
 @pytest.mark.parametrize("x", [[1e308, 0.0, 0.0], [0.0, -1e155, 0.0], [2000.0, 0.0, 0.0]])
-def test_a_position_that_is_not_in_metres_is_refused(answers: Answers, x: list[float]) -> None:
+def test_position_not_in_metres_is_refused(answers: Answers, x: list[float]) -> None:
     request = Request({}, wire.encode({"x": x}), wire.JSON)
     with pytest.raises(RequestError, match="positions are in metres, at most 1000 on each axis"):
         answers.ik(request)
@@ -178,7 +176,7 @@ def test_a_position_that_is_not_in_metres_is_refused(answers: Answers, x: list[f
 
 @quick
 @given(st.dictionaries(st.sampled_from(["from", "to", "limit"]), st.text(max_size=25)))
-def test_any_parameters_of_the_history_are_pairs_or_an_error(parameters: dict[str, str]) -> None:
+def test_arbitrary_history_parameters_are_answered_or_refused(parameters: dict[str, str]) -> None:
     class Empty:
         identity = "uuid"
 
@@ -292,11 +290,11 @@ def test_thousands_of_mangled_files_are_read_or_refused(tmp_path: Path, data: st
         ("servo_writes.jsonl", WRITES.replace(b"feet", b"f\xff\xff\xff"), read_writes),
     ],
 )
-def test_json_that_is_none_is_refused(tmp_path: Path, name: str, data: bytes, read: Callable[[Path], object]) -> None:
+def test_malformed_json_is_refused(tmp_path: Path, name: str, data: bytes, read: Callable[[Path], object]) -> None:
     assert read_bytes(tmp_path, name, data, read) is None
 
 
-def test_a_control_character_in_a_scan_is_escaped_in_robot_toml(tmp_path: Path) -> None:
+def test_control_character_in_scan_is_escaped_in_toml(tmp_path: Path) -> None:
     tables = read_bytes(tmp_path, "scan.json", SCAN.replace(b"ttyUSB0", b"tty\x7f\\n"), read_servos)
     assert isinstance(tables, dict)
     assert tables["drivers"]["dynamixel"]["buses"]["arm"]["port"] == "/dev/tty\x7f\n"
@@ -313,7 +311,7 @@ def test_a_control_character_in_a_scan_is_escaped_in_robot_toml(tmp_path: Path) 
         "x = '" + "a" * 5_000_000 + "'",
     ],
 )
-def test_a_toml_file_that_would_take_for_ever_is_refused(tmp_path: Path, text: str) -> None:
+def test_toml_file_of_excessive_cost_is_refused(tmp_path: Path, text: str) -> None:
     (tmp_path / "robot.toml").write_text(text + "\n")
     with pytest.raises(ConfigError):
         read_robot_toml(tmp_path / "robot.toml")
@@ -350,7 +348,7 @@ ENTITIES = '<!DOCTYPE r [<!ENTITY a "aaaaaaaaaa">' + "".join(
         (b'<robot name="' + b"a" * (17 * 2**20) + b'"/>', "larger than 16 MiB"),
     ],
 )
-def test_a_urdf_that_would_take_for_ever_or_read_other_files_is_refused(tmp_path: Path, urdf: bytes, said: str) -> None:
+def test_urdf_bomb_or_external_entity_is_refused(tmp_path: Path, urdf: bytes, said: str) -> None:
     (tmp_path / "a.urdf").write_bytes(urdf)
     with pytest.raises(ConfigError, match=said):
         UrdfTree.load(tmp_path / "a.urdf")
@@ -378,7 +376,7 @@ def test_a_recording_of_absurd_width_is_refused(tmp_path: Path, text: bytes) -> 
         Recording.read(tmp_path / "a.csv", JOINTS)
 
 
-def test_a_small_parquet_file_of_billions_of_rows_is_refused_unread(tmp_path: Path) -> None:
+def test_parquet_file_of_too_many_rows_is_refused(tmp_path: Path) -> None:
     arrow, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
     table = arrow.table(dict.fromkeys((*JOINTS, "x", "y", "z"), arrow.nulls(1_000_000, arrow.float64())))
     with parquet.ParquetWriter(tmp_path / "a.parquet", table.schema) as writer:
@@ -446,7 +444,7 @@ def test_a_forged_checkpoint_is_restored_or_refused(tmp_path: Path, stored, plac
 
 @quick
 @given(st.lists(st.binary(max_size=60) | st.just(b"{}"), max_size=5))
-def test_published_bytes_that_are_no_pair_are_counted_and_learning_goes_on(payloads: list[bytes]) -> None:
+def test_malformed_published_bytes_leave_feed_queue_empty(payloads: list[bytes]) -> None:
     from bodyschema.daemon.learner.feed import PairFeed
     from bodyschema.interfaces.clock import SystemClock
 

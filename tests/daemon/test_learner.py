@@ -99,7 +99,7 @@ def test_a_learner_with_all_pairs_is_well(learner: tuple[Learner, Wire]) -> None
     assert (status.pairs, status.behind, status.age_s, status.health) == (5, 0, 0.0, [])
 
 
-def test_a_learner_far_behind_says_so(learner: tuple[Learner, Wire]) -> None:
+def test_learner_far_behind_reports_its_backlog(learner: tuple[Learner, Wire]) -> None:
     wire = learner[1]
     late = pair(4000)
     wire.handlers[KEYS.pair](encode(pair_to_wire(late)).replace(b"12:00:00.000", b"12:05:00.000"))
@@ -109,7 +109,7 @@ def test_a_learner_far_behind_says_so(learner: tuple[Learner, Wire]) -> None:
     assert decode(wire.ask(KEYS.predict, {"q": [0.1, 0.2]}), PredictReply).age_s == 300.0
 
 
-def test_a_told_tool_change_is_told_with_how_to_undo_it(learner: tuple[Learner, Wire]) -> None:
+def test_tool_changed_command_reports_how_to_undo_it(learner: tuple[Learner, Wire]) -> None:
     wire = learner[1]
     reply = decode(wire.ask(KEYS.command("learner"), CommandRequest("tool_changed")), CommandReply)
     assert "`bodyschema command rollback` takes it back" in reply.message
@@ -118,7 +118,7 @@ def test_a_told_tool_change_is_told_with_how_to_undo_it(learner: tuple[Learner, 
     assert (change.kind, change.found, change.can_roll_back) == ("tool", False, True)
 
 
-def test_new_pairs_tell_on_how_many_their_error_rests(learner: tuple[Learner, Wire]) -> None:
+def test_status_counts_pairs_behind_prequential_error(learner: tuple[Learner, Wire]) -> None:
     status = learner[1].status()
     assert status.prequential_pairs == 5
     assert set(status.prequential_m) == {"prior", "nlms"}
@@ -157,7 +157,7 @@ def answers_of(tmp_path: Path, text: str) -> tuple[LearnerStatus, PredictReply]:
     return wire.status(), decode(wire.ask(KEYS.predict, {"q": [0.1, 0.2]}), PredictReply)
 
 
-def test_predictions_contain_what_calibration_and_tag_leave(tmp_path: Path) -> None:
+def test_predictions_include_calibration_and_tag_size_uncertainty(tmp_path: Path) -> None:
     calibrated(tmp_path)
     (status, reply), (_, sure) = (
         answers_of(tmp_path, text) for text in (TAG_CAMERA, TAG_CAMERA.replace("0.0005", "0.0"))
@@ -191,7 +191,7 @@ port = 5005
 """
 
 
-def test_positions_of_another_source_do_not_share_the_cameras_error(tmp_path: Path) -> None:
+def test_mocap_positions_have_no_common_camera_error(tmp_path: Path) -> None:
     calibrated(tmp_path)
     status, _ = answers_of(tmp_path, TAG_CAMERA + MOCAP)
     assert status.common_error_m is None

@@ -65,7 +65,7 @@ def asked(endpoint: str, robot: str) -> LearnerStatus:
                 raise
 
 
-def test_every_robot_is_answered_for_by_the_one_process(robots: list[Config]) -> None:
+def test_one_process_answers_for_every_robot(robots: list[Config]) -> None:
     wishes = SignalFlags()
     host = threading.Thread(target=run_learners, args=(robots, SystemClock(), wishes, Notifier()))
     host.start()
@@ -124,7 +124,7 @@ class Attended:
             self.wishes.end()
 
 
-def test_a_reload_that_is_wished_for_in_mid_round_is_done_once_for_every_robot() -> None:
+def test_mid_round_reload_reaches_every_robot_once() -> None:
     wishes, clock = SignalFlags(), SystemClock()
     learners = [Attended(wishes, wishing) for wishing in (False, True, False)]
     service = Service(Notifier(), (), clock)
@@ -147,7 +147,7 @@ def test_a_folder_stands_for_the_robots_in_it(tmp_path: Path, robots: list[Confi
     assert descriptions([tmp_path]) == [config.file for config in robots]
 
 
-def test_what_else_lies_in_the_folder_is_no_robot(tmp_path: Path, robots: list[Config]) -> None:
+def test_other_toml_in_folder_is_not_a_robot(tmp_path: Path, robots: list[Config]) -> None:
     (tmp_path / "cameras.toml").write_text('format = "bodyschema stereo rig 1"\n')
     assert descriptions([tmp_path]) == [config.file for config in robots]
 
@@ -164,7 +164,7 @@ def test_a_description_out_of_reach_is_named(tmp_path: Path) -> None:
         configs_of([beyond], None)
 
 
-def test_each_of_several_robots_has_a_folder_of_its_own_for_its_state(tmp_path: Path, robots: list[Config]) -> None:
+def test_each_robot_has_its_own_state_folder(tmp_path: Path, robots: list[Config]) -> None:
     configs = configs_of([config.file for config in robots], tmp_path / "states")
     assert [config.state_dir for config in configs] == [tmp_path / "states" / name for name in ("left", "right")]
 
@@ -215,9 +215,7 @@ def pairs(count: int) -> tuple[np.ndarray, np.ndarray]:
     return np.zeros((count, JOINTS)), np.zeros((count, 3))
 
 
-def test_what_a_robot_tells_waits_while_the_process_solves_for_another(
-    shared: SolverPool, process: ScriptedProcess
-) -> None:
+def test_solver_orders_wait_while_another_robot_is_solved(shared: SolverPool, process: ScriptedProcess) -> None:
     first, second = shared.seat(), shared.seat()
     for seat in (first, second):
         seat.start(TASK)
@@ -231,7 +229,7 @@ def test_what_a_robot_tells_waits_while_the_process_solves_for_another(
     assert first.poll() is not None
 
 
-def test_the_robot_whose_pairs_grew_most_has_the_next_turn(shared: SolverPool, process: ScriptedProcess) -> None:
+def test_robot_with_most_new_pairs_is_solved_next(shared: SolverPool, process: ScriptedProcess) -> None:
     busy, old, new = (shared.seat() for _ in range(3))
     for seat, count in ((busy, 10), (old, 10), (new, 10)):
         seat.learn(*pairs(count))

@@ -50,7 +50,7 @@ def of_journal(status: os.stat_result) -> dict[str, str]:
     return {"JOURNAL_STREAM": f"{status.st_dev}:{status.st_ino}"}
 
 
-def test_the_journal_gets_one_line_an_event_with_its_priority(tmp_path) -> None:
+def test_journal_gets_one_prioritised_line_per_event(tmp_path) -> None:
     assert logged(tmp_path / "log", of_journal) == [
         "<4>bodyschema.daemon.sampler.sampler: the disk | is nearly full",
         "<6>bodyschema.daemon.sampler.sampler: all is well",
@@ -58,9 +58,7 @@ def test_the_journal_gets_one_line_an_event_with_its_priority(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("inherited", [{}, {"JOURNAL_STREAM": "8:1"}])
-def test_a_person_gets_time_and_level_also_in_a_terminal_that_the_journal_s_session_started(
-    tmp_path, inherited
-) -> None:
+def test_terminal_log_has_time_despite_inherited_journal_stream(tmp_path, inherited) -> None:
     assert logged(tmp_path / "log", lambda _: inherited)[-1].endswith(
         "INFO    bodyschema.daemon.sampler.sampler: all is well"
     )
@@ -79,7 +77,7 @@ def test_malformed_requests_fill_no_terminal(tmp_path) -> None:
     assert (first, again[:13]) == ("Invalid HTTP request received.", "49 more times")
 
 
-def test_a_disk_that_is_full_again_after_each_pair_fills_no_terminal() -> None:
+def test_intermittently_full_disk_does_not_flood_log() -> None:
     stream, said = io.StringIO(), [StoreUnwritable("the disk is full"), 1] * 50
     logs.set_up(environment={}, stream=stream)
     writer = ResilientWriter(cast(PairStore, Flapping(said)), SystemClock())
@@ -142,7 +140,7 @@ def test_an_error_is_one_line_with_its_traceback() -> None:
     assert journal.lines[0].endswith("| ValueError: too far")
 
 
-def test_what_is_said_again_is_counted_and_told_when_a_minute_is_over() -> None:
+def test_repeated_message_is_summarised_after_a_minute() -> None:
     journal = Journal()
     for _ in range(100):
         journal.say("no answer")
@@ -151,7 +149,7 @@ def test_what_is_said_again_is_counted_and_told_when_a_minute_is_over() -> None:
     assert journal.lines == ["<4>bus: no answer", "<4>bus: 99 more times in 61 s: no answer", "<4>bus: all is well"]
 
 
-def test_after_a_minute_it_is_said_again() -> None:
+def test_message_is_logged_again_after_a_minute() -> None:
     journal = Journal()
     journal.say("no answer")
     journal.now.time = 61.0
@@ -159,7 +157,7 @@ def test_after_a_minute_it_is_said_again() -> None:
     assert journal.lines == ["<4>bus: no answer"] * 2
 
 
-def test_a_flood_that_differs_in_its_numbers_is_cut_off() -> None:
+def test_flood_differing_only_in_numbers_is_cut_off() -> None:
     journal = Journal()
     for number in range(500):
         journal.say(f"pair {number} was refused")
@@ -169,21 +167,21 @@ def test_a_flood_that_differs_in_its_numbers_is_cut_off() -> None:
     assert journal.lines[-1] == f"<4>bus: {500 - logs.OFTEN} more times in 0 s: pair # was refused"
 
 
-def test_two_joints_with_the_same_trouble_are_both_named() -> None:
+def test_same_warning_for_two_joints_names_both() -> None:
     journal = Journal()
     for joint in (3, 4, 3, 4):
         journal.say(f"joint {joint} is hot")
     assert journal.lines == ["<4>bus: joint 3 is hot", "<4>bus: joint 4 is hot"]
 
 
-def test_an_error_is_not_kept_back_for_a_warning_of_the_same_words() -> None:
+def test_error_is_not_suppressed_by_identical_warning() -> None:
     journal = Journal()
     for level in (logging.WARNING, logging.ERROR):
         journal.say("the bus is silent", level)
     assert journal.lines == ["<4>bus: the bus is silent", "<3>bus: the bus is silent"]
 
 
-def test_what_was_said_is_forgotten_before_it_fills_the_memory() -> None:
+def test_number_of_remembered_messages_is_bounded() -> None:
     journal = Journal()
     for k in range(5000):
         journal.say("x" * (k % 1000))
@@ -205,7 +203,7 @@ def test_signals_are_handled_as_before_afterwards() -> None:
     assert signal.getsignal(signal.SIGTERM) is before
 
 
-def test_a_hangup_calls_for_a_reload_where_one_is_wanted() -> None:
+def test_sighup_triggers_reload() -> None:
     called, before = [], signal.getsignal(signal.SIGHUP)
     with on_termination(lambda: called.append("stop"), reload=lambda: called.append("reload")):
         signal.raise_signal(signal.SIGHUP)

@@ -27,7 +27,7 @@ def taken(desk: QueryLimiter[str], count: int) -> list[str]:
     return [turn[0] for turn in (desk.take() for _ in range(count)) if turn is not None]
 
 
-def test_those_who_ask_take_turns_however_much_one_asks() -> None:
+def test_sources_take_turns_despite_a_greedy_one() -> None:
     desk = reception()
     for number in range(50):
         desk.admit("greedy", 0, f"greedy {number}")
@@ -42,7 +42,7 @@ def test_queries_of_one_source_keep_their_order() -> None:
     assert taken(desk, 5) == list("01234")
 
 
-def test_a_source_that_lets_too_many_wait_is_told_how_many_may() -> None:
+def test_source_over_its_waiting_limit_is_refused() -> None:
     desk = reception(waiting=3)
     for number in range(3):
         desk.admit("one", 0, str(number))
@@ -52,7 +52,7 @@ def test_a_source_that_lets_too_many_wait_is_told_how_many_may() -> None:
     assert len(taken(desk, 4)) == 4
 
 
-def test_a_source_that_asks_too_often_is_told_how_often_it_may_and_may_again_after_a_rest() -> None:
+def test_source_over_its_rate_is_refused_until_rest() -> None:
     watch = Watch()
     desk = reception(watch, rate_hz=10.0, burst=2)
     desk.admit("one", 0, "a")
@@ -63,12 +63,12 @@ def test_a_source_that_asks_too_often_is_told_how_often_it_may_and_may_again_aft
     desk.admit("one", 0, "d")
 
 
-def test_a_request_that_is_too_large_is_told_the_largest() -> None:
+def test_oversized_request_error_names_limit() -> None:
     with pytest.raises(RequestError, match="the request has 11 bytes; send at most 10"):
         reception(request_bytes=10).admit("one", 11, "large")
 
 
-def test_what_waits_takes_no_more_room_than_is_said() -> None:
+def test_waiting_bytes_are_limited_per_source_and_overall() -> None:
     limits = Limits(waiting_bytes=100, request_bytes=100)
     desk: QueryLimiter[str] = QueryLimiter(limits, Watch())
     for name in range(EVERYBODYS):
@@ -81,7 +81,7 @@ def test_what_waits_takes_no_more_room_than_is_said() -> None:
     desk.admit("another", 100, "now there is room")
 
 
-def test_who_waited_too_long_is_told_so_in_the_place_of_an_answer() -> None:
+def test_query_that_waited_too_long_is_refused() -> None:
     watch = Watch()
     desk = reception(watch, wait_s=10.0)
     desk.admit("one", 0, "late")
@@ -91,7 +91,7 @@ def test_who_waited_too_long_is_told_so_in_the_place_of_an_answer() -> None:
     assert "the query waited 11 s for its turn; at most 10 s" in str(refused)
 
 
-def test_ever_new_names_are_forgotten_again_and_at_last_refused() -> None:
+def test_served_sources_are_forgotten_and_excess_ones_refused() -> None:
     desk = reception(sources=2)
     for name in "abc":
         desk.admit(name, 0, name)

@@ -45,7 +45,7 @@ def read_until_reading(source: ReconnectingSource[JointReading], timeout_s: floa
     raise AssertionError("no reading came")
 
 
-def test_a_source_is_read_as_it_is_while_all_is_well() -> None:
+def test_healthy_source_is_read_unchanged() -> None:
     with reopening(Scripted([READING])) as source:
         assert source.read(0.1) is READING
 
@@ -56,7 +56,7 @@ def test_the_first_opening_must_succeed() -> None:
         pass
 
 
-def test_a_lost_source_is_closed_and_opened_again_after_a_wait() -> None:
+def test_lost_source_is_closed_and_reopened_after_wait() -> None:
     script = Scripted([SourceLost("unplugged"), READING])
     with reopening(script) as source:
         nothing = read_until_reading(source)
@@ -73,7 +73,7 @@ def test_the_waits_double_up_to_half_a_minute() -> None:
     assert clock.t - 100.0 == pytest.approx(0.5 + 1 + 2 + 4 + 8 + 16 + 30 + 30 + 30)
 
 
-def test_a_loss_is_logged_once_however_long_it_lasts(caplog) -> None:
+def test_long_loss_is_logged_once(caplog) -> None:
     script = Scripted([SourceLost("unplugged"), READING], openings=[None, *[SourceLost("still away")] * 5])
     with reopening(script) as source, caplog.at_level(logging.WARNING):
         read_until_reading(source)
@@ -82,14 +82,14 @@ def test_a_loss_is_logged_once_however_long_it_lasts(caplog) -> None:
     ]
 
 
-def test_a_source_that_opens_but_cannot_be_read_is_tried_less_and_less_often() -> None:
+def test_unreadable_reopened_source_is_retried_with_growing_waits() -> None:
     clock, script = SteppedClock(), Scripted([*[SourceLost("dead")] * 5, READING])
     with ReconnectingSource(script, "the encoders", clock, clock.sleep) as source:
         read_until_reading(source)
     assert clock.t - 100.0 == pytest.approx(0.5 + 1 + 2 + 4 + 8)
 
 
-def test_a_source_that_opens_but_cannot_be_read_is_not_called_back(caplog) -> None:
+def test_unreadable_reopened_source_is_not_logged_as_back(caplog) -> None:
     with reopening(Scripted([*[SourceLost("dead")] * 5, READING])) as source, caplog.at_level(logging.INFO):
         read_until_reading(source)
     assert [record.message for record in caplog.records] == [
@@ -98,7 +98,7 @@ def test_a_source_that_opens_but_cannot_be_read_is_not_called_back(caplog) -> No
     ]
 
 
-def test_the_trouble_is_told_until_the_source_is_back() -> None:
+def test_trouble_is_reported_until_source_is_back() -> None:
     with reopening(Scripted([SourceLost("unplugged"), READING])) as source:
         source.read(0.1)
         assert source.trouble == "the encoders are lost (unplugged); trying to open them again"
@@ -113,14 +113,14 @@ def test_every_loss_is_counted() -> None:
         assert source.losses == 2
 
 
-def test_a_source_that_is_lost_in_the_end_is_closed_once() -> None:
+def test_source_lost_at_the_end_is_closed_once() -> None:
     script = Scripted([SourceLost("unplugged")])
     with reopening(script) as source:
         source.read(0.1)
     assert script.closed == 1
 
 
-def test_a_source_that_can_be_looked_for_cheaply_is_opened_again_sooner() -> None:
+def test_cheaply_probed_source_is_reopened_sooner() -> None:
     gone = SourceLost("unplugged", retry_s=0.2)
     script = Scripted([gone, READING], openings=[None, *[gone] * 20])
     clock = SteppedClock()
@@ -129,7 +129,7 @@ def test_a_source_that_can_be_looked_for_cheaply_is_opened_again_sooner() -> Non
     assert clock.t == pytest.approx(100.0 + 21 * 0.2)
 
 
-def test_what_only_a_new_process_may_open_ends_this_one() -> None:
+def test_device_forbidden_to_this_process_raises_source_error() -> None:
     clock = SteppedClock()
     script = Scripted([SourceLost("unplugged"), READING], openings=[None, SourceLost("not permitted")])
     source = ReconnectingSource(script, "the encoders", clock, clock.sleep, forbidden=lambda: "/dev/ttyUSB1")
@@ -172,7 +172,7 @@ class Exchanged:
     ],
     ids=["another_serial", "exchanged", "another_size"],
 )
-def test_other_cameras_are_told_of_and_the_calibrated_ones_waited_for(other, said, caplog) -> None:
+def test_exchanged_cameras_are_reported_until_calibrated_ones_return(other, said, caplog) -> None:
     right = (("A1", "B2"), SIZE)
     eyes = Exchanged([right, other, other, right])
     camera = RectifiedCamera(eyes, known_rig(webcams(np.random.default_rng(6))))

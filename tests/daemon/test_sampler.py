@@ -95,7 +95,7 @@ def command(bus: ZenohSession, name: str) -> str:
 # --- the path of a pair
 
 
-def test_each_frame_of_a_walk_becomes_a_pair_with_the_angles_of_its_time(config) -> None:
+def test_each_frame_becomes_pair_with_its_joint_angles(config) -> None:
     walk = Walk(config.robot, 20)
     pairs, _ = sample(config, walk.sources())
     assert np.array_equal([pair.q for pair in pairs], walk.q)
@@ -117,7 +117,7 @@ def test_a_pair_keeps_the_fix_as_it_came(config) -> None:
     assert (pair.t, pair.x.tolist(), pair.centres_px) == (fix.t, fix.x.tolist(), fix.centres_px)
 
 
-def test_every_frame_is_counted_as_a_pair_or_under_its_reason(config) -> None:
+def test_every_frame_is_counted_as_pair_or_rejection(config) -> None:
     walk = Walk(config.robot, 20, step_deg=0.6)
     fixes = walk.fixes
     fixes[5] = MarkerMiss(fixes[5].t, Reason.AT_BORDER)
@@ -127,7 +127,7 @@ def test_every_frame_is_counted_as_a_pair_or_under_its_reason(config) -> None:
     assert len(pairs) + sum(status.rejected.values()) == status.frames == 20
 
 
-def test_a_pair_is_in_the_store_before_it_is_published(config) -> None:
+def test_pair_is_stored_before_it_is_published(config) -> None:
     walk, found = Walk(config.robot, 10), []
     with sampling(config, walk.sources(), exit_at_end=True) as sampler:
         publish = sampler._publish
@@ -141,14 +141,14 @@ def test_a_pair_is_in_the_store_before_it_is_published(config) -> None:
     assert found == [True] * 10
 
 
-def test_a_restart_goes_on_with_the_numbers_in_a_new_segment(config) -> None:
+def test_restart_continues_numbering_in_new_segment(config) -> None:
     walk = Walk(config.robot, 10)
     sample(config, walk.sources())
     pairs, _ = sample(config, walk.sources())
     assert [(pair.seq, pair.segment) for pair in pairs[8:12]] == [(9, 1), (10, 1), (11, 2), (12, 2)]
 
 
-def test_the_coverage_after_a_restart_includes_the_pairs_before_it(config) -> None:
+def test_coverage_includes_pairs_before_restart(config) -> None:
     walk = Walk(config.robot, 10)
     sample(config, walk.sources())
     _, status = sample(config, Sources(Scripted([], config.robot.joints), Scripted([]), SystemClock()))
@@ -156,7 +156,7 @@ def test_the_coverage_after_a_restart_includes_the_pairs_before_it(config) -> No
     assert (waist.low, waist.high, waist.lower_limit) == (walk.q[0, 0], walk.q[-1, 0], -3.0)
 
 
-def test_readings_that_are_not_finite_are_not_used_and_reported(config) -> None:
+def test_non_finite_readings_are_skipped_and_reported(config) -> None:
     walk = Walk(config.robot, 10)
     readings = walk.readings
     readings[4] = JointReading(readings[4].t, frozen_array([np.nan, 0.0]))
@@ -180,7 +180,7 @@ def impatient(monkeypatch) -> None:
     monkeypatch.setattr("bodyschema.daemon.sampler.reconnect.FIRST_WAIT_S", 0.0)
 
 
-def test_a_lost_camera_is_opened_again_and_the_segment_ends(config, impatient) -> None:
+def test_reopened_camera_starts_new_segment(config, impatient) -> None:
     walk = Walk(config.robot, 6)
     fixes = [*walk.fixes[:3], SourceLost("unplugged"), *walk.fixes[3:]]
     pairs, _ = sample(config, walk.sources(fixes=fixes))
@@ -194,7 +194,7 @@ def test_lost_encoders_are_opened_again(config, impatient) -> None:
     assert (joints.opened, joints.closed, len(pairs)) == (2, 2, 6)
 
 
-def test_a_lost_source_is_told_of_while_it_is_lost(config) -> None:
+def test_lost_source_is_reported_in_status(config) -> None:
     marker = Scripted([SourceLost("unplugged")], openings=[None, *[SourceLost("still unplugged")] * 100])
     held = threading.Event()
     sources = Sources(Scripted([held], config.robot.joints), marker, SystemClock())
@@ -203,7 +203,7 @@ def test_a_lost_source_is_told_of_while_it_is_lost(config) -> None:
     assert status.health[0].startswith("the cameras are lost (")
 
 
-def test_a_source_that_cannot_be_opened_at_the_start_is_an_error(config) -> None:
+def test_source_unavailable_at_start_raises_error(config) -> None:
     sources = Sources(Scripted([], config.robot.joints, [SourceError("no such port")]), Scripted([]), SystemClock())
     with sampling(config, sources) as sampler, pytest.raises(SourceError, match="no such port"):
         sampler.run()
@@ -225,7 +225,7 @@ def test_all_sources_are_closed_in_the_end(config) -> None:
 # --- a store that fails
 
 
-def test_pairs_that_a_full_disk_does_not_take_are_not_published_and_told(config, mount_small_disk) -> None:
+def test_pairs_lost_to_full_disk_are_reported_unpublished(config, mount_small_disk) -> None:
     file = mount_small_disk("size=256k") / "pairs.sqlite"
     walk, published = Walk(config.robot, 3000, step_deg=1.0005), []
     with (
@@ -254,7 +254,7 @@ def test_a_store_that_is_damaged_ends_the_sampler(config, monkeypatch) -> None:
         sampler.run()
 
 
-def test_a_position_that_is_no_number_makes_no_pair(config) -> None:
+def test_non_finite_position_makes_no_pair(config) -> None:
     walk = Walk(config.robot, 10)
     fixes = list(walk.fixes)
     fixes[4] = replace(fixes[4], x=frozen_array([np.nan, 0.0, 1.0]))
@@ -304,12 +304,12 @@ def test_a_range_of_the_history_includes_both_bounds(ended) -> None:
     assert ([pair.seq for pair in reply.pairs], reply.last_seq) == ([7, 8, 9], 1200)
 
 
-def test_who_asks_for_more_than_there_is_gets_no_pairs(ended) -> None:
+def test_history_beyond_last_pair_is_empty(ended) -> None:
     reply = decode(ended.ask_one(f"{KEYS.pairs}?from=1201"), PairsReply)
     assert (reply.pairs, reply.last_seq) == ([], 1200)
 
 
-def test_the_history_comes_as_messagepack_to_who_asks_in_messagepack(ended) -> None:
+def test_history_is_served_as_messagepack_on_request(ended) -> None:
     payload = ended.ask_one(f"{KEYS.pairs}?from=3;to=3", encoding=MSGPACK)
     assert msgspec.msgpack.decode(payload)["pairs"][0]["seq"] == 3
 
@@ -330,7 +330,7 @@ def test_a_bad_range_is_refused(ended, parameters, message) -> None:
         ended.ask_one(f"{KEYS.pairs}?{parameters}")
 
 
-def test_a_paused_sampler_accepts_nothing_and_goes_on_in_a_new_segment(config) -> None:
+def test_paused_sampler_rejects_frames_then_starts_new_segment(config) -> None:
     walk = Walk(config.robot, 12)
     gates = [threading.Event() for _ in range(2)]
     fixes = [*walk.fixes[:4], gates[0], *walk.fixes[4:8], gates[1], *walk.fixes[8:]]
@@ -355,7 +355,7 @@ class StoppedClock(SystemClock):
         return self._t
 
 
-def test_a_frame_that_was_under_way_when_the_sampler_resumed_gives_no_pair(config) -> None:
+def test_frame_taken_before_resume_makes_no_pair(config) -> None:
     walk = Walk(config.robot, 12)
     gate = threading.Event()
     scripted = walk.sources(fixes=[*walk.fixes[:4], gate, *walk.fixes[4:]])
@@ -368,22 +368,22 @@ def test_a_frame_that_was_under_way_when_the_sampler_resumed_gives_no_pair(confi
     assert (ended.pairs, ended.rejected) == (8, {"paused": 4})
 
 
-def test_turns_are_not_accepted_where_nobody_asks_for_them(ended) -> None:
+def test_accept_turns_is_refused_without_lost_turn_count(ended) -> None:
     with pytest.raises(RequestError, match="no joint has lost its turn count"):
         command(ended, "accept_turns")
 
 
-def test_a_command_for_the_learner_is_refused_with_its_address(ended) -> None:
+def test_learner_command_is_refused_with_its_address(ended) -> None:
     with pytest.raises(RequestError, match=r"the sampler has nothing to do with checkpoint.*/command/learner"):
         command(ended, "checkpoint")
 
 
-def test_a_command_that_nobody_knows_is_refused(ended) -> None:
+def test_unknown_command_is_refused(ended) -> None:
     with pytest.raises(RequestError, match="command: 'dance' is unknown, known are: pause, resume"):
         ended.ask_one(KEYS.command("sampler"), b'{"command": "dance"}')
 
 
-def test_what_is_no_json_is_refused(ended) -> None:
+def test_malformed_json_command_is_refused(ended) -> None:
     with pytest.raises(RequestError, match="not a CommandRequest"):
         ended.ask_one(KEYS.command("sampler"), b"{")
 
@@ -395,7 +395,7 @@ def test_the_simulations_tool_is_changed_on_request(config) -> None:
     assert world.tools == [(0.1, 0.0, 0.35)]
 
 
-def test_the_simulation_tells_its_truth_to_an_empty_request(config) -> None:
+def test_simulation_returns_ground_truth_to_empty_request(config) -> None:
     with running(config, simulated(Walk(config.robot, 1).sources(), World(config.robot.chain))) as bus:
         truth = json.loads(bus.ask_one(KEYS.simulation))
     assert np.array_equal(truth["fixed"], config.robot.chain.fixed)
@@ -410,12 +410,12 @@ def test_a_tool_that_cannot_be_is_refused(config, request_) -> None:
     assert world.tools == []
 
 
-def test_nobody_tells_the_truth_where_there_is_no_simulation(ended) -> None:
+def test_ground_truth_is_unavailable_without_simulation(ended) -> None:
     with pytest.raises(BusError, match="nothing answers under bodyschema/arm/simulation"):
         ended.ask_one(KEYS.simulation)
 
 
-def test_a_picture_is_given_once_a_frame_has_come(config) -> None:
+def test_picture_is_served_after_first_frame(config) -> None:
     pictures: list[bytes] = []
     sources = replace(Walk(config.robot, 1).sources(), picture=lambda: pictures[-1] if pictures else None)
     with running(config, sources) as bus:
@@ -449,7 +449,7 @@ def test_frames_refused_for_one_reason_are_a_complaint(config) -> None:
     assert status.health == [f"40 of the last 40 frames were rejected: sizes differ. {REMEDIES[Reason.SIZE_MISMATCH]}"]
 
 
-def test_joints_too_fast_for_their_readings_make_no_pairs(config) -> None:
+def test_reading_time_uncertainty_rejects_fast_motion(config) -> None:
     walk = Walk(config.robot, 20)
     late = [replace(reading, t_sigma=0.01) for reading in walk.readings]
     pairs, status = sample(config, walk.sources(readings=late, fixes=walk.fixes[2:-2]))
@@ -462,13 +462,13 @@ def uncertain(walk: Walk, t_sigma: float) -> list[MarkerFix]:
     return [replace(fix, t_sigma=t_sigma) for fix in walk.fixes[2:-2]]
 
 
-def test_joints_too_fast_for_how_well_the_time_is_known_make_no_pair(config) -> None:
+def test_frame_time_uncertainty_rejects_fast_motion(config) -> None:
     walk = Walk(config.robot, 20)  # 45°/s
     pairs, status = sample(config, walk.sources(fixes=uncertain(walk, 0.01)))
     assert (pairs, status.rejected) == ([], {"moving": 16})
 
 
-def test_the_same_joints_make_pairs_where_the_time_is_known_well(config) -> None:
+def test_small_frame_time_uncertainty_accepts_fast_motion(config) -> None:
     walk = Walk(config.robot, 20)
     pairs, _ = sample(config, walk.sources(fixes=uncertain(walk, 0.001)))
     assert len(pairs) == 16

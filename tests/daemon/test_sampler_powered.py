@@ -57,7 +57,7 @@ def sources(config: Config, drive: Powered) -> Sources:
     return Sources(joints, marker, SystemClock(), powered=(drive,))
 
 
-def test_what_the_arm_says_is_the_answer(config) -> None:
+def test_command_returns_the_arm_s_answer(config) -> None:
     drive = Powered({True: "it floats", False: "it is off"})
     with running(config, sources(config, drive)) as bus:
         assert command(bus, "zero_force_on") == "it floats"
@@ -71,7 +71,7 @@ def test_a_refusal_is_the_answer(config) -> None:
         command(bus, "zero_force_on")
 
 
-def test_what_nobody_does_in_time_is_not_done_later(config, monkeypatch) -> None:
+def test_unanswered_command_is_cancelled_after_timeout(config, monkeypatch) -> None:
     monkeypatch.setattr("bodyschema.daemon.sampler.sources.ANSWER_S", 0.05)
     drive = Powered()
     with running(config, sources(config, drive)) as bus, pytest.raises(RequestError, match="not read at present"):
@@ -79,7 +79,7 @@ def test_what_nobody_does_in_time_is_not_done_later(config, monkeypatch) -> None
     assert drive.asked[0][1].cancelled()
 
 
-def test_what_is_not_configured_is_refused(config) -> None:
+def test_unconfigured_command_is_refused(config) -> None:
     with (
         running(config, sources(config, Powered())) as bus,
         pytest.raises(RequestError, match="gaze is not configured"),
@@ -87,7 +87,7 @@ def test_what_is_not_configured_is_refused(config) -> None:
         command(bus, "gaze_on")
 
 
-def test_in_the_simulation_nothing_has_torque_to_be_asked_for(config) -> None:
+def test_gaze_command_is_refused_in_simulation(config) -> None:
     simulated = replace(sources(config, Powered()), simulation=object())
     with running(config, simulated) as bus, pytest.raises(RequestError, match="gaze is of a real arm"):
         command(bus, "gaze_on")
@@ -119,7 +119,7 @@ class Head(Powered):
         self.told.put((t, angles))
 
 
-def test_the_head_is_told_where_to_look_while_the_sampler_runs(tmp_path, endpoint) -> None:
+def test_running_sampler_sends_gaze_angles_within_limits(tmp_path, endpoint) -> None:
     environment = {
         "BODYSCHEMA_ROBOT_NAME": "arm",
         "BODYSCHEMA_ZENOH_SAMPLER": endpoint,
@@ -155,13 +155,13 @@ def borne(config) -> Config:
     return replace(config, robot=replace(config.robot, robot=section))
 
 
-def test_while_zero_force_shall_bear_the_arm_and_is_off_no_pairs_are_taken(borne) -> None:
+def test_pairs_are_rejected_without_required_zero_force(borne) -> None:
     pairs, status = sample(borne, walking(borne, Powered()))
     assert (pairs, status.rejected) == ([], {"not_borne": 10})
     assert any("zero_force is to bear the arm" in text for text in status.health)
 
 
-def test_while_zero_force_bears_the_arm_pairs_are_taken(borne) -> None:
+def test_pairs_are_taken_while_zero_force_is_on(borne) -> None:
     drive = Powered()
     drive.state = "on"
     assert len(sample(borne, walking(borne, drive))[0]) == 10
@@ -173,6 +173,6 @@ class Cameras:
     health = ("the left camera's image is black: is the lens cap on?",)
 
 
-def test_what_the_cameras_say_is_in_the_status(config) -> None:
+def test_camera_warnings_are_in_the_status(config) -> None:
     with running(config, replace(sources(config, Powered()), cameras=Cameras())) as bus:
         assert Cameras.health[0] in status_when(bus, lambda status: bool(status.health)).health

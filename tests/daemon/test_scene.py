@@ -19,7 +19,7 @@ def everything(folder: Path) -> dict[str, bytes]:
     return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def test_a_folder_of_somebody_s_own_robot_is_refused_and_left_as_it_is(tmp_path) -> None:
+def test_folder_with_another_robot_is_refused_untouched(tmp_path) -> None:
     (tmp_path / "state").mkdir()
     for name in ("robot.toml", "recording.csv", "state/pairs.sqlite"):
         (tmp_path / name).write_text("mine")
@@ -29,7 +29,7 @@ def test_a_folder_of_somebody_s_own_robot_is_refused_and_left_as_it_is(tmp_path)
     assert everything(tmp_path) == before
 
 
-def test_what_an_earlier_demo_left_is_replaced(tmp_path) -> None:
+def test_earlier_demo_files_are_replaced(tmp_path) -> None:
     scene = prepare(tmp_path / "demo", seed=0)
     scene.recording_file.write_text("old")
     scene.store_file.parent.mkdir()
@@ -40,7 +40,7 @@ def test_what_an_earlier_demo_left_is_replaced(tmp_path) -> None:
     assert "seed = 1" in again.robot_file.read_text()
 
 
-def test_the_cube_in_the_demos_hand_looks_to_all_sides_and_stands_on_its_corner(tmp_path) -> None:
+def test_demo_cube_tags_face_outwards_in_three_dimensions(tmp_path) -> None:
     vision = Config.load(prepare(tmp_path / "demo", seed=0, marker="cluster").robot_file).tables.vision
     body = TagBody.cluster(vision.cluster, vision.tag)
     middles = np.array([corners.mean(axis=0) for corners in body.corners.values()])
@@ -50,7 +50,7 @@ def test_the_cube_in_the_demos_hand_looks_to_all_sides_and_stands_on_its_corner(
     assert np.linalg.matrix_rank(np.round(normals, 6)) == 3
 
 
-def test_the_tool_meets_the_demos_single_tag_from_behind(tmp_path) -> None:
+def test_demo_tool_meets_single_tag_from_behind(tmp_path) -> None:
     """It would cover the tag from the front, and no frame would give a pair."""
     config = Config.load(prepare(tmp_path / "demo", seed=0, marker="tag").robot_file)
     ((corners,),) = [list(TagBody.cluster(config.tables.vision.cluster, config.tables.vision.tag).corners.values())]
@@ -61,11 +61,11 @@ def test_the_tool_meets_the_demos_single_tag_from_behind(tmp_path) -> None:
 
 
 @pytest.mark.parametrize(("marker", "looked_for"), [("ball", "ball"), ("tag", "cluster"), ("cluster", "cluster")])
-def test_the_demo_looks_for_what_is_in_the_hand(tmp_path, marker, looked_for) -> None:
+def test_demo_tracks_the_marker_in_the_hand(tmp_path, marker, looked_for) -> None:
     assert Config.load(prepare(tmp_path / "demo", seed=0, marker=marker).robot_file).tables.vision.marker == looked_for
 
 
-def test_the_demo_over_servos_reads_the_simulated_arm_through_them(tmp_path, caplog) -> None:
+def test_demo_over_servos_reads_simulated_arm(tmp_path, caplog) -> None:
     pytest.importorskip("pybullet")
     caplog.set_level(logging.INFO)
     config = Config.load(prepare(tmp_path / "demo", seed=0, bus="dynamixel").robot_file)

@@ -134,7 +134,7 @@ def answered(route: Route, keys: dict[str, str]) -> set[str]:
         return {name for name, key in keys.items() if [reply.payload for reply in bus.ask(key)] == [key.encode()]}
 
 
-def test_a_viewer_is_answered_but_may_give_no_command(site: Site) -> None:
+def test_viewer_can_query_but_not_command(site: Site) -> None:
     everything = QUESTIONS | STATES | COMMANDS
     assert answered(site.as_somebody("anna"), everything) == set(QUESTIONS | STATES)
 
@@ -144,16 +144,16 @@ def test_an_operator_may_give_commands(site: Site) -> None:
     assert answered(site.as_somebody("bert"), everything) == set(everything)
 
 
-def test_a_stranger_with_a_certificate_of_the_authority_may_do_nothing(site: Site) -> None:
+def test_certificate_without_role_permits_nothing(site: Site) -> None:
     assert answered(site.as_somebody("hub"), QUESTIONS | STATES | COMMANDS) == set()
 
 
-def test_the_learner_asks_the_sampler_and_the_sampler_the_learner(site: Site) -> None:
+def test_learner_and_sampler_can_query_each_other(site: Site) -> None:
     assert site.learner.ask_one(KEYS.pairs) == KEYS.pairs.encode()
     assert site.sampler.ask_one(KEYS.predict) == KEYS.predict.encode()
 
 
-def test_the_learner_may_not_command_the_sampler_nor_the_sampler_the_learner(site: Site) -> None:
+def test_learner_and_sampler_cannot_command_each_other(site: Site) -> None:
     assert site.learner.ask(KEYS.command("sampler")) == []
     assert site.sampler.ask(KEYS.command("learner")) == []
 
@@ -170,7 +170,7 @@ def test_the_samplers_pairs_reach_learner_and_viewer(site: Site) -> None:
 
 
 @pytest.mark.parametrize("name", ["anna", "bert", "hub", "arm.learner"])
-def test_pairs_that_the_sampler_did_not_publish_teach_the_learner_nothing(site: Site, name: str) -> None:
+def test_pairs_from_others_do_not_reach_learner(site: Site, name: str) -> None:
     drained(site.heard)
     with client(site.as_somebody(name)) as bus:
         bus.publisher(KEYS.pair)(b"poison")
@@ -179,7 +179,7 @@ def test_pairs_that_the_sampler_did_not_publish_teach_the_learner_nothing(site: 
         assert drained(site.heard) == [b"a pair"]
 
 
-def test_nobody_answers_in_the_place_of_the_learner(site: Site) -> None:
+def test_operator_cannot_answer_for_learner(site: Site) -> None:
     with client(site.as_somebody("bert")) as forger:
         forger.answer(KEYS.predict, lambda _request: b"forged")
         forger.ask(KEYS.predict)
@@ -187,7 +187,7 @@ def test_nobody_answers_in_the_place_of_the_learner(site: Site) -> None:
             assert [reply.payload for reply in viewer.ask(KEYS.predict)] == [KEYS.predict.encode()]
 
 
-def test_nobody_listens_to_the_commands_of_others(site: Site) -> None:
+def test_viewer_cannot_intercept_commands(site: Site) -> None:
     with client(site.as_somebody("anna")) as spy:
         spy.answer(KEYS.command("learner"), lambda _request: b"forged")
         spy.ask(KEYS.predict)
@@ -197,7 +197,7 @@ def test_nobody_listens_to_the_commands_of_others(site: Site) -> None:
             ]
 
 
-def test_nobody_pretends_to_be_alive(site: Site) -> None:
+def test_operator_cannot_forge_liveliness(site: Site) -> None:
     seen: Queue[bool] = Queue()
     other = Keys("other")
     with client(site.as_somebody("bert")) as pretender, client(site.as_somebody("anna")) as viewer:
@@ -209,35 +209,35 @@ def test_nobody_pretends_to_be_alive(site: Site) -> None:
             seen.get(timeout=SILENCE_S)
 
 
-def test_a_viewer_sees_who_is_alive_of_every_robot(site: Site) -> None:
+def test_viewer_of_all_robots_sees_liveliness(site: Site) -> None:
     with client(site.as_somebody("anna")) as viewer:
         assert viewer.alive("bodyschema/*/alive/sampler")
 
 
-def test_an_operator_of_one_robot_is_nobody_at_another(site: Site) -> None:
+def test_operator_of_one_robot_cannot_list_all_robots(site: Site) -> None:
     with client(site.as_somebody("bert")) as operator:
         assert not operator.alive("bodyschema/*/alive/sampler")
 
 
-def test_without_a_role_the_error_says_that_one_may_lack(site: Site) -> None:
+def test_denied_command_error_suggests_missing_role(site: Site) -> None:
     with client(site.as_somebody("anna")) as viewer, pytest.raises(BusError, match=r"certificate or name has no role"):
         viewer.ask_one(KEYS.command("learner"))
 
 
 @pytest.mark.parametrize("who", ["nobody", "foreign"])
-def test_without_a_certificate_of_the_authority_nobody_gets_in(site: Site, who: str) -> None:
+def test_client_without_valid_certificate_is_refused(site: Site, who: str) -> None:
     folder = site.pki if who == "nobody" else site.pki / "foreign"
     route = Route((site.endpoint,), identity_of(folder, None if who == "nobody" else "anna", site.pki / "ca.pem"))
     with pytest.raises(BusError, match="is there, but the connection was refused: your certificate"), client(route):
         pass
 
 
-def test_without_tls_nobody_gets_in(site: Site) -> None:
+def test_client_without_tls_is_refused(site: Site) -> None:
     with pytest.raises(BusError), client(site.endpoint.replace("tls/", "tcp/"), open_timeout_s=1.0):
         pass
 
 
-def test_a_router_of_a_foreign_authority_is_not_believed(site: Site) -> None:
+def test_router_of_foreign_authority_is_rejected(site: Site) -> None:
     identity = identity_of(site.pki / "foreign", "anna")
     with pytest.raises(BusError, match="not of your authority"), client(Route((site.endpoint,), identity)):
         pass
@@ -286,7 +286,7 @@ def two(pki: Path, tmp_path: Path, free_endpoint) -> Iterator[tuple[Config, Queu
         yield configs["learner"], heard
 
 
-def test_two_machines_need_no_router_and_the_processes_keep_others_out_themselves(two, pki: Path) -> None:
+def test_two_machines_enforce_access_without_router(two, pki: Path) -> None:
     learner, heard = two
     assert heard.get(timeout=LIMIT_S) == b"a pair"
     as_anna = Route((learner.tables.zenoh.learner,), identity_of(pki, "anna"))
@@ -302,7 +302,7 @@ def test_two_machines_need_no_router_and_the_processes_keep_others_out_themselve
 # --- names and passwords
 
 
-def test_name_and_password_open_the_router_and_nothing_else_does(pki: Path, endpoint: str) -> None:
+def test_router_accepts_only_valid_name_and_password(pki: Path, endpoint: str) -> None:
     endpoint = endpoint.replace("tcp/", "tls/")
     (pki / "users.txt").write_text("anna:a long password\nbert:another\n")
     (pki / "users.txt").chmod(0o600)
@@ -336,9 +336,7 @@ def test_name_and_password_open_the_router_and_nothing_else_does(pki: Path, endp
 @pytest.mark.parametrize(
     "open_to_all", ["tcp/0.0.0.0:7447", "tcp/[::]:7447", "ws/192.0.2.1:7447", "udp/robot.lan:7447"]
 )
-def test_an_endpoint_open_to_the_network_without_tls_is_refused_with_the_remedy(
-    tmp_path: Path, open_to_all: str
-) -> None:
+def test_public_endpoint_without_tls_is_refused_with_remedy(tmp_path: Path, open_to_all: str) -> None:
     robot = write_small_arm(tmp_path, f'[zenoh]\nsampler = "{open_to_all}"\n')
     said = rf"line 9: zenoh.sampler: {re.escape(open_to_all)} is open to the network.*Write tcp/127.0.0.1:7447 for"
     with pytest.raises(ConfigError, match=said):
@@ -375,7 +373,7 @@ def test_half_a_protection_is_refused(pki: Path, tmp_path: Path, tables: str, sa
         write_robot(tmp_path, tables, pki)
 
 
-def test_one_says_who_one_is_for_once_as_the_page_shows(pki: Path, tmp_path: Path) -> None:
+def test_documented_environment_variable_overrides_tls_identity(pki: Path, tmp_path: Path) -> None:
     shown = re.search(r"`(BODYSCHEMA_ZENOH_TLS)='(.*?)' bodyschema command", PAGE.read_text())
     assert shown is not None
     variable, value = shown.groups()
@@ -402,7 +400,7 @@ def test_a_key_that_everybody_can_read_is_refused(pki: Path, tmp_path: Path) -> 
         ("operator", "admin", r"unknown key.*admin"),
     ],
 )
-def test_a_wrong_router_file_names_what_is_wrong(pki: Path, old: str, new: str, said: str) -> None:
+def test_wrong_router_file_setting_is_named(pki: Path, old: str, new: str, said: str) -> None:
     text = (SEVERAL / "router.toml").read_text()
     assert old in text
     (pki / "wrong.toml").write_text(text.replace(old, new))
@@ -410,7 +408,7 @@ def test_a_wrong_router_file_names_what_is_wrong(pki: Path, old: str, new: str, 
         RouterConfig.load(pki / "wrong.toml")
 
 
-def test_where_a_router_file_comes_from_is_told(tmp_path: Path) -> None:
+def test_missing_router_file_error_names_documentation(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"there is no such file\. docs/security.md has one"):
         RouterConfig.load(tmp_path / "router.toml")
 
@@ -429,13 +427,13 @@ def test_zenohd_gets_the_same_configuration_as_a_file(pki: Path, tmp_path: Path)
 # --- the page
 
 
-def test_the_page_shows_the_files_of_deploy_as_they_are() -> None:
+def test_page_shows_deploy_files_verbatim() -> None:
     shown = blocks("toml")
     for file in (SEVERAL / "router.toml", SEVERAL / "robot.toml", TWO / "robot.toml"):
         assert file.read_text().split("\n", 1)[1] in shown
 
 
-def test_the_page_names_every_role_and_the_limits_in_force() -> None:
+def test_page_lists_every_role_and_current_limit() -> None:
     page = PAGE.read_text(encoding="utf-8")
     assert re.findall(r"^\| `(\w+)` \| ", page, re.MULTILINE) == list(ROLES)
     for row in (
@@ -452,7 +450,7 @@ def test_the_page_names_every_role_and_the_limits_in_force() -> None:
 # --- floods
 
 
-def test_a_flood_of_one_client_keeps_no_other_from_its_answer(endpoint: str) -> None:
+def test_flood_from_one_client_does_not_starve_others(endpoint: str) -> None:
     served: list[bytes] = []
     refused: Queue[str] = Queue()
     busy, goes_on = threading.Event(), threading.Event()
@@ -491,7 +489,7 @@ def test_a_flood_of_one_client_keeps_no_other_from_its_answer(endpoint: str) -> 
     assert served.index(b"modest") <= 2
 
 
-def test_a_request_that_is_too_large_gets_the_largest_size_as_an_error(endpoint: str) -> None:
+def test_oversized_request_error_names_largest_size(endpoint: str) -> None:
     with ZenohSession(listen=endpoint) as server, client(endpoint) as asking:
         server.answer(KEYS.predict, lambda request: b"answered")
         assert asking.ask_one(KEYS.predict, bytes(LIMITS.request_bytes)) == b"answered"

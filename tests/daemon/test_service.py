@@ -66,7 +66,7 @@ def a_round_of(service: Service, clock: HandClock, *loops: str) -> None:
         service.beat(loop)
 
 
-def test_the_watchdog_is_fed_while_all_loops_come_round(service, clock, systemd) -> None:
+def test_watchdog_is_fed_while_all_loops_run(service, clock, systemd) -> None:
     for _ in range(3):
         a_round_of(service, clock, *LOOPS)
     assert systemd.all() == ["WATCHDOG=1"] * 3
@@ -79,7 +79,7 @@ def test_one_loop_that_hangs_starves_the_watchdog(service, clock, systemd, hangi
     assert systemd.all() == []
 
 
-def test_loops_that_come_round_often_tell_systemd_no_oftener_than_it_needs(service, clock, systemd) -> None:
+def test_frequent_loops_feed_watchdog_only_when_needed(service, clock, systemd) -> None:
     for _ in range(1000):
         clock.time += 0.002
         for loop in LOOPS:
@@ -87,13 +87,13 @@ def test_loops_that_come_round_often_tell_systemd_no_oftener_than_it_needs(servi
     assert len(systemd.all()) == 1  # in 2 s of the watchdog's 8
 
 
-def test_nobody_waits_for_a_loop_that_came_to_its_end(service, clock, systemd) -> None:
+def test_finished_loop_does_not_starve_watchdog(service, clock, systemd) -> None:
     service.leave("encoders")
     a_round_of(service, clock, "frames")
     assert systemd.all() == ["WATCHDOG=1"]
 
 
-def test_ready_is_said_once(service, systemd) -> None:
+def test_ready_is_notified_once(service, systemd) -> None:
     service.ready()
     service.ready()
     assert systemd.all() == ["READY=1"]
@@ -106,27 +106,27 @@ def test_a_start_that_works_is_given_more_time(systemd, tmp_path) -> None:
     assert systemd.all() == [f"EXTEND_TIMEOUT_USEC={START_LIMIT_S}000000"]
 
 
-def test_a_reload_begins_with_its_time_and_ends_with_ready(service, systemd) -> None:
+def test_reload_notifies_start_time_and_ready(service, systemd) -> None:
     service.follow(lambda: "nothing changed")
     first, last = systemd.all()
     assert first.startswith("RELOADING=1\nMONOTONIC_USEC=")
     assert last == "READY=1"
 
 
-def test_a_status_is_one_line_and_told_when_it_is_another(service, systemd) -> None:
+def test_status_is_one_line_sent_on_change(service, systemd) -> None:
     for line in ("running, 2 pairs", "running, 2 pairs", "the disk\nis full"):
         service.tell(line)
     assert systemd.all() == ["STATUS=running, 2 pairs", "STATUS=the disk is full"]
 
 
-def test_a_status_has_the_first_thing_that_is_wrong() -> None:
+def test_status_shows_first_of_several_problems() -> None:
     assert with_health("running", []) == "running"
     assert with_health("running", ["the cameras are lost", "the disk is full"]) == (
         "running. the cameras are lost (and 1 more)"
     )
 
 
-def test_a_name_without_a_file_is_told_too(clock) -> None:
+def test_abstract_socket_is_notified(clock) -> None:
     name = f"bodyschema-test-{os.getpid()}"
     heard = Heard(f"\0{name}")
     Notifier(f"@{name}").ready()
@@ -134,7 +134,7 @@ def test_a_name_without_a_file_is_told_too(clock) -> None:
     heard.socket.close()
 
 
-def test_what_systemd_asks_for_is_not_handed_on_to_children(tmp_path) -> None:
+def test_systemd_variables_are_removed_from_environment(tmp_path) -> None:
     environment = {"NOTIFY_SOCKET": "/run/n", "WATCHDOG_USEC": "20000000", "WATCHDOG_PID": str(os.getpid()), "A": "b"}
     notifier = Notifier.of_environment(environment)
     assert (environment, notifier.watchdog_s, notifier.is_heard) == ({"A": "b"}, 20.0, True)
@@ -149,11 +149,11 @@ def test_what_systemd_asks_for_is_not_handed_on_to_children(tmp_path) -> None:
         {"NOTIFY_SOCKET": "/run/n", "WATCHDOG_USEC": "soon"},
     ],
 )
-def test_a_watchdog_of_nobody_or_of_another_process_is_not_fed(environment) -> None:
+def test_watchdog_without_socket_or_own_pid_is_ignored(environment) -> None:
     assert Notifier.of_environment(environment).watchdog_s is None
 
 
-def test_a_systemd_that_is_gone_is_logged_once_and_ends_nothing(tmp_path, caplog) -> None:
+def test_unreachable_systemd_is_logged_once(tmp_path, caplog) -> None:
     notifier = Notifier(str(tmp_path / "gone"))
     notifier.ready()
     notifier.feed_watchdog()
@@ -192,18 +192,18 @@ def owner(systemd: Heard, clock: HandClock, plugged: Path, permissions: Permissi
     return Service(notifier, LOOPS, clock, devices=[str(plugged)], may_open=permissions)
 
 
-def test_a_device_that_may_be_opened_is_not_forbidden(owner) -> None:
+def test_openable_device_is_not_forbidden(owner) -> None:
     assert owner.forbidden() is None
 
 
-def test_a_device_that_may_not_be_opened_for_long_is_forbidden(owner, clock, permissions, plugged) -> None:
+def test_persistently_unopenable_device_is_forbidden(owner, clock, permissions, plugged) -> None:
     permissions.granted = False
     assert owner.forbidden() is None  # its group may come yet
     clock.time += SETTLED_S
     assert owner.forbidden() == str(plugged)
 
 
-def test_a_device_that_gets_its_group_late_is_not_forbidden(owner, clock, permissions) -> None:
+def test_device_permitted_late_is_not_forbidden(owner, clock, permissions) -> None:
     permissions.granted = False
     owner.forbidden()
     clock.time += SETTLED_S
@@ -213,7 +213,7 @@ def test_a_device_that_gets_its_group_late_is_not_forbidden(owner, clock, permis
     assert owner.forbidden() is None
 
 
-def test_a_device_that_is_not_there_is_waited_for(owner, clock, permissions, plugged) -> None:
+def test_absent_device_is_not_forbidden(owner, clock, permissions, plugged) -> None:
     plugged.unlink()
     permissions.granted = False
     owner.forbidden()

@@ -55,13 +55,13 @@ def solving(solver: ScriptedSolver) -> SolverClient:
     return solving
 
 
-def test_a_new_task_is_told_once(solver: ScriptedSolver, solving: SolverClient) -> None:
+def test_new_task_is_sent_once(solver: ScriptedSolver, solving: SolverClient) -> None:
     assert not solving.begin(TASK)
     assert solver.told == [("start", 1)]
 
 
 @pytest.mark.parametrize(("solved_at", "not_yet", "due_at"), [(50, 54, 55), (1000, 1024, 1025)])
-def test_a_solution_is_due_after_a_tenth_more_pairs_but_never_later_than_configured(
+def test_solver_interval_is_tenth_up_to_configured_limit(
     solver: ScriptedSolver, solving: SolverClient, solved_at: int, not_yet: int, due_at: int
 ) -> None:
     solving.feed(Q, X, solved_at)
@@ -94,7 +94,7 @@ def test_it_is_busy_until_the_last_answer(solver: ScriptedSolver, solving: Solve
     assert busy == [True, False]
 
 
-def test_it_is_busy_from_the_question_to_the_answer(solver: ScriptedSolver, solving: SolverClient) -> None:
+def test_solver_is_busy_from_request_to_answer(solver: ScriptedSolver, solving: SolverClient) -> None:
     solving.feed(Q, X, 25)
     solving.ask()
     waiting = solving.busy, solving.poll(), solving.busy
@@ -103,7 +103,7 @@ def test_it_is_busy_from_the_question_to_the_answer(solver: ScriptedSolver, solv
     assert (waiting, solving.busy) == ((True, None, True), False)
 
 
-def test_a_solver_that_lost_everything_is_given_everything_again(solver: ScriptedSolver, solving: SolverClient) -> None:
+def test_restarted_solver_is_fed_from_the_beginning(solver: ScriptedSolver, solving: SolverClient) -> None:
     solving.feed(Q, X, 10)
     solving.restart()
     assert solving.begin(TASK)
@@ -122,7 +122,7 @@ def test_a_solver_that_hangs_is_replaced(monkeypatch) -> None:
         assert process.pid is None
 
 
-def test_a_solver_that_reads_nothing_blocks_nobody(monkeypatch) -> None:
+def test_solver_that_reads_nothing_is_replaced(monkeypatch) -> None:
     monkeypatch.setattr(solver_process, "module_command", lambda _: ("sleep", "60"))
     monkeypatch.setattr(solver_process, "READS_WITHIN_S", 0.0)
     monkeypatch.setattr(solver_process, "HUNG_AFTER_S", 0.0)
@@ -134,7 +134,7 @@ def test_a_solver_that_reads_nothing_blocks_nobody(monkeypatch) -> None:
             list(iter(process.poll, ()))
 
 
-def test_a_look_for_solutions_does_not_wait_for_a_reader(monkeypatch) -> None:
+def test_polling_does_not_wait_for_blocked_solver(monkeypatch) -> None:
     monkeypatch.setattr(solver_process, "module_command", lambda _: ("sleep", "60"))
     monkeypatch.setattr(solver_process, "READS_WITHIN_S", 0.0)
     with solver_process.SolverProcess() as process:
@@ -146,7 +146,7 @@ def test_a_look_for_solutions_does_not_wait_for_a_reader(monkeypatch) -> None:
         assert time.monotonic() - begin < 10.0
 
 
-def test_a_solver_is_kept_where_its_clock_is_unknown(monkeypatch) -> None:
+def test_solver_with_unreadable_cpu_clock_is_kept(monkeypatch) -> None:
     def unknown(clock: int) -> float:
         raise OSError(22, "Invalid argument")
 

@@ -91,7 +91,7 @@ def test_a_child_that_does_not_end_is_killed(tmp_path, monkeypatch) -> None:
     assert gone(started(tmp_path / "pids")[0])
 
 
-def test_a_child_that_refuses_to_start_ends_the_others(tmp_path) -> None:
+def test_child_failing_at_start_ends_the_others(tmp_path) -> None:
     supervisor = Supervisor([child(WAITING, tmp_path / "pids"), child("raise SystemExit(3)")])
     with pytest.raises(BodyschemaError, match=r"could not start \(exit code 3\); its message is above"):
         supervisor.run()
@@ -104,12 +104,12 @@ SERVING_THEN_FAILING = (
 )
 
 
-def test_a_child_that_fails_after_it_served_is_started_again(tmp_path, supervise) -> None:
+def test_child_failing_after_serving_is_restarted(tmp_path, supervise) -> None:
     supervise(child(SERVING_THEN_FAILING, tmp_path / "pids"))
     wait_until(lambda: len(started(tmp_path / "pids")) == 2)
 
 
-def test_a_child_that_refuses_after_minutes_ends_the_others(monkeypatch) -> None:
+def test_child_failing_late_without_serving_is_not_restarted(monkeypatch) -> None:
     minutes = iter(range(0, 6000, 60))
     monkeypatch.setattr("bodyschema.daemon.service.supervise.time.monotonic", lambda: float(next(minutes)))
     with pytest.raises(BodyschemaError, match=r"could not start \(exit code 1\)"):
@@ -133,7 +133,7 @@ def test_a_killed_run_takes_both_processes_with_it(tmp_path, free_endpoint) -> N
     assert ended == [True, True]
 
 
-def test_the_command_run_with_a_port_in_use_ends_with_its_message(tmp_path, free_endpoint) -> None:
+def test_run_with_port_in_use_exits_with_message(tmp_path, free_endpoint) -> None:
     taken = free_endpoint()
     with socket.create_server(("127.0.0.1", int(taken.rpartition(":")[2]))):
         done = warm.run("-m", "bodyschema", "run", "--robot", _robot(tmp_path, taken, free_endpoint()))

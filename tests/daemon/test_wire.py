@@ -30,7 +30,7 @@ finite = st.floats(allow_nan=False, allow_infinity=False)
 
 
 @given(st.lists(finite, min_size=12, max_size=12), st.sampled_from([JSON, MSGPACK]))
-def test_a_pair_comes_out_of_the_wire_as_it_went_in(numbers, encoding) -> None:
+def test_pair_round_trip_is_exact(numbers, encoding) -> None:
     a, b, c, d, e, f = numbers[6:]
     cov = frozen_array([[a, b, c], [b, d, e], [c, e, f]])
     pair = Pair("id", 3, 2, 1.5, "utc", frozen_array(numbers[:3]), frozen_array(numbers[3:6]), cov)
@@ -41,7 +41,7 @@ def test_a_pair_comes_out_of_the_wire_as_it_went_in(numbers, encoding) -> None:
 
 
 @pytest.mark.parametrize("encoding", [JSON, MSGPACK])
-def test_an_orientation_comes_out_of_the_wire_as_it_went_in(encoding) -> None:
+def test_orientation_round_trip_is_exact(encoding) -> None:
     turn, cov_R = frozen_array([0.0, 0.6, 0.0, 0.8]), frozen_array(1e-4 * np.eye(3) + 1e-6)
     pair = Pair("id", 3, 2, 1.5, "utc", np.zeros(3), np.zeros(3), np.eye(3), None, turn, cov_R)
     back = pair_from_wire(decode(encode(pair_to_wire(pair), encoding), PairMessage, encoding), 3)
@@ -92,7 +92,7 @@ def message(**changed: object) -> bytes:
     return encode(fields | changed)
 
 
-def test_a_message_of_a_later_version_with_more_keys_is_read() -> None:
+def test_message_with_unknown_extra_keys_is_read() -> None:
     assert decode(message(colour="red"), PairMessage).seq == 1
 
 
@@ -105,12 +105,12 @@ def test_a_message_of_a_later_version_with_more_keys_is_read() -> None:
         ({"cov": [0, 0, None, 0, 0, 0]}, r"`\$.cov"),
     ],
 )
-def test_a_message_that_is_no_pair_is_refused_with_its_place(changed, said) -> None:
+def test_invalid_pair_message_is_refused_with_its_field(changed, said) -> None:
     with pytest.raises(RequestError, match=said):
         decode(message(**changed), PairMessage)
 
 
-def test_a_pair_of_another_number_of_joints_is_refused() -> None:
+def test_pair_with_wrong_joint_count_is_refused() -> None:
     with pytest.raises(RequestError, match="pair 1 has 3 joint angles, this robot has 7"):
         pair_from_wire(decode(message(), PairMessage), 7)
 
@@ -120,7 +120,7 @@ def test_a_pair_with_an_infinite_number_is_refused() -> None:
         pair_from_wire(PairMessage("id", 1, 1, 0.0, "", [0, 0, float("inf")], (0, 0, 0), (0,) * 6), 3)
 
 
-def test_a_pair_with_a_quaternion_that_is_none_is_refused() -> None:
+def test_pair_with_unnormalised_quaternion_is_refused() -> None:
     with pytest.raises(RequestError, match="pair 1 has an R of the length 2, not 1"):
         pair_from_wire(decode(message(R=[0, 0, 0, 2]), PairMessage), 3)
 
@@ -154,6 +154,6 @@ def test_one_vector_is_a_batch_of_one() -> None:
         ([[0.0] * 3] * (LARGEST_BATCH + 1), f"send at most {LARGEST_BATCH} at once"),
     ],
 )
-def test_joint_angles_that_do_not_fit_the_robot_are_refused(q, said) -> None:
+def test_joint_angles_not_fitting_robot_are_refused(q, said) -> None:
     with pytest.raises(RequestError, match=said):
         joint_angles(JointsRequest(q), JOINTS)

@@ -23,7 +23,7 @@ def enter(config: Config, *, sim: bool) -> None:
         pass
 
 
-def test_without_a_driver_the_two_ways_out_are_named(tmp_path) -> None:
+def test_missing_driver_error_names_sim_and_recording(tmp_path) -> None:
     with pytest.raises(ConfigError, match=r"no driver is configured. Give --sim .*recording in the table \[drivers\]"):
         enter(load(tmp_path), sim=False)
 
@@ -33,7 +33,7 @@ def test_sources_can_be_checked_without_opening_any(tmp_path) -> None:
         check_sources(load(tmp_path), sim=False)
 
 
-def test_a_recording_is_found_beside_robot_toml_and_read(tmp_path) -> None:
+def test_recording_beside_robot_toml_is_read(tmp_path) -> None:
     (tmp_path / "walk.csv").write_text("waist,shoulder,x,y,z\n0.1,0.2,0.3,0.4,0.5\n")
     config = load(tmp_path, '[drivers]\nrecording = "walk.csv"\nspeed = 0\n')
     with open_sources(config, sim=False) as sources, sources.joints, sources.marker:
@@ -42,7 +42,7 @@ def test_a_recording_is_found_beside_robot_toml_and_read(tmp_path) -> None:
     assert np.array_equal(fix.x, [0.3, 0.4, 0.5])
 
 
-def test_a_recording_with_a_mistake_names_line_and_column(tmp_path) -> None:
+def test_recording_mistake_is_named_with_line_and_column(tmp_path) -> None:
     (tmp_path / "walk.csv").write_text("waist,shoulder,x,y,z\n0.1,0.2,0.3,0.4,0.5\n0.1,nan,0.3,0.4,0.5\n")
     with pytest.raises(RecordingError, match=r"walk.csv, line 3, column shoulder"):
         enter(load(tmp_path, '[drivers]\nrecording = "walk.csv"\n'), sim=False)
@@ -117,7 +117,7 @@ def test_sim_camera_may_show_another_marker(tmp_path) -> None:
         ("[sim.camera]\nball_rgb = [0.1, 0.8, 0.2]\n", r"\[vision.colour\] or"),
     ],
 )
-def test_a_marker_that_cannot_be_shown_is_told(tmp_path, tables, keys) -> None:
+def test_untrackable_simulated_marker_is_reported(tmp_path, tables, keys) -> None:
     with pytest.raises(ConfigError, match=rf"robot.toml: the tracker would not find the marker .*Change {keys}"):
         check_sources(load(tmp_path, STEREO + tables), sim=True)
 
@@ -180,12 +180,12 @@ def test_servos_without_a_camera_make_no_pairs(tmp_path) -> None:
         ("id = 2", "id = 2\nzero = 1", "unknown key 'zero' in .*Known are: .*zero_ticks"),
     ],
 )
-def test_a_mistake_about_servos_is_named_with_its_line(tmp_path, right, wrong, said) -> None:
+def test_dynamixel_setting_mistake_is_named_with_line(tmp_path, right, wrong, said) -> None:
     with pytest.raises(ConfigError, match=rf"robot.toml, line \d+: .*{said}"):
         load(tmp_path, SERVOS.replace(right, wrong))
 
 
-def test_a_rate_that_no_servo_has_is_refused(tmp_path) -> None:
+def test_unknown_dynamixel_baud_rate_is_refused(tmp_path) -> None:
     with pytest.raises(ConfigError, match=r"buses\.baud: 12345 is unknown, known are: 9600, 57600"):
         load(tmp_path, SERVOS.replace("port =", "baud = 12345\nport ="))
 
@@ -215,7 +215,7 @@ encoder = "upper"
 
 
 @pytest.mark.parametrize("tables", [FEETECH, ENCODERS])
-def test_other_hardware_in_robot_toml_is_the_joint_source(tmp_path, tables) -> None:
+def test_feetech_or_encoder_table_is_the_joint_source(tmp_path, tables) -> None:
     source = open_joints(load(tmp_path, tables), SystemClock())
     assert source.joints == ("waist", "shoulder")
     with pytest.raises(SourceLost, match=r"by-id/none is not there: No such file"), source:
@@ -235,7 +235,7 @@ def test_other_hardware_in_robot_toml_is_the_joint_source(tmp_path, tables) -> N
         (ENCODERS, "port =", "baud = 5\nport =", "baud"),
     ],
 )
-def test_a_mistake_about_other_hardware_is_named_with_its_line(tmp_path, tables, right, wrong, said) -> None:
+def test_feetech_or_encoder_mistake_is_named_with_line(tmp_path, tables, right, wrong, said) -> None:
     with pytest.raises(ConfigError, match=rf"robot.toml, line \d+: .*{said}"):
         load(tmp_path, tables.replace(right, wrong))
 
@@ -245,7 +245,7 @@ def test_a_joint_without_an_encoder_is_named(tmp_path) -> None:
         load(tmp_path, ENCODERS[: ENCODERS.rindex("[[")])
 
 
-def test_a_rate_that_no_feetech_servo_has_is_refused(tmp_path) -> None:
+def test_unknown_feetech_baud_rate_is_refused(tmp_path) -> None:
     with pytest.raises(ConfigError, match=r"buses\.baud: 12345 is unknown, known are: 19200, 38400"):
         load(tmp_path, FEETECH.replace("port =", "baud = 12345\nport ="))
 

@@ -58,7 +58,7 @@ EXAMPLES = dict(zip(("PairMessage", "PredictReply"), re.findall(r"```json\n(.*?)
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_the_page_s_examples_are_such_messages_with_all_their_fields(name: str) -> None:
+def test_page_examples_are_complete_valid_messages(name: str) -> None:
     assert json.loads(encode(decode(EXAMPLES[name].encode(), getattr(wire, name)))) == json.loads(EXAMPLES[name])
 
 
@@ -112,13 +112,13 @@ def run_example(name: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False, cwd=os.sep)
 
 
-def test_the_example_prints_what_the_learner_answers(learner: Config) -> None:
+def test_example_prints_the_learner_s_prediction(learner: Config) -> None:
     done = run_example("ask_predictions.py", "arm", learner.tables.zenoh.learner, "0.0", "0.0")
     assert (done.returncode, done.stderr) == (0, "")
     assert re.match(r"x = \[0\.3, .*\] m, 1-sigma \[.*\] m, away from all data\nmodel \w+ of 0 pairs", done.stdout)
 
 
-def test_the_example_ends_with_what_the_learner_says_is_wrong(learner: Config) -> None:
+def test_example_exits_with_the_learner_s_error(learner: Config) -> None:
     done = run_example("ask_predictions.py", "arm", learner.tables.zenoh.learner, "0.0")
     assert (done.returncode, "this robot has 2 joints: waist, shoulder" in done.stderr) == (1, True)
 
@@ -149,13 +149,13 @@ def test_predict_loads_no_numpy(learner: Config) -> None:
     assert done.stdout.splitlines()[-1] == "False"
 
 
-def test_joint_values_that_the_arm_cannot_have_are_named_with_their_limits_and_deg(learner: Config, capsys) -> None:
+def test_angle_beyond_limits_is_named_with_deg_hint(learner: Config, capsys) -> None:
     said = predicted(learner, capsys, "-60", "0")
     assert "waist cannot be at -60 rad: its limits are -3 to 3 rad (-171.9° to 171.9°). --deg takes degrees." in said
     assert "cannot be" not in predicted(learner, capsys, "--deg", "-60", "0")
 
 
-def test_degrees_beyond_the_limits_are_named_without_the_option_that_was_given(learner: Config, capsys) -> None:
+def test_deg_hint_is_omitted_when_deg_was_given(learner: Config, capsys) -> None:
     said = predicted(learner, capsys, "--deg", "--", "0", "900")
     assert "shoulder cannot be at 15.71 rad: its limits are -2 to 2 rad (-114.6° to 114.6°). The answer" in said
 
@@ -184,7 +184,7 @@ def test_an_orientation_makes_a_matrix_and_covariance() -> None:
     assert sigmas == pytest.approx([1e-3, 2e-3, 3e-3, 0.01, 0.02, 0.03])
 
 
-def test_raw_replies_have_the_poses_of_the_command_line(learner: Config, capsys) -> None:
+def test_raw_reply_poses_match_command_line_poses(learner: Config, capsys) -> None:
     with client(learner.tables.zenoh.learner) as bus:
         [raw] = json.loads(bus.ask_one(KEYS.predict, encode(JointsRequest([0.1, 0.2]))))["poses"]
         found = json.loads(bus.ask_one(KEYS.ik, encode(IkRequest((0.3, 0.0, 0.0)))))
@@ -198,7 +198,7 @@ def ask_ik(learner: Config, request: IkRequest) -> IkReply:
         return decode(bus.ask_one(KEYS.ik, encode(request)), IkReply)
 
 
-def test_joint_angles_for_a_position_bring_the_marker_there(learner: Config) -> None:
+def test_ik_solution_reaches_position_within_joint_limits(learner: Config) -> None:
     chain, target = learner.robot.chain, learner.robot.chain.positions([0.7, 0.0])
     reply = ask_ik(learner, IkRequest(tuple(target.tolist()), start=[0.5, 0.4], posture="middle"))
     assert (reply.converged, reply.reason) == (True, "reached")
@@ -206,12 +206,12 @@ def test_joint_angles_for_a_position_bring_the_marker_there(learner: Config) -> 
     assert ((learner.robot.lower <= reply.q) & (reply.q <= learner.robot.upper)).all()
 
 
-def test_a_position_out_of_reach_is_answered_with_the_nearest_and_its_distance(learner: Config) -> None:
+def test_unreachable_position_is_answered_with_nearest_distance(learner: Config) -> None:
     reply = ask_ik(learner, IkRequest((0.0, 1.3, 0.0)))
     assert (reply.converged, reply.reason, round(reply.distance, 6)) == (False, "out_of_reach", 1.0)
 
 
-def test_the_command_ik_ends_with_1_where_the_position_is_not_reached(learner: Config) -> None:
+def test_ik_command_exits_1_for_unreached_position(learner: Config) -> None:
     command = ("-m", "bodyschema", "ik", "--deg", "--robot", learner.file, "--")
     inside, outside = (warm.run(*command, x, "0", "0") for x in ("0.3", "0.8"))
     assert (inside.returncode, inside.stdout.splitlines()[2]) == (0, "reached")
@@ -233,7 +233,7 @@ def test_the_page_s_error_replies_are_the_learner_s(learner: Config, key: str, r
     assert str(refused.value) == code(error)
 
 
-def test_the_page_s_word_on_nan_in_messagepack_is_true(learner: Config) -> None:
+def test_page_quotes_error_for_nan_in_messagepack(learner: Config) -> None:
     request = encode(JointsRequest([0.1, float("nan")]), MSGPACK)
     with client(learner.tables.zenoh.learner) as bus, pytest.raises(RequestError) as refused:
         bus.ask_one(KEYS.predict, request, encoding=MSGPACK)
@@ -270,7 +270,7 @@ def sampler_running(config: Config, sources: Sources) -> Iterator[None]:
             thread.join(LIMIT_S)
 
 
-def test_the_example_follows_stored_and_new_pairs_in_order(tmp_path, endpoint) -> None:
+def test_example_follows_stored_and_new_pairs_in_order(tmp_path, endpoint) -> None:
     tables = f'[zenoh]\nsampler = "{endpoint}"\n[daemon]\nstate_dir = "state"\n'
     config = Config.load(write_small_arm(tmp_path, tables), {})
     walk, go_on = Walk(config.robot, 40), threading.Event()
@@ -289,7 +289,7 @@ def test_the_example_follows_stored_and_new_pairs_in_order(tmp_path, endpoint) -
     assert [int(line.split(" ")[0]) for line in lines] == list(range(3, 41))
 
 
-def test_the_example_ends_with_a_line_when_nobody_listens(endpoint) -> None:
+def test_example_exits_with_message_without_sampler(endpoint) -> None:
     done = run_example("follow_pairs.py", "arm", endpoint)
     assert done.returncode == 1
     assert done.stderr.startswith("follow_pairs: ")

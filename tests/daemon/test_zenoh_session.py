@@ -32,7 +32,7 @@ def asking(server: ZenohSession, endpoint: str) -> Iterator[ZenohSession]:
         yield bus
 
 
-def test_a_query_is_answered_with_what_the_handler_returns(server, asking) -> None:
+def test_query_returns_the_handler_s_result(server, asking) -> None:
     server.answer(KEY, lambda request: b"<" + request.payload + b">")
     assert asking.ask_one(KEY, b"hello") == b"<hello>"
 
@@ -59,25 +59,25 @@ def break_down(_request: Request) -> bytes:
     raise ZeroDivisionError("a bug")
 
 
-def test_a_refused_request_gets_the_reason_as_an_error(server, asking) -> None:
+def test_refused_request_returns_reason_as_error(server, asking) -> None:
     server.answer(KEY, refuse)
     with pytest.raises(RequestError, match="q has 3 numbers; this robot has 7 joints"):
         asking.ask_one(KEY)
 
 
-def test_an_error_comes_in_the_encoding_of_the_request(server, asking) -> None:
+def test_error_uses_encoding_of_the_request(server, asking) -> None:
     server.answer(KEY, refuse)
     reply = next(iter(asking._open.get(KEY, encoding=MSGPACK)))
     assert decode(reply.err.payload.to_bytes(), ErrorReply, MSGPACK).error.startswith("q has 3 numbers")
 
 
-def test_an_encoding_that_nobody_speaks_is_refused_by_name(server, asking) -> None:
+def test_unknown_encoding_is_refused_by_name(server, asking) -> None:
     server.answer(KEY, lambda request: request.payload)
     with pytest.raises(RequestError, match="encoding application/x-msgpack is unknown; known are application/json"):
         asking.ask_one(KEY, encoding="application/x-msgpack")
 
 
-def test_a_handler_with_a_bug_answers_all_the_same(server, asking) -> None:
+def test_handler_exception_is_returned_as_error(server, asking) -> None:
     server.answer(KEY, break_down)
     with pytest.raises(RequestError, match="please report it: ZeroDivisionError: a bug"):
         asking.ask_one(KEY)
@@ -134,7 +134,7 @@ def test_a_stopped_subscriber_holds_up_no_publication(endpoint) -> None:
             stopped.kill()
 
 
-def test_where_nobody_answers_the_process_to_start_is_named(asking) -> None:
+def test_unanswered_query_names_process_to_start(asking) -> None:
     with pytest.raises(BusError, match=r"Is the sampler running\? Start it with `bodyschema run sampler`"):
         asking.ask_one(KEY)
 
@@ -151,7 +151,7 @@ def test_the_learners_keys_name_the_learner(asking) -> None:
         asking.ask_one("bodyschema/arm/predict")
 
 
-def test_an_answer_that_does_not_come_in_time_is_an_error(server, asking) -> None:
+def test_late_answer_is_a_request_error(server, asking) -> None:
     done = threading.Event()
     server.answer(KEY, lambda _request: b"" if done.wait(LIMIT_S) else b"late")
     with pytest.raises(RequestError, match="no answer in time"):
@@ -159,12 +159,12 @@ def test_an_answer_that_does_not_come_in_time_is_an_error(server, asking) -> Non
     done.set()
 
 
-def test_a_client_without_a_server_is_told_at_once(endpoint) -> None:
+def test_client_without_server_reports_nothing_listening(endpoint) -> None:
     with pytest.raises(BusError, match=f"nothing listens on {endpoint}. Start the daemon"), client(endpoint):
         pass
 
 
-def test_a_port_in_use_is_named_with_the_remedy(server, endpoint) -> None:
+def test_port_in_use_is_reported_with_remedy(server, endpoint) -> None:
     second = ZenohSession(listen=endpoint)
     with pytest.raises(BusError, match=f"the port of {endpoint} is in use.*another endpoint in the table"), second:
         pass
@@ -175,20 +175,20 @@ def test_an_endpoint_that_cannot_be_is_named() -> None:
         ZenohSession(listen="carrier/pigeon").__enter__()
 
 
-def test_who_is_alive_is_found(server, asking) -> None:
+def test_alive_process_is_found(server, asking) -> None:
     server.token("bodyschema/arm/alive/sampler")
     assert asking.alive("bodyschema/arm/alive/sampler", timeout_s=LIMIT_S)
     assert not asking.alive("bodyschema/arm/alive/learner", timeout_s=LIMIT_S)
 
 
-def test_who_is_alive_already_is_told_to_who_watches(server, asking) -> None:
+def test_watcher_is_notified_of_already_alive_process(server, asking) -> None:
     server.token("bodyschema/arm/alive/sampler")
     changes: Queue[bool] = Queue()
     asking.watch("bodyschema/arm/alive/sampler", changes.put)
     assert changes.get(timeout=LIMIT_S)
 
 
-def test_who_ends_is_no_longer_alive(endpoint) -> None:
+def test_ended_process_is_no_longer_alive(endpoint) -> None:
     changes: Queue[bool] = Queue()
     with ZenohSession(listen=endpoint) as server:
         server.token("bodyschema/arm/alive/sampler")
@@ -199,7 +199,7 @@ def test_who_ends_is_no_longer_alive(endpoint) -> None:
             assert not changes.get(timeout=LIMIT_S)
 
 
-def test_who_is_linked_to_a_process_and_to_the_router_hears_everything_once(endpoint, free_endpoint) -> None:
+def test_subscriber_linked_twice_receives_each_message_once(endpoint, free_endpoint) -> None:
     meeting = free_endpoint()
     heard: Queue[bytes] = Queue()
     behind = {"mode": "router"}
@@ -221,12 +221,12 @@ def test_who_is_linked_to_a_process_and_to_the_router_hears_everything_once(endp
     assert [word for word in words if word != b"first"] == said
 
 
-def test_a_closed_session_says_so(endpoint) -> None:
+def test_closed_session_raises_not_open(endpoint) -> None:
     with pytest.raises(BusError, match="not open"):
         ZenohSession(listen=endpoint).publisher(KEY)
 
 
-def test_a_process_ends_although_its_handlers_are_still_declared(endpoint) -> None:
+def test_process_exits_with_handlers_still_declared(endpoint) -> None:
     code = (
         "import sys; from bodyschema.daemon.transport.session import ZenohSession\n"
         "with ZenohSession(listen=sys.argv[1]) as bus:\n"

@@ -42,7 +42,7 @@ def pair(seq: int, segment: int = 1) -> Pair:
     )
 
 
-def test_a_series_of_months_stays_small_and_covers_all_of_it() -> None:
+def test_series_of_months_stays_small_and_complete() -> None:
     series = Series()
     for t in range(100_000):
         series.add(float(t), error_m=0.001, expected_m=None, pairs_per_s=10.0, predict_s=None)
@@ -52,7 +52,7 @@ def test_a_series_of_months_stays_small_and_covers_all_of_it() -> None:
     assert np.ptp(np.diff(t)) == 0
 
 
-def test_a_change_is_marked_once_where_it_was_and_named_when_it_is_known() -> None:
+def test_change_is_marked_once_and_named_later() -> None:
     course = Course()
     for pairs in (90, 100):
         course.note(learner(pairs), 1.0)
@@ -74,7 +74,7 @@ def test_a_told_tool_change_is_marked_as_told() -> None:
     assert marks(course) == [(100, "tool", True)]
 
 
-def test_a_change_that_was_rolled_back_is_marked_no_more() -> None:
+def test_rolled_back_change_loses_its_mark() -> None:
     course = Course()
     first, second = change("camera"), change("tool", noticed_seq=200, found=False)
     course.note(learner(110, pairs_since_change=10, last_change=first), 1.0)
@@ -86,14 +86,14 @@ def test_a_change_that_was_rolled_back_is_marked_no_more() -> None:
     assert marks(course) == []
 
 
-def test_a_change_that_is_placed_anew_is_marked_once() -> None:
+def test_relocated_change_is_marked_once() -> None:
     course = Course()
     for since in (10, 12, 9):
         course.note(learner(110, pairs_since_change=since, last_change=change("camera")), 1.0)
     assert marks(course) == [(100, "camera", False)]
 
 
-def test_a_span_of_one_model_is_one_line_with_its_newest_version() -> None:
+def test_model_span_is_one_line_with_newest_version() -> None:
     course = Course()
     for pairs, answering, model in ((1, "nlms", "a"), (20, "nlms", "b"), (30, "rigid", "c"), (40, "rigid", "d")):
         course.note(learner(pairs, answering=answering, model=model), float(pairs))
@@ -116,20 +116,20 @@ def test_learning_that_began_anew_has_no_past() -> None:
     assert [span.first_pairs for span in course.document.versions] == [3]
 
 
-def test_segments_are_counted_and_the_first_known_one_may_have_begun_before() -> None:
+def test_segment_counts_allow_an_unseen_beginning() -> None:
     recent = RecentPairs()
     recent.add([pair(seq, segment=4 + (seq > 12)) for seq in range(10, 20)])
     found = [(segment.segment, segment.pairs, segment.complete) for segment in recent.segments()]
     assert found == [(4, 3, False), (5, 7, True)]
 
 
-def test_of_a_store_of_any_size_only_the_newest_pairs_are_kept() -> None:
+def test_only_newest_pairs_of_store_are_kept() -> None:
     recent = RecentPairs()
     recent.add(pair(seq) for seq in range(1, 2 * KEPT))
     assert (len(recent), recent.newest.seq) == (KEPT, 2 * KEPT - 1)
 
 
-def test_the_cloud_is_of_this_tool_s_learnt_pairs_evenly_spread() -> None:
+def test_cloud_is_even_sample_of_current_tool() -> None:
     recent = RecentPairs()
     recent.add(pair(seq) for seq in range(1, 2501))
     chosen = [chosen.seq for chosen in recent.chosen(500, 2400)]
@@ -146,7 +146,7 @@ def test_a_residual_is_measured_less_predicted() -> None:
     assert found.model == "6b6f"
 
 
-def test_before_there_is_a_model_the_cloud_is_empty() -> None:
+def test_cloud_without_model_is_empty() -> None:
     def refuse(q: list[list[float]]) -> PredictReply:
         raise RequestError("there is no model yet")
 

@@ -94,7 +94,7 @@ def test_a_diagnosis_leaves_its_report(config, said, diagnoses) -> None:
 
 
 @pytest.mark.soak
-def test_what_the_diagnosis_says_it_lacks_comes_to_the_page(config, said, diagnoses) -> None:
+def test_missing_diagnosis_input_is_shown_on_page(config, said, diagnoses) -> None:
     diagnoses(lambda: stored(config, 3)).start()
     assert said.over.wait(LIMIT_S)
     assert said.newest.state == "failed"
@@ -111,7 +111,7 @@ def test_without_a_sampler_the_page_is_told_so(said, diagnoses) -> None:
     assert (said.newest.state, said.newest.said) == ("failed", "the sampler does not answer")
 
 
-def test_one_diagnosis_runs_at_a_time_and_can_be_stopped(config, said, diagnoses) -> None:
+def test_single_diagnosis_runs_and_can_be_stopped(config, said, diagnoses) -> None:
     history = Stored(config, 150)
     asked = diagnoses(lambda: history)
     asked.start()

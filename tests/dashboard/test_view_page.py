@@ -91,7 +91,7 @@ def ask(hub: Hub, processes: Processes):
     return asked
 
 
-def test_a_button_s_command_reaches_the_process_and_its_words_come_back(ask, processes) -> None:
+def test_button_command_reaches_process_and_returns_answer(ask, processes) -> None:
     answer = ask("POST", "/api/command", json=PAUSE)
     assert (answer.status_code, answer.json()["message"]) == (200, "no pairs are accepted until resume")
     assert processes.told == [("sampler", "pause")]
@@ -102,7 +102,7 @@ def test_a_change_is_rolled_back_by_a_button(ask, processes) -> None:
     assert processes.told == [("learner", "rollback")]
 
 
-def test_the_cameras_picture_is_served_where_there_is_one(ask, processes) -> None:
+def test_available_camera_picture_is_served(ask, processes) -> None:
     assert ask("GET", "/api/picture").status_code == 204
     processes.jpeg = b"jpeg"
     answer = ask("GET", "/api/picture")
@@ -134,7 +134,7 @@ class SlowShapes(Processes):
         return super().mesh(number)
 
 
-def test_pages_that_wait_for_the_shapes_hold_up_nothing_else(hub, processes) -> None:
+def test_waiting_for_shapes_blocks_no_other_request(hub, processes) -> None:
     shapes = SlowShapes()
 
     async def asked() -> tuple[list[int], list[int]]:
@@ -170,7 +170,7 @@ def test_who_asks_for_another_host_is_refused_everywhere(ask, address: str, host
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1:8420", "localhost:9000", "LOCALHOST", "[::1]:8420"])
-def test_this_machine_s_names_are_served_on_any_port_so_that_a_tunnel_works(ask, host: str) -> None:
+def test_local_host_names_are_accepted_on_any_port(ask, host: str) -> None:
     assert ask("GET", "/", {"Host": host}).status_code == 200
 
 
@@ -213,7 +213,7 @@ def test_another_page_may_not_read_here_either(ask, address: str) -> None:
         b'{"process": "sampler", "command": "pause"}' + b" " * LARGEST_BODY,
     ],
 )
-def test_what_no_button_says_is_refused_and_nothing_happens(ask, processes, body: bytes) -> None:
+def test_unknown_command_is_refused_without_effect(ask, processes, body: bytes) -> None:
     answer = ask("POST", "/api/command", {"Content-Type": "application/json"}, content=body)
     assert answer.status_code == 400
     assert answer.json()["error"]
@@ -227,7 +227,7 @@ def test_a_form_s_encoding_is_refused(ask, processes) -> None:
 
 
 @pytest.mark.parametrize(("error", "code"), [(BusError("nobody answers"), 503), (RequestError("not now"), 400)])
-def test_why_a_process_did_not_do_it_is_told(ask, processes, error: Exception, code: int) -> None:
+def test_refusal_of_process_is_reported(ask, processes, error: Exception, code: int) -> None:
     processes.error = error
     answer = ask("POST", "/api/command", json=PAUSE)
     assert (answer.status_code, answer.json()) == (code, {"error": str(error)})
@@ -258,7 +258,7 @@ def test_before_any_diagnosis_there_is_no_report(ask) -> None:
     assert ask("GET", "/report").status_code == 404
 
 
-def test_a_path_out_of_the_folder_is_not_found(ask) -> None:
+def test_path_outside_folder_is_not_found(ask) -> None:
     for path in ("/static/../app.py", "/static/%2e%2e/app.py", "/static/js/..%2f..%2f..%2fapp.py"):
         assert ask("GET", path).status_code == 404
 
@@ -320,7 +320,7 @@ def test_a_head_request_takes_no_page_s_place(ask, hub) -> None:
         assert ask("HEAD", "/api/events").status_code == 200
 
 
-def test_a_slow_browser_gets_the_newest_of_each_document_alone(hub) -> None:
+def test_slow_browser_gets_only_newest_documents(hub) -> None:
     async def follow() -> dict[str, bytes]:
         follower = hub.follow()
         for number in range(100):
@@ -345,7 +345,7 @@ KINDS = (".html", ".css", ".js")
 OURS = sorted(file for file in STATIC.rglob("*") if file.suffix in KINDS and "vendor" not in file.parts)
 
 
-def test_the_page_has_every_element_that_its_scripts_ask_for() -> None:
+def test_page_has_every_element_scripts_need() -> None:
     asked = {
         name
         for file in OURS

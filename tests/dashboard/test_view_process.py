@@ -37,7 +37,7 @@ def page(port: int) -> str | None:
         connection.close()
 
 
-def test_the_page_is_there_as_long_as_the_process_that_shows_it(robot: Path, endpoint: str) -> None:
+def test_page_lives_as_long_as_its_process(robot: Path, endpoint: str) -> None:
     port, deadline = int(endpoint.rpartition(":")[2]), time.monotonic() + LIMIT_S
     with shown(robot, port):
         while (found := page(port)) is None:
@@ -48,7 +48,7 @@ def test_the_page_is_there_as_long_as_the_process_that_shows_it(robot: Path, end
 
 
 @pytest.mark.soak
-def test_a_port_that_is_taken_is_no_matter_for_whoever_is_shown(robot: Path, caplog) -> None:
+def test_taken_port_does_not_disturb_shown_process(robot: Path, caplog) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken, shown(robot, taken.getsockname()[1]) as process:
         process.wait(LIMIT_S)
     assert "the page had ended with exit code 1" in caplog.text

@@ -129,7 +129,7 @@ def test_names_that_the_system_refuses_are_missing_meshes(tmp_path, monkeypatch,
     assert "Missing meshes: package://locked/a.stl." in found.said[0]
 
 
-def test_a_name_longer_than_any_file_s_is_a_missing_mesh(tmp_path) -> None:
+def test_overlong_mesh_name_counts_as_missing(tmp_path) -> None:
     robot(tmp_path, mesh(f"{'a' * 5000}.stl"))
     assert "Missing meshes: aaa" in read_shapes(tmp_path / "arm.urdf").said[0]
 

@@ -121,7 +121,7 @@ def sampler(config: Config, pairs: int):
     return process(config.tables.zenoh.sampler, "sampler", status, {KEYS.pairs: answer})
 
 
-def test_a_learner_that_goes_is_missed_and_one_that_comes_back_is_seen(config, hub, watch) -> None:
+def test_learner_disappearance_and_return_are_noticed(config, hub, watch) -> None:
     def answers() -> bool:
         found = document(hub, "learner")
         return found is not None and found["answers"]
@@ -135,7 +135,7 @@ def test_a_learner_that_goes_is_missed_and_one_that_comes_back_is_seen(config, h
 
 
 @pytest.mark.parametrize("here", [True, False])
-def test_a_learner_at_the_router_is_seen_wherever_it_runs(tmp_path, hub, free_endpoint, here) -> None:
+def test_learner_behind_router_is_seen(tmp_path, hub, free_endpoint, here) -> None:
     meeting, own = free_endpoint(), free_endpoint()
     tables = f'[zenoh]\nsampler = "{free_endpoint()}"\nlearner = "{own}"\nrouter = "{meeting}"\n'
     config = Config.load(write_small_arm(tmp_path, tables), {})
@@ -147,7 +147,7 @@ def test_a_learner_at_the_router_is_seen_wherever_it_runs(tmp_path, hub, free_en
         until(lambda: (found := document(hub, "learner")) and found["answers"])
 
 
-def test_residuals_and_segments_come_from_the_sampler_s_pairs_and_the_learner_s_answers(config, hub, watch) -> None:
+def test_residuals_combine_sampler_pairs_and_learner_answers(config, hub, watch) -> None:
     told = msgspec.structs.replace(LEARNER, pairs=250, last_seq=250, pairs_since_change=250)
     with sampler(config, 250), learner(config, told):
         cloud = until(lambda: (found := document(hub, "cloud")) and len(found["x"]) == 250 and found)
@@ -156,13 +156,13 @@ def test_residuals_and_segments_come_from_the_sampler_s_pairs_and_the_learner_s_
         assert until(lambda: any(document(hub, "series")["predict_s"]))
 
 
-def test_fields_that_this_version_does_not_know_are_passed_on(config, hub, watch) -> None:
+def test_unknown_state_fields_are_passed_on(config, hub, watch) -> None:
     newer = msgspec.to_builtins(LEARNER) | {"mood": "fine"}
     with learner(config, newer):
         until(lambda: (found := document(hub, "learner")) and found["status"] and found["status"]["mood"] == "fine")
 
 
-def test_a_state_that_is_not_understood_is_told_and_ends_nothing(config, hub, watch) -> None:
+def test_unreadable_state_is_reported_and_survived(config, hub, watch) -> None:
     with learner(config, {"robot": 3}):
         said = until(lambda: (found := document(hub, "learner")) and found["problem"])
     assert "another version" in said
@@ -200,7 +200,7 @@ def test_the_arm_stands_at_the_newest_pair(config, hub, watch) -> None:
     assert arm["apart_m"] == pytest.approx(0.003)
 
 
-def test_a_picture_is_asked_for_once_by_many_browsers(config, hub, watch) -> None:
+def test_many_browsers_cause_one_picture_request(config, hub, watch) -> None:
     asked: list[int] = []
 
     def picture(_) -> bytes:

@@ -41,25 +41,25 @@ def in_runs(robot: RobotDescription, *effects: Effect) -> Fit:
     return aligned(observations, Simulation(robot)).with_causes(effects)
 
 
-def test_a_joint_that_settles_is_at_rest_when_it_has_forgotten_what_was_before_the_run(robot) -> None:
+def test_settling_joint_is_trusted_after_its_memory_decays(robot) -> None:
     lacking = in_runs(robot, Effect.at(robot, "settling", SHOULDER, values=[0.3, 0.3])).doubtful()
     rows = np.flatnonzero(lacking[:RUN])
     # 0.3 and 0.09 of it are more than a twentieth, 0.027 is not; the first row is never trusted in a walk.
     np.testing.assert_array_equal(rows, [1, 2])
 
 
-def test_a_joint_that_remembers_nothing_is_at_rest_at_once(robot) -> None:
+def test_joint_without_memory_is_trusted_at_once(robot) -> None:
     assert not in_runs(robot, Effect.at(robot, "settling", SHOULDER, values=[0.3, 0.0])).doubtful().any()
 
 
-def test_a_run_that_begins_in_mid_move_makes_no_outliers_beyond_the_rows_before_rest(robot) -> None:
+def test_excluding_unsettled_rows_leaves_no_outliers(robot) -> None:
     fit = in_runs(robot, Effect.at(robot, "settling", SHOULDER, values=[0.5, 0.3]))
     again = aligned(fit.observations.without(fit.doubtful()), Simulation(robot)).with_causes(fit.causes)
     assert fit.noise.share > 0.02
     assert again.noise.share < 0.005
 
 
-def test_a_play_is_known_once_the_run_has_crossed_it(robot) -> None:
+def test_backlash_side_is_known_after_crossing(robot) -> None:
     q = np.tile(np.median(walk(robot, 3).q, axis=0), (6, 1))
     q[:, robot.joints.index(SHOULDER)] += [0.0, 0.01, 0.02, 0.03, 0.02, 0.01]
     play = Effect.at(robot, "backlash", SHOULDER, values=[0.025])
@@ -67,7 +67,7 @@ def test_a_play_is_known_once_the_run_has_crossed_it(robot) -> None:
     np.testing.assert_array_equal(play.kind.unknown_state(run, play), [True, True, True, False, False, False])
 
 
-def test_after_the_first_crossing_the_path_between_two_runs_is_believed(robot) -> None:
+def test_backlash_side_is_trusted_after_first_crossing(robot) -> None:
     fit = in_runs(robot, Effect.at(robot, "backlash", SHOULDER, values=[0.2]))
     reached = fit.observations.motion.q[:, robot.joints.index(SHOULDER)]
     crossed = np.maximum.accumulate(reached) - np.minimum.accumulate(reached) >= fit.causes[0].values[0]
@@ -76,14 +76,14 @@ def test_after_the_first_crossing_the_path_between_two_runs_is_believed(robot) -
 
 
 @pytest.mark.parametrize("seed", [3, 4])
-def test_where_few_runs_cross_a_play_nothing_stands_in_for_its_side(robot, seed) -> None:
+def test_rarely_crossed_backlash_is_the_only_cause_found(robot, seed) -> None:
     play = Effect.at(robot, "backlash", SHOULDER, values=[0.2])
     found = diagnose(recorded(robot, play, seed=seed), Simulation(robot))
     assert [cause.key for cause in found.causes] == [play.key]
     assert not found.left.is_there
 
 
-def test_a_flank_is_known_where_friction_does_not_matter(robot) -> None:
+def test_backlash_side_is_unknown_only_within_friction_band(robot) -> None:
     torque = np.array([10.0, 3.0, -0.4, -0.8, -3.0, -10.0])  # friction of 1 N m lets go at -1
     play = Effect.at(robot, "gravity_backlash", SHOULDER, values=[0.01, 1.0])
     k = robot.joints.index(SHOULDER)

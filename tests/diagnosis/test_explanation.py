@@ -55,17 +55,17 @@ def fits_on_the_way() -> list[Fit]:
     return [start.with_causes(truth[:count]) for count in range(3)]
 
 
-def test_fewer_causes_stay_where_one_more_is_hardly_better_beside_the_same_way(monkeypatch) -> None:
+def test_marginally_better_extra_cause_is_not_added(monkeypatch) -> None:
     fits = fits_on_the_way()
     assert explained_beside(fits, [100.0, 101.0 + NAMED, 0.0], monkeypatch).fit is fits[0]
 
 
-def test_one_more_cause_is_taken_where_it_is_clearly_better_beside_the_same_way(monkeypatch) -> None:
+def test_clearly_better_extra_cause_is_added(monkeypatch) -> None:
     fits = fits_on_the_way()
     assert explained_beside(fits, [100.0, 120.0, 0.0], monkeypatch).fit is fits[1]
 
 
-def test_what_few_rows_tell_of_a_way_is_no_reason_to_doubt_it() -> None:
+def test_unnamed_family_shown_by_few_rows_is_kept() -> None:
     # A shoulder that errs by the elbow's square, where the elbow was far out in a few rows alone.
     robot = desk_arm()
     shoulder, elbow = (robot.joints.index(joint) for joint in (SHOULDER, ELBOW))
@@ -83,7 +83,7 @@ def test_what_few_rows_tell_of_a_way_is_no_reason_to_doubt_it() -> None:
     assert unnamed.predicts(unnamed.apart(start, (Way.of(family, start),)), start)
 
 
-def test_noise_that_is_alike_in_neighbouring_rows_puts_no_unnamed_error_in_the_place_of_a_cause() -> None:
+def test_autocorrelated_noise_replaces_no_cause_by_unnamed_error() -> None:
     robot = desk_arm()
     simulation, motion = Simulation(robot), walk(robot, 1, rows=600)
     cause = Effect.at(robot, "joint_eccentricity", ELBOW, values=[0.02, 0.01])
@@ -99,7 +99,7 @@ def test_noise_that_is_alike_in_neighbouring_rows_puts_no_unnamed_error_in_the_p
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_cause_stays_that_only_the_rows_show_which_the_instrument_sees_well(seed) -> None:
+def test_cause_shown_only_by_precise_rows_is_kept(seed) -> None:
     robot, rng = surveyed_arm(), np.random.default_rng([seed, 7])
     motion = walk(robot, seed, 400)
     cause = Effect.at(robot, "joint_eccentricity", ELBOW, values=[1e-3, 1e-3])

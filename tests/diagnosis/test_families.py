@@ -27,7 +27,7 @@ def found(start) -> list[Family]:
     return families(start.run)
 
 
-def test_columns_times_numbers_are_the_moves_by_what_they_are_moved(start, found) -> None:
+def test_family_columns_match_moves_times_amounts(start, found) -> None:
     rng = np.random.default_rng(0)
     for family in found:
         columns = family.columns(start.run)
@@ -36,7 +36,7 @@ def test_columns_times_numbers_are_the_moves_by_what_they_are_moved(start, found
         np.testing.assert_allclose(columns @ numbers, np.einsum("nia,na->ni", family.moves(start.run), by), atol=1e-9)
 
 
-def test_a_part_of_a_family_moves_as_the_family_with_the_same_numbers_does(start, found) -> None:
+def test_subfamily_moves_as_the_whole_family_does(start, found) -> None:
     rng = np.random.default_rng(0)
     for family in (family for family in found if family.kind == "body" and family.ties is None):
         way = Way.of(family, start)
@@ -46,7 +46,7 @@ def test_a_part_of_a_family_moves_as_the_family_with_the_same_numbers_does(start
         np.testing.assert_allclose(part.columns @ (part.scales * numbers), whitened, rtol=1e-6, atol=1e-6)
 
 
-def test_a_link_that_gives_at_its_near_end_turns_about_what_carries_it() -> None:
+def test_link_compliant_at_near_end_rotates_about_carrier() -> None:
     robot = RobotDescription.load(model_file("upper_body"))
     run = start_of(robot, walk(robot, 1, rows=50), (), 1).run
     found, gravity = families(run), run.simulation.gravity
@@ -60,7 +60,7 @@ def test_a_link_that_gives_at_its_near_end_turns_about_what_carries_it() -> None
         np.testing.assert_allclose(family.moves(run)[:, :, :3], axes, atol=1e-9)
 
 
-def test_a_focal_length_that_wanders_is_told_from_all_other_families() -> None:
+def test_wandering_focal_length_is_the_nearest_family() -> None:
     robot = desk_arm()
     motion, rng = walk(robot, 1, rows=150), np.random.default_rng(1)
     x = Simulation(robot).positions(motion) + 3e-4 * rng.normal(size=(len(motion), 3))
@@ -71,7 +71,7 @@ def test_a_focal_length_that_wanders_is_told_from_all_other_families() -> None:
     assert way.family.what == "the lens refocuses: its focal length wanders"
 
 
-def test_a_hand_that_bears_an_arm_of_unknown_weight_leaves_nothing_that_gives() -> None:
+def test_hand_supported_arm_has_no_compliance_families() -> None:
     held = {"torque_free": "held"}
     for robot, gives in ((desk_arm(), False), (desk_arm(held), True)):
         found = families(Simulation(robot).run(walk(robot, 1)))

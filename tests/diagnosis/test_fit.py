@@ -65,13 +65,13 @@ def fits(robot) -> list[Fit]:
     return [start_of(robot, walk(robot, seed), truth, seed).with_causes([at_rest(e) for e in truth]) for seed in SEEDS]
 
 
-def test_each_amount_lies_in_its_stated_interval_as_often_as_stated(robot, fits) -> None:
+def test_amount_intervals_have_their_stated_coverage(robot, fits) -> None:
     truth = np.concatenate([effect.values for effect in planted(robot)])
     held = sum(np.abs(amounts(fit) - truth) <= 1.959964 * np.sqrt(np.diag(covariance(fit))) for fit in fits)
     assert (held >= successes(CHANCE, len(fits), 0.95)).all()
 
 
-def test_the_stated_covariance_is_neither_too_small_nor_too_large(robot, fits) -> None:
+def test_covariance_is_neither_too_small_nor_too_large(robot, fits) -> None:
     truth = np.concatenate([effect.values for effect in planted(robot)])
     total = sum((amounts(f) - truth) @ np.linalg.solve(covariance(f), amounts(f) - truth) for f in fits)
     low, high = chi_square([CHANCE, 1.0 - CHANCE], len(truth) * len(fits))
@@ -88,7 +88,7 @@ SHAPED = {
 @pytest.mark.parametrize(
     "name", ["settling", *(pytest.param(name, marks=pytest.mark.soak) for name in SHAPED if name != "settling")]
 )
-def test_a_period_or_time_constant_lies_in_its_stated_interval_as_often_as_stated(robot, name) -> None:
+def test_shape_parameter_intervals_have_their_stated_coverage(robot, name) -> None:
     where, values, off = SHAPED[name]
     truth = Effect.at(robot, name, where, values=values)
     held = 0
@@ -101,7 +101,7 @@ def test_a_period_or_time_constant_lies_in_its_stated_interval_as_often_as_state
     assert held >= successes(CHANCE, 20, 0.95)
 
 
-def test_the_size_of_the_noise_is_that_of_the_recording(fits) -> None:
+def test_estimated_noise_matches_the_recording_s_noise(fits) -> None:
     squares = np.mean([fit.noise.sigma**2 for fit in fits])
     # Each fit has three coordinates a trusted row less its amounts: 9 of camera and marker, 4 of the causes.
     coordinates = 3 * int(fits[0].observations.trusted.sum())
@@ -111,7 +111,7 @@ def test_the_size_of_the_noise_is_that_of_the_recording(fits) -> None:
 
 
 @pytest.mark.parametrize("ends", [[], [0], [-1], [0, -1]], ids=["inside", "first row", "last row", "both ends"])
-def test_a_tenth_of_scattered_outliers_changes_the_amounts_no_more_than_their_absence_would(robot, ends) -> None:
+def test_ten_percent_outliers_hardly_change_the_amounts(robot, ends) -> None:
     clean = observed(robot, walk(robot, 5), planted(robot), 5)
     n = len(clean)
     inside = np.random.default_rng(6).choice(np.arange(1, n - 1), n // 10 - len(ends), replace=False)
@@ -124,7 +124,7 @@ def test_a_tenth_of_scattered_outliers_changes_the_amounts_no_more_than_their_ab
 
 
 @pytest.mark.parametrize("ends", [[], [-1]], ids=["inside", "last row"])
-def test_scattered_outliers_are_told_from_the_marker(robot, ends) -> None:
+def test_scattered_outliers_get_low_weights(robot, ends) -> None:
     clean = observed(robot, walk(robot, 5), planted(robot), 5)
     n = len(clean)
     inside = np.random.default_rng(6).choice(np.arange(1, n - 1), n // 10 - len(ends), replace=False)
@@ -141,11 +141,11 @@ def jumped(robot) -> Fit:
     return start_of(robot, motion, (Effect.at(robot, "encoder_jump", SHOULDER, values=[JUMP_RAD, t0]),), 7)
 
 
-def test_rows_after_a_jump_of_30_percent_of_the_recording_are_not_taken_for_outliers(jumped) -> None:
+def test_rows_after_a_jump_are_not_outliers(jumped) -> None:
     assert jumped.noise.weights[210:].mean() > 0.95
 
 
-def test_a_jump_of_30_percent_of_the_recording_is_found_from_a_fit_that_knows_nothing_of_it(robot, jumped) -> None:
+def test_jump_is_found_from_fit_without_it(robot, jumped) -> None:
     candidate = Scan(jumped).candidate(Effect.at(robot, "encoder_jump", SHOULDER))
     assert candidate is not None
     found = jumped.with_causes([candidate.effect]).causes[0]
@@ -162,7 +162,7 @@ def triangulated(pixels: FloatArray, calibration: StereoCalibration) -> FloatArr
     return np.array([(ul - cx) * z, (0.5 * (vl + vr) - cy) * z, calibration.focal_px * z]) / calibration.focal_px
 
 
-def test_stereo_covariances_are_those_of_numerical_derivatives_of_triangulation(robot) -> None:
+def test_stereo_covariances_match_numerical_triangulation_derivatives(robot) -> None:
     calibration = robot.calibration
     assert calibration is not None
     x = np.random.default_rng(8).uniform([-0.4, -0.3, 0.4], [0.4, 0.3, 1.6], (20, 3))
@@ -178,7 +178,7 @@ def test_stereo_covariances_are_those_of_numerical_derivatives_of_triangulation(
         np.testing.assert_allclose(stated, expected, rtol=1e-5, atol=1e-5 * np.trace(expected))
 
 
-def test_a_time_constant_is_as_sure_in_seconds_as_in_milliseconds(robot) -> None:
+def test_time_constant_uncertainty_is_independent_of_time_unit(robot) -> None:
     way, halves = walk(robot, 5), []
     assert way.t is not None
     for unit in (1.0, 1e3):
@@ -189,7 +189,7 @@ def test_a_time_constant_is_as_sure_in_seconds_as_in_milliseconds(robot) -> None
     assert halves[1] == pytest.approx(halves[0], rel=1e-3)
 
 
-def test_a_time_constant_of_which_little_is_told_is_not_said_to_be_sure(robot) -> None:
+def test_barely_observed_time_constant_has_large_uncertainty(robot) -> None:
     way = walk(robot, 5)
     assert way.t is not None
     # By the end of the recording hardly more than a straight line has been seen.
@@ -199,7 +199,7 @@ def test_a_time_constant_of_which_little_is_told_is_not_said_to_be_sure(robot) -
     assert np.sqrt(fit.covariance[-1, -1]) > 0.5 * long
 
 
-def test_a_fit_that_cannot_become_so_probable_is_given_up(robot, monkeypatch) -> None:
+def test_hopeless_fit_is_given_up_within_three_steps(robot, monkeypatch) -> None:
     truth = Effect.at(robot, "joint_offset", SHOULDER, values=[0.02])
     other = start_of(robot, walk(robot, 1), (truth,), 1).starting([Effect.at(robot, "joint_scale", SHOULDER)])
     best = improved(other).log_likelihood
@@ -210,7 +210,7 @@ def test_a_fit_that_cannot_become_so_probable_is_given_up(robot, monkeypatch) ->
     assert len(taken) <= 3
 
 
-def test_a_fit_that_begins_far_off_among_outliers_is_not_given_up_before_a_step(robot) -> None:
+def test_distant_start_among_outliers_still_converges(robot) -> None:
     clean = observed(robot, walk(robot, 5), planted(robot), 5)
     rows = np.random.default_rng(6).choice(len(clean), len(clean) // 10, replace=False)
     best = refitted(robot, with_outliers(clean, rows))
@@ -218,7 +218,7 @@ def test_a_fit_that_begins_far_off_among_outliers_is_not_given_up_before_a_step(
     assert improved(far, best.log_likelihood - 1.0).log_likelihood > best.log_likelihood - 1.0
 
 
-def test_of_what_the_data_do_not_tell_twenty_times_the_usual_size_is_clearly_less_probable_than_none(robot) -> None:
+def test_prior_disfavours_large_undetermined_amounts(robot) -> None:
     start = start_of(robot, walk(robot, 1), (), 1)
     # Guided torque-free: no weight bends a joint.
     none = Effect.at(robot, "joint_compliance", ELBOW)
@@ -237,7 +237,7 @@ def test_kept_derivatives_lead_to_the_same_fit(robot) -> None:
     assert abs(improved(kept).log_likelihood - improved(own).log_likelihood) < 0.3
 
 
-def test_the_loss_of_a_cause_is_that_of_a_refit(robot) -> None:
+def test_estimated_loss_of_cause_matches_a_refit(robot) -> None:
     full = refitted(robot, observed(robot, walk(robot, 6), planted(robot), 6))
     for cause in full.causes:
         assert full.loss(cause) == pytest.approx(full.log_likelihood - full.without(cause).log_likelihood, rel=0.1)

@@ -51,7 +51,7 @@ def test_covariance_of_the_pose_covers_the_truth() -> None:
     assert 3.0 < np.mean(squares) < 10.0
 
 
-def test_a_pose_that_was_not_fitted_has_no_covariance() -> None:
+def test_unfitted_camera_pose_has_no_covariance() -> None:
     robot = RobotDescription.load(DESK_ARM)
     pose = found(robot, None, 0, ()).hand_eye
     assert pose.covariance is None
@@ -76,7 +76,7 @@ def test_covariance_of_predicted_poses_covers_the_truth() -> None:
     assert 0.7 < np.mean(squares) < 6.0
 
 
-def test_where_nothing_was_fitted_the_covariance_of_predicted_poses_is_not_known() -> None:
+def test_predicted_pose_covariance_is_absent_without_fitted_effects() -> None:
     assert predicted_pose_covariance(found(RobotDescription.load(DESK_ARM), None, 0, ()).diagnosis.stored) is None
 
 
@@ -87,7 +87,7 @@ def test_tolerances_alone_have_a_covariance_of_predicted_poses() -> None:
     assert np.linalg.eigvalsh(cov).min() > 0.0
 
 
-def test_a_predicted_pose_turns_by_as_much_as_its_joint_is_unsure() -> None:
+def test_predicted_rotation_variance_equals_joint_offset_variance() -> None:
     robot = RobotDescription.load(DESK_ARM)
     fit = found(robot, None, 0, (Effect.at(robot, "joint_offset", robot.joints[1]),)).diagnosis.stored
     cov = predicted_pose_covariance(fit)

@@ -73,7 +73,7 @@ def kept(observations: Observations, rows: np.ndarray) -> Observations:
     )
 
 
-def test_errors_on_rows_held_out_are_those_of_fits_without_their_fold(small) -> None:
+def test_held_out_errors_match_refits_without_the_fold(small) -> None:
     blocks = Blocks.cut(len(small.observations))
     plain = small.observations.x - small.run.measured
     expected = np.empty_like(plain)
@@ -88,20 +88,20 @@ def test_errors_on_rows_held_out_are_those_of_fits_without_their_fold(small) -> 
     assert difference < 0.01
 
 
-def test_errors_on_rows_held_out_are_larger_than_those_on_fitted_rows(small) -> None:
+def test_held_out_errors_exceed_errors_on_fitted_rows(small) -> None:
     plain = np.linalg.norm(small.observations.x - small.run.measured, axis=1)
     distances = np.linalg.norm(held_out_errors(small, Blocks.cut(60)), axis=1)
     assert np.square(distances).mean() > np.square(plain).mean()
 
 
 @pytest.mark.parametrize("folds", [2, 15])
-def test_the_held_out_error_hardly_depends_on_the_folds(small, monkeypatch, folds) -> None:
+def test_held_out_error_hardly_depends_on_fold_count(small, monkeypatch, folds) -> None:
     usual = np.linalg.norm(held_out_errors(small, Blocks.cut(60)))
     monkeypatch.setattr("bodyschema.diagnosis.search.held_out._Settings.folds", folds)
     assert np.linalg.norm(held_out_errors(small, Blocks.cut(60))) == pytest.approx(usual, rel=0.05)
 
 
-def test_blocks_are_runs_of_neighbouring_rows_and_folds_are_dealt_in_turn() -> None:
+def test_blocks_are_contiguous_and_folds_alternate() -> None:
     blocks = Blocks.cut(600)
     assert (np.diff(blocks.of_row) >= 0).all()
     assert np.ptp(np.bincount(blocks.of_row)) <= 1
@@ -109,7 +109,7 @@ def test_blocks_are_runs_of_neighbouring_rows_and_folds_are_dealt_in_turn() -> N
     assert (np.diff(blocks.fold)[np.diff(blocks.of_row) > 0] != 0).all()
 
 
-def test_a_gain_is_the_fall_of_the_rms_inside_its_interval() -> None:
+def test_gain_is_rms_reduction_within_its_interval() -> None:
     rng = np.random.default_rng(3)
     before = np.abs(rng.normal(size=400)) + 1.0
     percent, (low, high) = gain_percent(before, 0.7 * before * rng.uniform(0.9, 1.1, 400), Blocks.cut(400), 0)
@@ -117,7 +117,7 @@ def test_a_gain_is_the_fall_of_the_rms_inside_its_interval() -> None:
     assert low < percent < high
 
 
-def test_the_gain_of_another_recording_is_inside_the_interval() -> None:
+def test_gain_interval_covers_gain_on_another_recording() -> None:
     rng = np.random.default_rng(5)
 
     def recording(rows: int) -> tuple[FloatArray, FloatArray]:
@@ -197,7 +197,7 @@ def in_runs(robot) -> list[Fit]:
 
 
 @pytest.mark.parametrize(("name", "where"), [*ABSENT, SIX_NUMBERS])
-def test_p_values_of_what_is_not_there_are_uniform_under_noise(robot, over_poses, name, where) -> None:
+def test_p_values_of_absent_effects_are_uniform(robot, over_poses, name, where) -> None:
     assert is_uniform(chances(robot, over_poses, name, where))
 
 
@@ -209,23 +209,23 @@ def test_p_values_are_uniform_where_the_arm_walks(robot, over_walks, name, where
 
 @pytest.mark.parametrize(("name", "where"), ABSENT)
 @pytest.mark.soak
-def test_p_values_are_uniform_where_rows_are_rounded_alike_in_runs(robot, in_runs, name, where) -> None:
+def test_p_values_are_uniform_with_shared_rounding_errors(robot, in_runs, name, where) -> None:
     assert is_uniform(chances(robot, in_runs, name, where))
 
 
 @pytest.mark.parametrize(("name", "where"), ABSENT)
 @pytest.mark.soak
-def test_p_values_that_take_such_rows_as_independent_are_not_uniform(robot, in_runs, name, where) -> None:
+def test_p_values_assuming_independent_rows_are_not_uniform(robot, in_runs, name, where) -> None:
     assert not is_uniform(chances_of_independent_rows(robot, in_runs, name, where))
 
 
-def test_what_is_there_has_a_small_p_value(robot) -> None:
+def test_present_effect_has_a_small_p_value(robot) -> None:
     start = start_of(robot, walk(robot, 1), (Effect.at(robot, "joint_scale", BASE, values=[0.005]),), 1)
     assert chances(robot, [start], "joint_scale", BASE)[0] < 1e-6
 
 
 @pytest.mark.soak
 @pytest.mark.xfail(strict=True, reason="a sixth of these p-values is below 0.05")
-def test_p_values_of_six_numbers_are_uniform_where_the_arm_walks(robot) -> None:
+def test_six_parameter_p_values_are_uniform_on_walks(robot) -> None:
     starts = [start_of(robot, walk(robot, seed), (), seed) for seed in MANY_SEEDS]
     assert is_uniform(chances(robot, starts, *SIX_NUMBERS))

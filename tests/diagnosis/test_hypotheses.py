@@ -30,21 +30,21 @@ def names(hypotheses: Hypotheses) -> set[str]:
     return {effect.name for effect in hypotheses.effects}
 
 
-def test_a_robot_without_masses_is_tested_for_joints_that_give() -> None:
+def test_robot_without_masses_is_tested_for_joint_compliance() -> None:
     found = asked_of(desk_arm(HELD))
     assert "joint_compliance" in names(found)
     assert "payload" not in names(found)
     assert any("states no masses" in sentence for sentence in found.limitations)
 
 
-def test_an_arm_that_a_hand_bears_is_not_tested_for_joints_that_give() -> None:
+def test_hand_supported_arm_is_not_tested_for_compliance() -> None:
     found = asked_of(desk_arm())
     assert "joint_compliance" not in names(found)
     assert [s for s in found.limitations if "torque_free" in s]
     assert not [s for s in found.limitations if "masses" in s]
 
 
-def test_a_recording_without_times_is_not_tested_for_latency_and_drift() -> None:
+def test_untimed_recording_is_not_tested_for_timed_effects() -> None:
     robot = desk_arm()
     timed, untimed = walk(robot, 1), dataclasses.replace(walk(robot, 1), t=None)
     assert names(asked_of(robot, timed)) - names(asked_of(robot, untimed)) == {
@@ -54,7 +54,7 @@ def test_a_recording_without_times_is_not_tested_for_latency_and_drift() -> None
     assert not any("no times" in sentence for sentence in asked_of(robot, timed).limitations)
 
 
-def test_a_joint_that_never_moved_is_no_place_and_no_source_of_anything() -> None:
+def test_unmoved_joint_is_in_no_hypothesis() -> None:
     robot = desk_arm()
     q = walk(robot, 1).q.copy()
     q[:, robot.joints.index(ELBOW)] = 0.4
@@ -64,7 +64,7 @@ def test_a_joint_that_never_moved_is_no_place_and_no_source_of_anything() -> Non
     assert f"{ELBOW} never moved: nothing can be said of it." in found.limitations
 
 
-def test_a_camera_without_stereo_calibration_is_not_tested_for_its_lenses() -> None:
+def test_uncalibrated_stereo_camera_is_not_tested_for_lenses() -> None:
     found = asked_of(desk_arm({STEREO: ""}))
     assert names(asked_of(desk_arm())) - names(found) == {
         kind.name for kind in EFFECT_TYPES.values() if kind.needs_stereo
@@ -72,7 +72,7 @@ def test_a_camera_without_stereo_calibration_is_not_tested_for_its_lenses() -> N
     assert any("no stereo calibration" in sentence for sentence in found.limitations)
 
 
-def test_what_is_fitted_in_any_case_is_no_hypothesis() -> None:
+def test_always_fitted_parameters_are_no_hypotheses() -> None:
     free = {"camera_pose", "tool_offset"}
     assert not free & names(asked_of(desk_arm()))
     assert free <= names(asked_of(surveyed_arm()))
@@ -91,14 +91,14 @@ def test_every_effect_is_tested_at_every_joint_once() -> None:
     assert names(found) == {kind.name for kind in EFFECT_TYPES.values() if not kind.needs_weight}
 
 
-def test_only_what_is_asked_for_is_tested() -> None:
+def test_only_requested_effects_are_tested() -> None:
     robot = desk_arm()
     assert names(asked_of(robot, only=("backlash", "joint_scale"))) == {"backlash", "joint_scale"}
     assert "backlash" not in names(asked_of(robot, without=("backlash",)))
 
 
 @pytest.mark.parametrize("rows", [3, 19])
-def test_so_few_rows_test_nothing(rows) -> None:
+def test_fewer_than_20_rows_test_nothing(rows) -> None:
     robot = desk_arm()
     full = observed(robot, walk(robot, 1), (), 1)
     motion = Motion(full.motion.q[:rows], np.arange(rows) / 4.0, np.zeros(rows, np.int64))
@@ -106,7 +106,7 @@ def test_so_few_rows_test_nothing(rows) -> None:
     assert Hypotheses.of(Simulation(robot), few).effects == ()
 
 
-def test_the_first_link_has_a_simpler_name_where_the_cameras_pose_may_be_wrong() -> None:
+def test_first_link_error_is_simpler_as_camera_pose() -> None:
     robot = surveyed_arm()
     links = [Effect.at(robot, "link_geometry", joint) for joint in (BASE, ELBOW)]
     asked = [Effect.at(robot, "camera_pose"), *links]

@@ -22,32 +22,32 @@ def small() -> Diagnosis:
     return diagnose(seen(robot, walk(robot, 1), (truth,), 1), Simulation(robot), only=("joint_offset", "joint_scale"))
 
 
-def test_a_search_that_ended_at_its_longest_is_told(small) -> None:
+def test_limitations_report_a_truncated_search(small) -> None:
     assert conclusion(small).limitations == small.hypotheses.limitations
     ended = dataclasses.replace(small, ended_early=True)
     assert "describe the error and do not explain it" in conclusion(ended).limitations[-1]
 
 
-def test_what_extended_toml_leaves_out_is_told(small) -> None:
+def test_limitations_report_content_missing_from_extended_toml(small) -> None:
     told = conclusion(dataclasses.replace(small, stored=small.aligned)).limitations
     assert any(line.startswith("extended.toml holds none of it") for line in told)
 
 
-def test_a_search_that_ended_at_its_limit_explains_nothing(small) -> None:
+def test_truncated_search_is_unexplained(small) -> None:
     assert conclusion(small).verdict == "explained"
     ended = conclusion(dataclasses.replace(small, ended_early=True))
     assert ended.verdict == "unexplained"
     assert all(cause.probability <= 0.5 for cause in ended.causes)
 
 
-def test_many_jumps_describe_the_error_and_do_not_explain_it(small) -> None:
+def test_many_jumps_are_a_description_not_an_explanation(small) -> None:
     robot = small.extended.simulation.robot
     jumps = [Effect.at(robot, "encoder_jump", SHOULDER).one_more(k) for k in range(4)]
     assert are_a_description(jumps)
     assert not are_a_description([*jumps[:3], *small.causes])
 
 
-def test_what_is_rejected_though_chance_hardly_brings_it_about_has_a_word_why(small) -> None:
+def test_rejected_effect_with_small_p_value_has_reason(small) -> None:
     rest = dataclasses.replace(small, extended=small.aligned, standings=())
     rows = {(row.effect, row.where): row for row in conclusion(rest).rejected}
     assert rows["joint_offset", SHOULDER].p_value < 1e-3
@@ -55,7 +55,7 @@ def test_what_is_rejected_though_chance_hardly_brings_it_about_has_a_word_why(sm
     assert all(not row.why for row in rows.values() if row.p_value >= 1e-3)
 
 
-def test_a_play_that_runs_hardly_cross_is_told_with_what_to_record() -> None:
+def test_rarely_crossed_backlash_is_reported_with_remedy() -> None:
     robot = desk_arm()
     way = walk(robot, 1)
     short = Motion(way.q, way.t, np.arange(len(way.q)) // 2)
@@ -66,7 +66,7 @@ def test_a_play_that_runs_hardly_cross_is_told_with_what_to_record() -> None:
     assert "Record longer runs" in told
 
 
-def test_a_cause_that_gains_nothing_on_held_out_rows_is_dropped(small) -> None:
+def test_cause_without_held_out_gain_is_dropped(small) -> None:
     fit, robot = small.extended, small.extended.simulation.robot
     impossible = Effect.at(robot, "backlash", SHOULDER, values=[-0.001])
     begun = Explanation(fit.starting([*fit.causes, impossible]), None, 0.0)

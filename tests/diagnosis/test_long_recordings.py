@@ -38,7 +38,7 @@ def long() -> Diagnosis:
     return diagnose(seen(robot, motion, truth, 1), Simulation(robot), only=("joint_offset", "encoder_jump"))
 
 
-def test_a_part_of_a_motion_keeps_its_clock_and_begins_a_run_after_each_gap() -> None:
+def test_partial_motion_keeps_clock_and_splits_at_gaps() -> None:
     motion = Motion(np.arange(12.0)[:, None], None, np.repeat([0, 1], 6))
     part = motion.some(np.array([0, 1, 2, 5, 6, 7, 10]))
     np.testing.assert_array_equal(part.clock, [0, 1, 2, 5, 6, 7, 10])
@@ -47,13 +47,13 @@ def test_a_part_of_a_motion_keeps_its_clock_and_begins_a_run_after_each_gap() ->
     assert part.moves[3, 0] == 0.0
 
 
-def test_a_long_recording_is_looked_at_from_its_first_to_its_last_row_in_equal_runs() -> None:
+def test_long_recording_is_sampled_from_end_to_end() -> None:
     rows = diagnosis._part_of(np.zeros(ROWS, dtype=np.bool_))
     assert (rows[0], rows[-1], len(rows)) == (0, ROWS - 1, PART)
     assert len(diagnosis._part_of(np.zeros(2 * PART, dtype=np.bool_))) == 2 * PART
 
 
-def test_runs_of_a_broken_recording_are_those_with_the_fewest_breaks() -> None:
+def test_sampled_runs_avoid_breaks_in_the_recording() -> None:
     begins = np.zeros(ROWS, dtype=np.bool_)
     begins[::ROWS] = True
     begins[[70, 75, 80, 85]] = True  # from 68 to 87 would be the second run
@@ -62,7 +62,7 @@ def test_runs_of_a_broken_recording_are_those_with_the_fewest_breaks() -> None:
     np.testing.assert_array_equal(rows[2], np.arange(136, 156))
 
 
-def test_causes_found_in_a_part_are_fitted_to_all_rows(long: Diagnosis) -> None:
+def test_causes_from_part_are_fitted_to_all_rows(long: Diagnosis) -> None:
     assert long.part is not None
     assert len(long.part) == PART
     assert {cause.key[:2] for cause in long.causes} == {("joint_offset", SHOULDER), ("encoder_jump", ELBOW)}
@@ -72,14 +72,14 @@ def test_causes_found_in_a_part_are_fitted_to_all_rows(long: Diagnosis) -> None:
     assert len(long.markers) == ROWS
 
 
-def test_a_moment_between_two_runs_is_found_to_the_row(long: Diagnosis) -> None:
+def test_jump_time_between_sampled_runs_is_found(long: Diagnosis) -> None:
     found = next(cause for cause in conclusion(long).causes if cause.effect == "encoder_jump").parameters["t0"]
     assert found.value == pytest.approx(JUMPED_AT / 4.0, abs=0.3)
     assert found.ci95[1] - found.ci95[0] < 2.0
 
 
 @pytest.mark.soak
-def test_what_has_no_name_in_a_part_is_learnt_from_all_rows() -> None:
+def test_unnamed_error_is_learnt_from_all_rows() -> None:
     robot = desk_arm()
     motion = walk(robot, 1, rows=ROWS)
     q = motion.q.copy()

@@ -25,7 +25,7 @@ def explained(columns: FloatArray, wanted: FloatArray, rank: int) -> tuple[float
 
 
 @given(SEEDS)
-def test_what_follows_one_function_is_all_explained_by_one(seed: int) -> None:
+def test_one_function_signal_is_explained_at_rank_one(seed: int) -> None:
     rng = np.random.default_rng(seed)
     has, moves, function = columns(rng), rng.normal(size=MOVES), rng.normal(size=AMOUNTS)
     wanted = 100.0 * has @ np.outer(moves, function).ravel()
@@ -43,7 +43,7 @@ def test_a_part_explains_no_more_than_the_whole(seed: int, rank: int) -> None:
 
 
 @given(RANKS)
-def test_of_a_higher_rank_there_are_more_numbers_up_to_all(rank: int) -> None:
+def test_parameter_count_rises_with_rank_up_to_all(rank: int) -> None:
     assert numbers_of(MOVES, AMOUNTS, rank) <= MOVES * AMOUNTS
     assert numbers_of(MOVES, AMOUNTS, MOVES) == MOVES * AMOUNTS
     assert rank == 1 or numbers_of(MOVES, AMOUNTS, rank) > numbers_of(MOVES, AMOUNTS, rank - 1)

@@ -87,7 +87,7 @@ def test_a_new_effect_is_found_with_its_size(diagnosis) -> None:
     assert cause.parameters["skew"].value == pytest.approx(SKEW, abs=0.002)
 
 
-def test_a_new_effect_is_told_in_its_words(diagnosis, robot) -> None:
+def test_new_effect_is_described_by_its_presenter(diagnosis, robot) -> None:
     file = conclusion(diagnosis)
     told = remedies(file, robot, np.zeros(len(robot.joints)), np.zeros(len(robot.joints)))
     assert "from a right angle" in file.sentence
@@ -105,7 +105,7 @@ def test_a_new_effect_is_kept_in_extended_toml(diagnosis, tmp_path) -> None:
     np.testing.assert_allclose(again.positions(motion), simulation.positions(motion), atol=1e-9)
 
 
-def test_the_derivative_of_a_new_effect_is_that_of_its_report(two_files, robot) -> None:
+def test_new_effect_derivatives_follow_from_its_report(two_files, robot) -> None:
     motion = scattered(robot, 1, 20)
     others = (
         Effect.at(robot, "camera_scale", values=[0.1]),

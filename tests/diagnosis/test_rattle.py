@@ -35,17 +35,17 @@ def file() -> DiagnosisFile:
     return conclusion(diagnose(measured(robot, motion, noisy), Simulation(robot)))
 
 
-def test_a_loose_marker_is_unexplained_and_told_with_its_play(file) -> None:
+def test_loose_marker_is_unexplained_with_its_play_reported(file) -> None:
     assert (file.verdict, file.causes) == ("unexplained", ())
     assert file.unexplained.rms_mm == pytest.approx(1e3 * HALF_M, rel=0.05)
     assert "Fasten the marker" in file.advice[0]
 
 
-def test_the_play_of_a_loose_marker_is_not_in_the_noise(file) -> None:
+def test_loose_marker_play_does_not_raise_noise_floor(file) -> None:
     assert file.rms_mm.noise_floor == pytest.approx(1e3 * np.sqrt(3.0) * SIGMA_M, rel=0.15)
 
 
-def test_a_marker_that_hangs_where_gravity_takes_it_is_loose() -> None:
+def test_marker_on_its_gravity_side_is_loose() -> None:
     robot, rng = surveyed_arm(), np.random.default_rng(6)
     motion = walk(robot, 2)
     run, way = Simulation(robot).run(motion), np.array([0.6, 0.0, 0.8])
@@ -73,7 +73,7 @@ def beside_tolerances(seed: int, changes: tuple[int, ...]) -> DiagnosisFile:
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_a_marker_seldom_on_its_other_side_is_loose(seed) -> None:
+def test_marker_rarely_on_its_other_side_is_loose(seed) -> None:
     found = beside_tolerances(seed, changes=(120, 132, 200, 206, 290))
     assert (found.verdict, found.causes) == ("unexplained", ())
     assert found.unexplained.rms_mm == pytest.approx(1e3 * HALF_M, rel=0.1)
@@ -86,7 +86,7 @@ def test_a_marker_that_slips_once_is_not_loose(seed) -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_a_marker_that_slips_once_between_poses_of_an_exact_arm_is_not_loose(seed) -> None:
+def test_single_slip_on_exact_arm_is_not_loose(seed) -> None:
     robot, motion = surveyed_arm(), scattered(surveyed_arm(), seed)
     slip = Effect.at(robot, "tool_slip", values={"x_m": 0.0, "y_m": 0.0024, "z_m": -0.0015, "t0": 44.9})
     found = conclusion(diagnose(seen(robot, motion, (slip,), seed), Simulation(robot)))
@@ -102,7 +102,7 @@ def test_outliers_are_no_second_side(count) -> None:
     assert diagnose(measured(robot, motion, x), Simulation(robot)).left.rattle is None
 
 
-def test_a_marker_may_lie_anywhere_beside_a_change_of_side() -> None:
+def test_marker_side_is_undetermined_beside_a_change() -> None:
     robot, rng = surveyed_arm(), np.random.default_rng(3)
     motion = walk(robot, 3)
     run = Simulation(robot).run(motion)
@@ -115,7 +115,7 @@ def test_a_marker_may_lie_anywhere_beside_a_change_of_side() -> None:
     assert np.flatnonzero(play.sides == 0.0).tolist() == sorted([*changes - 1, *changes])
 
 
-def test_a_marker_that_changes_its_side_once_has_no_play() -> None:
+def test_marker_changing_side_once_has_no_play() -> None:
     robot, rng = surveyed_arm(), np.random.default_rng(3)
     motion = walk(robot, 3)
     run = Simulation(robot).run(motion)
@@ -129,7 +129,7 @@ def test_a_marker_that_changes_its_side_once_has_no_play() -> None:
     ("limit", "factor"),
     [("apart", 0.3), ("apart", 3.0), ("named", 0.3), ("named", 3.0), ("beyond_noise", 0.3), ("rounds", 0.3)],
 )
-def test_a_clear_play_does_not_depend_on_its_limits(monkeypatch, limit, factor) -> None:
+def test_clear_marker_play_is_insensitive_to_the_limits(monkeypatch, limit, factor) -> None:
     robot, rng = surveyed_arm(), np.random.default_rng(4)
     simulation, motion = Simulation(robot), scattered(robot, 1, rows=150)
     run = simulation.run(motion)
@@ -157,7 +157,7 @@ def test_a_loose_marker_without_noise_is_loose(seed) -> None:
     assert found.unexplained.rms_mm == pytest.approx(1e3 * HALF_M, rel=1e-3)
 
 
-def test_beside_a_loose_marker_the_noise_and_the_rows_left_out_stay(monkeypatch) -> None:
+def test_loose_marker_keeps_noise_factor_and_excluded_rows(monkeypatch) -> None:
     robot, rng = surveyed_arm(), np.random.default_rng(0)
     simulation, motion = Simulation(robot), scattered(robot, 1, rows=40)
     x = simulation.run(motion).measured + SIGMA_M * rng.normal(size=(40, 3))
@@ -192,7 +192,7 @@ def test_beside_a_loose_marker_the_noise_and_the_rows_left_out_stay(monkeypatch)
     assert (begun[-1].doubtful == left_out).all()
 
 
-def test_two_sides_and_causes_are_compared_over_the_same_rows(monkeypatch) -> None:
+def test_loose_marker_and_causes_share_the_compared_rows(monkeypatch) -> None:
     robot, rng = surveyed_arm(), np.random.default_rng(0)
     simulation, motion = Simulation(robot), scattered(robot, 1, rows=40)
     x = simulation.run(motion).measured + SIGMA_M * rng.normal(size=(40, 3))
@@ -230,7 +230,7 @@ def test_a_loose_marker_in_few_rows_has_noise(rows) -> None:
 
 
 @pytest.mark.parametrize("seed", range(2, 6))
-def test_rows_that_the_instrument_sees_less_exactly_are_no_second_side(seed) -> None:
+def test_imprecise_rows_are_not_a_second_marker_side(seed) -> None:
     robot, rng = surveyed_arm(), np.random.default_rng([seed, 8])
     motion = walk(robot, seed, 400)
     run = Simulation(robot).run(motion)

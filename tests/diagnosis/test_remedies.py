@@ -91,7 +91,7 @@ def test_beside_what_is_unexplained_a_remedy_is_conditional(robot) -> None:
     assert remedy.startswith("If it is joint elbow_pitch moving with joint base_yaw and not a part of what remains")
 
 
-def test_a_laser_tracker_has_no_images_to_look_at(robot) -> None:
+def test_laser_tracker_remedy_mentions_no_images(robot) -> None:
     outliers = Cause("outliers", None, None, {"share": Interval(0.006, (0.002, 0.01))}, 1.0, 0.0, 0.0, (), (), "")
     assert told(robot, outliers)[0].startswith("Look at the images of the 0.6 % of fixes")
     assert told(replace(robot, calibration=None), outliers, verdict="unexplained") == [
@@ -105,13 +105,13 @@ def test_decimals_of_a_file_are_no_ticks(robot, step) -> None:
     assert "tick" not in told(robot, cause(effect), step=step)[0]
 
 
-def test_ticks_are_not_spoken_of_where_none_are_seen(robot) -> None:
+def test_remedy_without_known_ticks_mentions_no_ticks(robot) -> None:
     effect = Effect.at(robot, "joint_offset", "elbow_pitch", values={"offset_rad": 0.01})
     assert "tick" not in told(robot, cause(effect))[0]
 
 
 @pytest.mark.parametrize("joint", ["shoulder_pitch", "elbow_pitch", "wrist_roll"])
-def test_a_urdf_with_the_origin_that_is_given_is_right(robot, joint) -> None:
+def test_following_urdf_origin_remedy_corrects_the_positions(robot, joint) -> None:
     effect = Effect.at(robot, "link_geometry", joint, values=SIX)
     wanted = positions(robot, effect)
     found = re.search(r'xyz="([^"]*)" rpy="([^"]*)"', told(robot, cause(effect))[0])
@@ -128,7 +128,7 @@ def test_a_urdf_with_the_origin_that_is_given_is_right(robot, joint) -> None:
     [("camera_pose", SIX), ("tool_offset", {axis: SIX[axis] for axis in ("x_m", "y_m", "z_m")}),
      ("camera_scale", {"scale_error": 0.02}), ("camera_focal", {"focal_error": -0.01})],
 )  # fmt: skip
-def test_a_robot_toml_with_the_numbers_that_are_given_is_right(robot, name, values) -> None:
+def test_following_robot_toml_remedy_corrects_the_positions(robot, name, values) -> None:
     effect = Effect.at(robot, name, values=values)
     remedy = told(robot, cause(effect))[0]
     changed = edited(robot, remedy)
@@ -145,7 +145,7 @@ def test_a_robot_toml_with_the_numbers_that_are_given_is_right(robot, name, valu
     np.testing.assert_allclose(depth, positions(robot)[:, 2], rtol=1e-5)
 
 
-def test_a_bump_counts_from_the_pose_that_was_found(robot) -> None:
+def test_camera_bump_is_relative_to_the_fitted_pose(robot) -> None:
     pose = Effect.at(robot, "camera_pose", values=SIX)
     bump = Effect.at(robot, "camera_moved", values={**SIX, "t0": -1.0})
     changed = edited(robot, told(robot, cause(pose), cause(bump))[1].split("is xyz")[1].join(["xyz", ""]))
@@ -157,13 +157,13 @@ def test_a_spring_tells_how_far_it_gives(robot) -> None:
     assert "up to 0.4° here" in told(robot, cause(effect), torque=2.0)[0]
 
 
-def test_a_joint_that_counts_the_other_way_is_called_so(robot) -> None:
+def test_reversed_joint_sign_is_named_as_such(robot) -> None:
     effect = Effect.at(robot, "joint_scale", "wrist_roll", values=[-2.0])
     assert "the other sign" in told(robot, cause(effect))[0]
     assert "counts the other way" in finding("joint_scale", "wrist_roll", None, {"scale_error": -2.0})
 
 
-def test_of_a_cause_that_may_be_another_one_that_is_said_first(robot) -> None:
+def test_remedy_of_uncertain_cause_states_its_rival_first(robot) -> None:
     effect = Effect.at(robot, "backlash", "elbow_pitch", values=[0.01])
     rival = Indistinguishable("settling", "elbow_pitch", None, "this_motion", 0.4)
     remedy = told(robot, cause(effect, probability=0.6, rivals=(rival,)))[0]
@@ -175,7 +175,7 @@ def test_numbers_have_the_digits_that_their_interval_has() -> None:
     assert (shown.label, shown.value, shown.interval) == ("offset", "+0.523°", "± 0.030")
 
 
-def test_a_lopsided_interval_is_told_by_its_ends() -> None:
+def test_asymmetric_interval_is_shown_by_its_ends() -> None:
     assert number("t0", Interval(40.0, (39.0, 44.0))).interval == "(39.0 … 44.0)"
 
 
@@ -183,7 +183,7 @@ def test_a_moment_without_times_is_a_row() -> None:
     assert number("t0", Interval(40.0, (39.0, 41.0)), timed=False).value == "row 40.0"
 
 
-def test_numbers_that_a_motion_does_not_tell_are_kept_out(robot) -> None:
+def test_undetermined_numbers_are_omitted(robot) -> None:
     effect = Effect.at(robot, "link_geometry", "elbow_pitch", values=SIX)
     known = cause(effect)
     known.parameters["y_m"] = Interval(0.0, (-0.3, 0.3))

@@ -118,7 +118,7 @@ def test_every_remedy_is_given(planted, file, html) -> None:
         assert escape(remedy) in html
 
 
-def test_the_moment_of_a_jump_is_marked_over_time(html) -> None:
+def test_jump_time_is_marked_in_time_plots(html) -> None:
     assert "Over time" in html
     assert html.count('class="moment"') == 3
 
@@ -128,7 +128,7 @@ def test_names_from_outside_are_text(html) -> None:
     assert "&lt;pairs&gt; &amp; more.csv" in html
 
 
-def test_what_was_done_names_version_and_seed(html) -> None:
+def test_report_states_version_and_seed(html) -> None:
     assert "bodyschema 1.2.3" in html
     assert "seed 0" in html
 
@@ -137,7 +137,7 @@ def test_a_report_is_less_than_a_megabyte(html) -> None:
     assert len(html.encode()) < 1_000_000
 
 
-def test_both_kinds_of_screen_and_paper_are_thought_of(html) -> None:
+def test_stylesheet_covers_dark_mode_small_screens_and_print(html) -> None:
     for rule in ("prefers-color-scheme:dark", "max-width:720px", "@media print", 'name="viewport"'):
         assert rule in html
 
@@ -152,7 +152,7 @@ def test_verdicts_look_different(planted, file, verdict, words) -> None:
     assert f'<span class="verdict {verdict}">{words}</span>' in page(planted, other, advice_on(planted, file), ABOUT)
 
 
-def test_a_recording_in_which_nothing_is_found_has_a_report_without_causes(robot) -> None:
+def test_report_without_findings_has_no_causes_section(robot) -> None:
     found = diagnose(walked(robot), Simulation(robot), only=("backlash",))
     html = page(found, conclusion(found), [], ABOUT)
     assert 'id="causes"' not in html
@@ -166,7 +166,7 @@ PLACES = [
 
 
 @pytest.mark.parametrize(("name", "where", "source"), PLACES)
-def test_every_effect_has_a_plot_and_a_remedy_of_its_own(robot, planted, file, name, where, source) -> None:
+def test_every_effect_has_a_plot_and_a_remedy(robot, planted, file, name, where, source) -> None:
     joints = robot.joints
     at = (None if where is None else joints[where], None if source is None else joints[source])
     effect = Effect.at(robot, name, *at)
@@ -197,7 +197,7 @@ def test_bins_of_a_step_function_have_its_values() -> None:
     assert binned(x, 3.0 * x).y.tolist() == [0.0, 3.0, 6.0]
 
 
-def test_structure_is_the_share_of_the_variance_that_goes_with_x() -> None:
+def test_structure_is_the_variance_share_explained_by_x() -> None:
     rng = np.random.default_rng(5)
     x = rng.uniform(size=4000)
     assert structure(x, np.sin(6.0 * x) + 1e-3 * rng.normal(size=4000)) > 0.95

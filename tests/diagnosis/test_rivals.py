@@ -45,21 +45,21 @@ def turned_camera() -> Diagnosis:
     return diagnosed(robot, walk(robot, 2, ROWS), truth, ("camera_pose", "link_geometry", "joint_offset"))
 
 
-def test_the_pose_of_the_camera_and_the_first_links_geometry_are_the_same_in_any_motion(turned_camera) -> None:
+def test_camera_pose_equals_first_link_in_any_motion(turned_camera) -> None:
     (cause,) = conclusion(turned_camera).causes
     assert cause.effect == "camera_pose"
     same = {(rival.effect, rival.where): rival.by for rival in cause.rivals}
     assert same == {("link_geometry", BASE): "any_motion"}
 
 
-def test_a_cause_that_no_motion_tells_from_its_rival_is_as_sure_as_both_together(turned_camera) -> None:
+def test_equivalent_rival_does_not_lower_the_cause_s_probability(turned_camera) -> None:
     (cause,) = conclusion(turned_camera).causes
     assert cause.probability > 0.99
     assert cause.rivals[0].probability > 0.02
     assert conclusion(turned_camera).verdict == "explained"
 
 
-def test_of_causes_that_no_motion_tells_apart_the_advice_is_to_mend_either(turned_camera) -> None:
+def test_advice_for_equivalent_causes_is_fixing_either(turned_camera) -> None:
     assert conclusion(turned_camera).advice == (
         f"No motion tells a wrong place of the camera from a wrong link before joint {BASE}: fix whichever is easier.",
     )
@@ -88,7 +88,7 @@ def open_case(planted) -> Diagnosis:
     return diagnosed(robot, narrow(robot), planted, NARROW)
 
 
-def test_causes_that_a_narrow_motion_cannot_tell_apart_are_told_as_rivals_in_this_motion(open_case) -> None:
+def test_narrow_motion_leaves_offset_and_scale_as_rivals(open_case) -> None:
     file = conclusion(open_case)
     (cause,) = file.causes
     (rival,) = cause.rivals
@@ -110,7 +110,7 @@ def advised(robot: RobotDescription, advice: str) -> Motion:
     return motion_of(q)
 
 
-def test_following_the_advice_tells_them_apart(planted, open_case) -> None:
+def test_following_the_advice_separates_the_rivals(planted, open_case) -> None:
     robot = surveyed_arm()
     (advice,) = conclusion(open_case).advice
     file = conclusion(diagnosed(robot, advised(robot, advice), planted, NARROW))
@@ -121,7 +121,7 @@ def test_following_the_advice_tells_them_apart(planted, open_case) -> None:
 
 
 @pytest.mark.soak
-def test_the_motion_that_is_advised_tells_the_simulations_of_both_apart(open_case) -> None:
+def test_advised_motion_separates_simulations_of_both_rivals(open_case) -> None:
     robot = surveyed_arm()
     (standing,) = open_case.standings
     (rival,) = standing.rivals
@@ -133,7 +133,7 @@ def test_the_motion_that_is_advised_tells_the_simulations_of_both_apart(open_cas
         assert [(cause.effect, cause.rivals) for cause in file.causes] == [(effect.name, ())]
 
 
-def test_effects_that_are_only_small_are_not_said_to_be_the_same_in_any_motion() -> None:
+def test_small_effects_are_not_equivalent_in_any_motion() -> None:
     robot = surveyed_arm()
     truth = Effect.at(robot, "joint_eccentricity", SHOULDER, values=[0.0018, 0.0])
     kinds = ("joint_eccentricity", "joint_scale")
@@ -144,7 +144,7 @@ def test_effects_that_are_only_small_are_not_said_to_be_the_same_in_any_motion()
     assert conclusion(found).advice[0].startswith("To tell an eccentric encoder of joint ")
 
 
-def test_a_rival_that_can_do_more_than_a_cause_does_not_make_it_surer() -> None:
+def test_more_flexible_rival_does_not_raise_cause_s_probability() -> None:
     robot = surveyed_arm()
     motion = walk(robot, 2, ROWS)
     truth = Effect.at(robot, "encoder_jump", robot.joints[-1], values=[0.02, float(motion.clock[ROWS // 2]) + 0.01])
@@ -174,7 +174,7 @@ def arm_of_one_length(tmp_path_factory) -> RobotDescription:
     [("link_geometry", ELBOW, [0.0, 0.0, 0.008, 0.0, 0.0, 0.0]), ("camera_scale", None, [0.03])],
     ids=["link", "scale"],
 )
-def test_a_length_and_a_scale_that_look_the_same_are_both_told(arm_of_one_length, truth) -> None:
+def test_indistinguishable_length_and_scale_are_both_reported(arm_of_one_length, truth) -> None:
     robot, (name, where, values) = arm_of_one_length, truth
     hidden = Effect.at(robot, name, where, values=values)
     file = conclusion(diagnosed(robot, walk(robot, 2, ROWS), hidden, ("camera_scale", "link_geometry")))
@@ -191,7 +191,7 @@ def test_a_length_and_a_scale_that_look_the_same_are_both_told(arm_of_one_length
 
 
 @pytest.mark.parametrize(("cycles", "sure"), [((4.0, 7.0), False), ((4.0, 9.0), True)])
-def test_ripples_that_the_range_of_a_joint_does_not_separate_are_not_sure(cycles, sure) -> None:
+def test_ripples_unresolved_by_joint_range_are_merged(cycles, sure) -> None:
     robot = surveyed_arm()
     motion = scattered(robot, 3, ROWS)
     assert np.ptp(motion.q[:, 1]) < 0.9 * 2.0 * np.pi
@@ -203,7 +203,7 @@ def test_ripples_that_the_range_of_a_joint_does_not_separate_are_not_sure(cycles
     assert merged_ripples(fit) == (set() if sure else {ripple.identity for ripple in ripples})
 
 
-def test_several_ripples_that_describe_one_curve_leave_the_verdict_open() -> None:
+def test_ripples_describing_one_curve_leave_verdict_undecided() -> None:
     robot = surveyed_arm()
     motion = scattered(robot, 3)
     q = motion.q.copy()
@@ -219,7 +219,7 @@ def test_several_ripples_that_describe_one_curve_leave_the_verdict_open() -> Non
     assert f"(or another error of {SHOULDER} that depends on its angle)" in file.sentence
 
 
-def test_a_cause_that_nothing_else_comes_near_has_no_rivals() -> None:
+def test_clearly_distinguished_cause_has_no_rivals() -> None:
     robot = desk_arm()
     truth = Effect.at(robot, "joint_scale", SHOULDER, values=[0.02])
     kinds = ("joint_offset", "joint_scale", "joint_eccentricity", "backlash")
@@ -228,7 +228,7 @@ def test_a_cause_that_nothing_else_comes_near_has_no_rivals() -> None:
     assert standing.probability > 0.999
 
 
-def test_a_slide_without_limits_is_not_sent_three_metres_away() -> None:
+def test_advised_range_of_unlimited_prismatic_joint_is_short() -> None:
     robot = SimpleNamespace(lower=[-np.pi], upper=[np.pi], chain=SimpleNamespace(prismatic=[True]))
     motion = SimpleNamespace(q=np.array([[0.1], [0.3]]))
     fit = SimpleNamespace(simulation=SimpleNamespace(robot=robot), observations=SimpleNamespace(motion=motion))
@@ -244,7 +244,7 @@ def only_shoulder(robot: RobotDescription, seed: int) -> Motion:
 
 @pytest.mark.parametrize(("hold", "what"), [("torque_free", "sag, which was not tested"), ("held", "the spread of")])
 @pytest.mark.parametrize("seed", [1, 2])
-def test_an_error_of_a_joint_that_sag_explains_as_well_is_not_sure(seed, hold, what) -> None:
+def test_joint_error_equally_explained_by_sag_is_unsure(seed, hold, what) -> None:
     held, robot = desk_arm({"torque_free": "held"}), desk_arm({"torque_free": hold})
     springs = tuple(Effect.at(held, "joint_compliance", joint, values=[0.02]) for joint in (SHOULDER,))
     recording = seen(held, only_shoulder(held, seed), springs, seed)
@@ -255,7 +255,7 @@ def test_an_error_of_a_joint_that_sag_explains_as_well_is_not_sure(seed, hold, w
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_ratio_of_an_arm_that_moves_all_its_joints_is_no_sag(seed) -> None:
+def test_joint_scale_with_all_joints_moving_is_sure(seed) -> None:
     robot = desk_arm()
     recording = seen(robot, scattered(robot, seed), (Effect.at(robot, "joint_scale", SHOULDER, values=[0.01]),), seed)
     (cause,) = conclusion(diagnose(recording, Simulation(robot), only=("joint_scale", "joint_offset"))).causes

@@ -46,9 +46,7 @@ SMALL = (
 
 
 @pytest.mark.parametrize(("name", "where", "source", "values"), SMALL, ids=[row[0] for row in SMALL])
-def test_the_gain_of_a_small_effect_is_twice_what_the_likelihood_rises_by_when_it_is_refitted(
-    robot, name, where, source, values
-) -> None:
+def test_small_effect_gain_is_twice_the_likelihood_rise(robot, name, where, source, values) -> None:
     planted = Effect.at(robot, name, where, source, values=values)
     start = start_of(robot, walk(robot, 3), (planted,), 3)
     candidate = Scan(start).candidate(planted)
@@ -59,7 +57,7 @@ def test_the_gain_of_a_small_effect_is_twice_what_the_likelihood_rises_by_when_i
 
 
 @pytest.mark.parametrize("free", [(0,), (1, 5)])
-def test_a_link_is_off_in_those_of_its_numbers_that_are(free) -> None:
+def test_scan_frees_only_the_changed_link_parameters(free) -> None:
     arm, values = surveyed_arm(), np.array([3e-3, 2e-3, 0.0, 0.0, 0.0, 0.02])
     planted = Effect.at(arm, "link_geometry", ELBOW, values=values).freeing(free)
     found = scanned(arm, planted, 3).effect
@@ -68,7 +66,7 @@ def test_a_link_is_off_in_those_of_its_numbers_that_are(free) -> None:
 
 
 @pytest.mark.parametrize("name", ["joint_offset", "encoder_jump", "joint_ripple", "camera_moved"])
-def test_the_gain_of_a_large_effect_is_within_a_quarter_of_that(robot, name) -> None:
+def test_large_effect_gain_is_within_25_percent(robot, name) -> None:
     at = {"joint_offset": (ELBOW, [0.05]), "encoder_jump": (ELBOW, [0.05, 35.1])} | {
         "joint_ripple": (SHOULDER, [0.02, 0.02, 9.0]),
         "camera_moved": (None, [0.01, 0.0, 0.01, 0.01, 0.0, 0.02, 35.1]),
@@ -91,7 +89,7 @@ def test_the_gain_of_a_large_effect_is_within_a_quarter_of_that(robot, name) -> 
         ("camera_refocused", None, [0.01]),
     ],
 )
-def test_a_moment_is_found_between_the_rows_where_it_was(robot, name, where, amounts) -> None:
+def test_event_time_is_found_between_the_right_rows(robot, name, where, amounts) -> None:
     clock = walk(robot, 4).clock
     t0 = clock[JUMP_ROW] - 0.2
     found = scanned(robot, Effect.at(robot, name, where, values=[*amounts, t0]), 4)
@@ -99,7 +97,7 @@ def test_a_moment_is_found_between_the_rows_where_it_was(robot, name, where, amo
 
 
 @pytest.mark.soak
-def test_the_moment_of_a_barely_visible_jump_lies_in_its_interval_as_often_as_stated(robot) -> None:
+def test_faint_jump_time_intervals_have_their_stated_coverage(robot) -> None:
     clock = walk(robot, 0).clock
     half = 0.5 * (clock[1] - clock[0])
     t0 = 0.5 * (clock[JUMP_ROW - 1] + clock[JUMP_ROW])
@@ -111,7 +109,7 @@ def test_the_moment_of_a_barely_visible_jump_lies_in_its_interval_as_often_as_st
 
 
 @pytest.mark.parametrize("cycles", [2.0, 8.0, 12.4, 50.0, 81.0])
-def test_a_ripple_is_found_with_its_cycles_a_turn(robot, cycles) -> None:
+def test_scan_recovers_ripple_cycles_per_turn(robot, cycles) -> None:
     found = scanned(robot, Effect.at(robot, "joint_ripple", SHOULDER, values=[0.006, -0.004, cycles]), 6)
     # The grid's step next to the best one: a sixtieth of the period that changes the phase by one over the range.
     step = 2.0 * np.pi / np.ptp(walk(robot, 6).q[:, 1]) / 60.0
@@ -128,7 +126,7 @@ def test_a_play_is_found_with_its_width(robot, width) -> None:
     assert start.with_causes([candidate.effect]).causes[0].value("width_rad") == pytest.approx(width, rel=0.05)
 
 
-def test_a_scan_without_a_cause_sees_what_a_fit_without_it_leaves(robot) -> None:
+def test_scan_without_a_cause_matches_refit_without_it(robot) -> None:
     truth = [
         Effect.at(robot, "joint_offset", SHOULDER, values=[0.004]),
         Effect.at(robot, "joint_scale", ELBOW, values=[0.01]),

@@ -79,21 +79,21 @@ def chance(fit: Fit, effect: Effect, *, beside: bool) -> float:
 
 
 @pytest.mark.parametrize("name", ["backlash", "settling"])
-def test_the_scatter_of_readings_looks_like_a_memory_of_the_way_and_is_told_from_one(robot, name) -> None:
+def test_reading_noise_is_distinguished_from_hysteresis(robot, name) -> None:
     fits, effect = [fit_of(robot, seed) for seed in SEEDS], remembers(robot, name)
     assert np.median([chance(fit, effect, beside=False) for fit in fits]) < CLEARLY
     assert min(chance(fit, effect, beside=True) for fit in fits) > HARDLY
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_play_of_several_times_the_scatter_is_clearly_seen_beside_it(robot, seed) -> None:
+def test_backlash_of_five_times_the_scatter_is_detected(robot, seed) -> None:
     play = Effect.at(robot, "backlash", ELBOW, values={"width_rad": 5.0 * SCATTER_RAD})
     assert chance(fit_of(robot, seed, play), play, beside=True) < CLEARLY
 
 
 @pytest.mark.parametrize("name", ["backlash", "settling"])
 @pytest.mark.soak
-def test_of_memories_that_no_joint_has_one_in_a_hundred_is_as_improbable_as_one_in_a_hundred(robot, name) -> None:
+def test_p_values_of_absent_hysteresis_are_calibrated(robot, name) -> None:
     """More than 4 of 80 p-values below 0.01 occur by chance in 1 of 700 such tests."""
     chances = []
     for seed in range(20):
@@ -106,7 +106,7 @@ def test_of_memories_that_no_joint_has_one_in_a_hundred_is_as_improbable_as_one_
 
 @pytest.mark.parametrize("name", ["backlash", "settling"])
 @pytest.mark.parametrize("way", [way_with_rests, poses])
-def test_a_memory_is_seen_on_ways_with_rests_and_from_pose_to_pose(robot, name, way) -> None:
+def test_hysteresis_is_detected_across_rests_and_poses(robot, name, way) -> None:
     values = {
         "backlash": {"width_rad": 5.0 * SCATTER_RAD},
         "settling": {"fraction": 0.2 if way is way_with_rests else 0.01},
@@ -124,13 +124,13 @@ def with_false_play(robot: RobotDescription, seed: int) -> tuple[Fit, Search]:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_play_that_only_the_scatter_speaks_for_is_taken_away_again(robot, seed) -> None:
+def test_search_removes_backlash_due_to_reading_noise(robot, seed) -> None:
     false, search = with_false_play(robot, seed)
     assert not search.run(false).causes
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_play_that_only_the_scatter_speaks_for_is_not_said_to_be_sure(robot, seed) -> None:
+def test_backlash_due_to_reading_noise_is_not_sure(robot, seed) -> None:
     false, search = with_false_play(robot, seed)
     (standing,) = standings(false, search, Blocks.cut(ROWS), 0)
     assert standing.probability < 0.9
@@ -140,14 +140,14 @@ class LagOfAnotherPackage(Settling):
     name = "lag_of_another_package"
 
 
-def test_what_another_package_says_a_joint_remembers_is_asked_for_in_the_same_way(robot) -> None:
+def test_plugin_hysteresis_effect_uses_the_same_instruments(robot) -> None:
     lag = remembers(robot, "settling")
     other = dataclasses.replace(lag, kind=LagOfAnotherPackage())
     fit = fit_of(robot, 0)
     np.testing.assert_array_equal(instruments(fit, other), instruments(fit, lag))
 
 
-def test_what_has_no_memory_is_left_as_it_is(robot) -> None:
+def test_effect_without_memory_keeps_its_own_columns(robot) -> None:
     fit, offset = fit_of(robot, 0), Effect.at(robot, "joint_offset", ELBOW, values=[0.001])
     columns = fit.weighted(fit.run.columns(offset)[:, :, offset.amounts])
     np.testing.assert_array_equal(instruments(fit, offset), columns)

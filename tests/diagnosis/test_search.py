@@ -31,7 +31,7 @@ def names(fit: Fit) -> set[tuple[str, str | None]]:
     return {(effect.name, effect.where) for effect in fit.causes}
 
 
-def test_nothing_more_that_explains_nothing_is_worth_nothing() -> None:
+def test_zero_gain_without_parameters_is_worth_nothing() -> None:
     assert nats(0.0, 0) == 0.0
 
 
@@ -41,21 +41,21 @@ def test_numbers_that_explain_nothing_cost_something(dof: int) -> None:
 
 
 @given(GAINS, NUMBERS)
-def test_of_the_same_gain_more_numbers_are_worth_less(gain: float, dof: int) -> None:
+def test_more_parameters_at_equal_gain_are_worth_less(gain: float, dof: int) -> None:
     assert nats(gain, dof + 1) < nats(gain, dof) < nats(gain, 0)
 
 
 @given(GAINS, st.floats(0.01, 1e3), NUMBERS)
-def test_more_gain_by_as_many_numbers_is_worth_more(gain: float, more: float, dof: int) -> None:
+def test_more_gain_with_equal_parameters_is_worth_more(gain: float, more: float, dof: int) -> None:
     assert nats(gain + more, dof) > nats(gain, dof)
 
 
 @given(st.floats(-1e5, 1e5), st.integers(-12, 12))
-def test_the_worth_of_an_exchange_is_the_negative_of_that_of_the_exchange_back(gain: float, dof: int) -> None:
+def test_worth_of_exchange_is_antisymmetric(gain: float, dof: int) -> None:
     assert nats(-gain, -dof) == pytest.approx(-nats(gain, dof), abs=1e-9)
 
 
-def test_a_cause_that_a_better_one_makes_redundant_is_dropped(robot) -> None:
+def test_cause_made_redundant_by_better_one_is_dropped(robot) -> None:
     truth = Effect.at(robot, "joint_eccentricity", SHOULDER, values=[0.03, 0.0])
     start = start_of(robot, walk(robot, 2), (truth,), 2)
     worse = [Effect.at(robot, name, SHOULDER) for name in ("joint_scale", "joint_offset")]
@@ -65,7 +65,7 @@ def test_a_cause_that_a_better_one_makes_redundant_is_dropped(robot) -> None:
     assert names(Search(hypotheses, lambda _: None).run(misled)) == {("joint_eccentricity", SHOULDER)}
 
 
-def test_a_cause_is_exchanged_for_a_rival_that_explains_more(robot) -> None:
+def test_cause_is_exchanged_for_a_better_rival(robot) -> None:
     coupling = Effect.at(robot, "joint_coupling", ELBOW, BASE, values=[0.02])
     jump = Effect.at(robot, "encoder_jump", SHOULDER, values=[0.03, 40.1])
     start = start_of(robot, walk(robot, 2), (coupling, jump), 2)
@@ -76,7 +76,7 @@ def test_a_cause_is_exchanged_for_a_rival_that_explains_more(robot) -> None:
 
 
 @pytest.mark.parametrize("seed", [5, 6])
-def test_a_jump_that_stands_for_the_first_rows_of_a_bump_is_dropped(seed) -> None:
+def test_jump_covering_a_camera_bump_s_start_is_dropped(seed) -> None:
     robot = surveyed_arm()
     jump = Effect.at(robot, "encoder_jump", BASE, values=[0.01, 40.1])
     bump = Effect.at(robot, "camera_moved", values=[0.0] * 6 + [40.1])
@@ -91,7 +91,7 @@ def test_a_jump_that_stands_for_the_first_rows_of_a_bump_is_dropped(seed) -> Non
 
 
 @pytest.mark.parametrize("first", ["camera_pose", "link_geometry"])
-def test_of_two_causes_that_explain_the_same_the_simpler_one_is_named(first) -> None:
+def test_simpler_of_two_equivalent_causes_is_named(first) -> None:
     robot = surveyed_arm()
     truth = Effect.at(robot, "link_geometry", BASE, values=[0.004, -0.003, 0.002, 0.01, -0.02, 0.015])
     pose, link = Effect.at(robot, "camera_pose"), Effect.at(robot, "link_geometry", BASE)
@@ -101,7 +101,7 @@ def test_of_two_causes_that_explain_the_same_the_simpler_one_is_named(first) -> 
     assert names(Search(hypotheses, lambda _: None).run(start)) == {("camera_pose", None)}
 
 
-def test_an_offset_is_named_rather_than_a_link_that_can_do_the_same(robot) -> None:
+def test_offset_is_preferred_to_an_equivalent_link(robot) -> None:
     truth = Effect.at(robot, "joint_offset", ELBOW, values=[0.02])
     hypotheses = [Effect.at(robot, "link_geometry", ELBOW), Effect.at(robot, "joint_offset", ELBOW)]
     found = Search(hypotheses, lambda _: None).run(start_of(robot, walk(robot, 2), (truth,), 2))
@@ -109,7 +109,7 @@ def test_an_offset_is_named_rather_than_a_link_that_can_do_the_same(robot) -> No
 
 
 @pytest.mark.parametrize("from_link", [False, True])
-def test_an_offset_is_named_though_a_link_that_contains_it_fits_slightly_better(from_link) -> None:
+def test_offset_is_preferred_to_slightly_better_link(from_link) -> None:
     robot = surveyed_arm()
     offset = Effect.at(robot, "joint_offset", ELBOW, values=[0.03])
     slightly_off = Effect.at(robot, "link_geometry", ELBOW, values=[0.0, 5e-5, 0.0, 0.0, 0.0, 0.0])
@@ -123,7 +123,7 @@ def test_an_offset_is_named_though_a_link_that_contains_it_fits_slightly_better(
     ("where", "free", "contained"),
     [(ELBOW, (3, 4), True), (ELBOW, (3, 5), False), (SHOULDER, (0, 1, 2, 3, 4, 5), False), (WRIST, (0, 4), True)],
 )
-def test_a_link_contains_the_offsets_of_the_joints_at_its_ends(where, free, contained) -> None:
+def test_link_contains_offsets_of_its_end_joints(where, free, contained) -> None:
     robot = surveyed_arm()
     offset = Effect.at(robot, "joint_offset", ELBOW, values=[0.03])
     link = Effect.at(robot, "link_geometry", where, values=[0.02] * 6).freeing(free)
@@ -131,14 +131,14 @@ def test_a_link_contains_the_offsets_of_the_joints_at_its_ends(where, free, cont
     assert contains(fit, link, fit.causes[0]) is contained
 
 
-def test_the_zero_of_another_joint_needs_less_evidence_than_the_first(robot) -> None:
+def test_second_joint_offset_needs_less_evidence_than_first(robot) -> None:
     first, offset = (Effect.at(robot, "joint_offset", joint, values=[0.02]) for joint in (ELBOW, SHOULDER))
     scale = Effect.at(robot, "joint_scale", ELBOW)
     search, candidate = Search([offset] * 100, lambda _: None), Candidate(offset, 10.0, 1)
     assert search.doubt(candidate, [first]) < search.doubt(candidate, [scale])
 
 
-def test_a_jump_of_the_last_joint_is_named_rather_than_a_slip_of_three_numbers(robot) -> None:
+def test_last_joint_jump_costs_less_than_tool_slip(robot) -> None:
     motion = walk(robot, 6)
     jump = Effect.at(robot, "encoder_jump", WRIST, values={"jump_rad": 0.15, "t0": float(motion.clock[150])})
     slip = Effect.at(robot, "tool_slip", None, values={"t0": float(motion.clock[150])})
@@ -149,7 +149,7 @@ def test_a_jump_of_the_last_joint_is_named_rather_than_a_slip_of_three_numbers(r
     assert beside.cost_of(beside.candidates[0]) < -6.0
 
 
-def test_a_jump_is_more_probable_than_a_slip_of_three_numbers(robot) -> None:
+def test_jump_is_more_probable_than_tool_slip(robot) -> None:
     motion = walk(robot, 6)
     t0 = float(motion.clock[150])
     jump = Effect.at(robot, "encoder_jump", WRIST, values={"jump_rad": 0.15, "t0": t0})
@@ -160,7 +160,7 @@ def test_a_jump_is_more_probable_than_a_slip_of_three_numbers(robot) -> None:
     assert standing.rivals[0].probability > 0.99
 
 
-def test_names_are_charged_as_a_set_and_not_as_an_order(robot) -> None:
+def test_cause_names_are_charged_regardless_of_order(robot) -> None:
     offset, scale = (Effect.at(robot, name, ELBOW) for name in ("joint_offset", "joint_scale"))
     search = Search([offset] * 100, lambda _: None)
     alone, beside = search.doubt(Candidate(scale, 10.0, 1)), search.doubt(Candidate(scale, 10.0, 1), [offset])
@@ -174,7 +174,7 @@ def test_all_joint_offsets_have_one_name(robot) -> None:
     assert search.doubt(scale, offsets) == search.doubt(scale, offsets[:1])
 
 
-def test_a_link_gives_way_to_the_offsets_that_it_contains(robot) -> None:
+def test_link_gives_way_to_offsets_it_contains(robot) -> None:
     truth = [Effect.at(robot, "joint_offset", joint, values=[0.03]) for joint in (SHOULDER, ELBOW)]
     link = Effect.at(robot, "link_geometry", ELBOW)
     start = start_of(robot, walk(robot, 2), tuple(truth), 2).with_causes([at_rest(link)])
@@ -195,7 +195,7 @@ def test_several_causes_are_named_and_no_others(robot) -> None:
     assert len(set(sets)) == len(sets)
 
 
-def test_the_more_hypotheses_there_are_the_more_one_of_them_has_to_explain(robot) -> None:
+def test_required_evidence_rises_with_hypothesis_count(robot) -> None:
     start = start_of(robot, walk(robot, 2), (Effect.at(robot, "joint_offset", ELBOW, values=[0.02]),), 2)
     offset = Effect.at(robot, "joint_offset", ELBOW)
     few, many = Search([offset], lambda _: None), Search([offset] * 100, lambda _: None)
@@ -216,7 +216,7 @@ class Undecided(Search):
         return fit.with_causes([other])
 
 
-def test_a_search_that_would_exchange_two_causes_for_ever_ends_with_each_set_tried_once(robot) -> None:
+def test_cyclic_exchange_of_causes_terminates(robot) -> None:
     truth = Effect.at(robot, "joint_offset", ELBOW, values=[0.02])
     search = Undecided([at_rest(truth), Effect.at(robot, "joint_scale", ELBOW)], lambda _: None)
     search.run(start_of(robot, walk(robot, 2), (truth,), 2))
@@ -234,7 +234,7 @@ class Reviewing(Search):
         return super()._second_thoughts(fit, cause)
 
 
-def test_a_cause_far_ahead_is_not_reviewed_after_a_small_change(robot) -> None:
+def test_dominant_cause_is_not_reviewed_after_small_change(robot) -> None:
     large = Effect.at(robot, "joint_offset", ELBOW, values=[0.05])
     small = Effect.at(robot, "joint_eccentricity", SHOULDER, values=[0.004, 0.0])
     search = Reviewing([at_rest(large), at_rest(small)], lambda _: None)
@@ -256,7 +256,7 @@ def test_a_moment_moves_across_rows_that_seemed_outliers(robot, early) -> None:
     assert (found.noise.weights[found.observations.trusted] > 0.5).all()
 
 
-def test_a_moment_is_sought_again_beside_causes_that_came_later(robot) -> None:
+def test_event_time_is_refined_beside_later_causes(robot) -> None:
     slip = Effect.at(robot, "tool_slip", values=[2e-3, 0.0, 0.0, 30.0])
     turned = Effect.at(robot, "joint_eccentricity", SHOULDER, values=[0.03, 0.0])
     start = start_of(robot, walk(robot, 3), (slip, turned), 3)
@@ -267,7 +267,7 @@ def test_a_moment_is_sought_again_beside_causes_that_came_later(robot) -> None:
     assert abs(moment - 30.0) <= INTERVAL_S
 
 
-def test_a_camera_that_stands_elsewhere_all_the_time_is_no_drift() -> None:
+def test_constant_camera_displacement_is_not_drift() -> None:
     robot = surveyed_arm()
     moved = Effect.at(robot, "camera_pose", values=[4e-4, -3e-4, 2e-4, 0.0, 0.0, 0.0])
     start = start_of(robot, walk(robot, 4), (moved,), 4)
@@ -286,7 +286,7 @@ def test_a_tool_that_slipped_twice_is_named_twice(robot) -> None:
     assert moments == pytest.approx([30.0, 70.0], abs=2.0 * INTERVAL_S)
 
 
-def test_ripples_of_two_periods_at_one_joint_are_both_named_and_no_third(robot) -> None:
+def test_two_ripples_at_one_joint_yield_exactly_two(robot) -> None:
     ripples = (
         Effect.at(robot, "joint_ripple", SHOULDER, values=[3e-3, 0.0, 9.0]),
         Effect.at(robot, "joint_ripple", SHOULDER, values=[0.0, 2e-3, 14.0]),
@@ -297,14 +297,14 @@ def test_ripples_of_two_periods_at_one_joint_are_both_named_and_no_third(robot) 
     assert periods == pytest.approx([9.0, 14.0], rel=0.02)
 
 
-def test_there_is_one_offset_at_a_joint_and_no_second(robot) -> None:
+def test_joint_has_at_most_one_offset(robot) -> None:
     offset = Effect.at(robot, "joint_offset", ELBOW, values=[0.02])
     start = start_of(robot, walk(robot, 3), (offset,), 3)
     found = Search([Effect.at(robot, "joint_offset", ELBOW)], lambda _: None).run(start)
     assert len(found.causes) == 1
 
 
-def test_a_link_that_stands_for_an_offset_and_a_small_jump_gives_way_to_both() -> None:
+def test_link_is_replaced_by_offset_and_small_jump() -> None:
     robot = surveyed_arm()
     offset = Effect.at(robot, "joint_offset", SHOULDER, values=[4e-3])
     jump = Effect.at(robot, "encoder_jump", ELBOW, values=[1.2e-3, 40.1])
@@ -318,7 +318,7 @@ def test_a_link_that_stands_for_an_offset_and_a_small_jump_gives_way_to_both() -
     assert names(found) == {("joint_offset", SHOULDER), ("encoder_jump", ELBOW)}
 
 
-def test_two_offsets_are_named_rather_than_the_link_between_them_that_can_do_both() -> None:
+def test_two_offsets_are_preferred_to_the_equivalent_link() -> None:
     robot = surveyed_arm()
     offsets = (
         Effect.at(robot, "joint_offset", BASE, values=[0.012]),
@@ -331,6 +331,6 @@ def test_two_offsets_are_named_rather_than_the_link_between_them_that_can_do_bot
 
 
 @given(st.floats(0.0, 1e4), st.integers(0, 6))
-def test_the_rise_that_a_worth_needs_is_worth_as_much(worth, dof) -> None:
+def test_rise_for_inverts_the_worth(worth, dof) -> None:
     assert abs(nats(2.0 * rise_for(worth, dof), dof) - worth) < 1e-3
     assert abs(nats(2.0 * rise_for(-worth, -dof), -dof) + worth) < 1e-3

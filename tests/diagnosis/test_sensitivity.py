@@ -14,7 +14,7 @@ HOLDING = {0.02: {SHOULDER}, 0.1: {SHOULDER, ELBOW}}
 
 
 @pytest.mark.parametrize("share", HOLDING)
-def test_a_joint_is_told_that_holds_a_twentieth_of_the_variance(share) -> None:
+def test_joint_holding_a_twentieth_of_variance_is_reported(share) -> None:
     robot = desk_arm()
     run = Simulation(robot).run(scattered(robot, 1, rows=2000))
     both = [robot.joints.index(joint) for joint in (SHOULDER, ELBOW)]
@@ -28,7 +28,7 @@ def test_a_joint_is_told_that_holds_a_twentieth_of_the_variance(share) -> None:
     assert {robot.joints[k] for k in found} == HOLDING[share]
 
 
-def test_the_joint_that_errs_is_told_whatever_it_holds() -> None:
+def test_erring_joint_is_reported_whatever_its_variance_share() -> None:
     robot = desk_arm()
     run, base, elbow = Simulation(robot).run(scattered(robot, 1)), *(robot.joints.index(j) for j in (BASE, ELBOW))
     moves, amounts = lambda run: run.by_joint[:, :, [base]], lambda run: run.motion.q[:, [elbow]]

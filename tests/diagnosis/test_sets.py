@@ -50,7 +50,7 @@ def sets(fit: Fit, cause: Effect) -> Sets:
     return Sets(fit, [Candidate(cause, 0.0, 1)], 0.0)
 
 
-def test_a_set_is_worth_the_same_about_a_noisy_and_a_quiet_fit_of_a_distant_instrument() -> None:
+def test_set_worth_is_independent_of_reference_fit() -> None:
     robot = desk_arm()
     hidden = Effect.at(robot, "backlash", SHOULDER, values=[0.03])
     without = fit_of(robot, hidden, (3.0, -3.0, 2.0))
@@ -60,7 +60,7 @@ def test_a_set_is_worth_the_same_about_a_noisy_and_a_quiet_fit_of_a_distant_inst
     assert worths[0] == pytest.approx(worths[1], abs=3.0)
 
 
-def test_rows_that_are_outliers_without_a_cause_count_against_the_set_without_it() -> None:
+def test_outliers_explained_by_a_cause_favour_its_set() -> None:
     robot = surveyed_arm()
     jump = Effect.at(robot, "encoder_jump", ELBOW, values={"jump_rad": 0.1, "t0": 0.25 * (ROWS - 5.5)})
     without = fit_of(robot, jump)
@@ -68,7 +68,7 @@ def test_rows_that_are_outliers_without_a_cause_count_against_the_set_without_it
     assert sets(without.with_causes([jump]), jump).of((0,)).worth > sets(without, jump).of(()).worth + 20.0
 
 
-def test_a_cause_that_would_be_negative_and_cannot_be_leaves_its_set() -> None:
+def test_cause_with_impossible_sign_leaves_its_set() -> None:
     robot = surveyed_arm()
     hidden = Effect.at(robot, "backlash", SHOULDER, values=[-0.02])
     assert not hidden.is_possible
@@ -88,7 +88,7 @@ def rough(robot: RobotDescription, seed: int, angle: float, *causes: Effect) -> 
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_set_is_fitted_as_well_from_tolerances_that_were_far_too_large(seed) -> None:
+def test_set_fit_recovers_from_too_large_tolerances(seed) -> None:
     robot = desk_arm()
     places = zip((SHOULDER, ELBOW, WRIST), (0.1, -0.1, 0.1), strict=True)
     offsets = [Effect.at(robot, "joint_offset", joint, values=[size]) for joint, size in places]
@@ -102,7 +102,7 @@ def test_a_set_is_fitted_as_well_from_tolerances_that_were_far_too_large(seed) -
 
 @pytest.mark.parametrize(("bent", "stays"), [(0.0, False), (0.1, True)])
 @pytest.mark.parametrize("seed", range(3))
-def test_a_link_leaves_a_roughly_made_arm_unless_it_is_bent_far_more(seed, bent, stays) -> None:
+def test_only_strongly_bent_link_stays_in_rough_arm(seed, bent, stays) -> None:
     robot = desk_arm()
     link = Effect.at(robot, "link_geometry", WRIST, values=[0.0, 0.0, 0.0, bent, -bent, bent])
     hypotheses = [Effect.at(robot, "link_geometry", joint) for joint in robot.joints]
@@ -130,13 +130,13 @@ def bent(seed: int, angle: float) -> tuple[Fit, Sequence[Effect]]:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_link_is_named_rather_than_tolerances_that_no_workshop_needs(seed) -> None:
+def test_bent_link_is_named_over_implausible_tolerances(seed) -> None:
     # Without it angles would have to be made five times as roughly.
     assert [cause.where for cause in together(*bent(seed, 0.012)).causes] == [WRIST]
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_what_large_tolerances_may_be_instead_has_a_probability(seed) -> None:
+def test_alternative_to_large_tolerances_has_a_probability(seed) -> None:
     start, hypotheses = bent(seed, 0.008)
     fit = start.tolerating(Scales())
     found = in_place_of_tolerances(fit.tolerating(tolerated(fit).scales), hypotheses)
@@ -146,14 +146,14 @@ def test_what_large_tolerances_may_be_instead_has_a_probability(seed) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_wrong_scale_is_named_rather_than_large_tolerances(seed) -> None:
+def test_camera_scale_is_named_over_large_tolerances(seed) -> None:
     robot = desk_arm()
     start = rough(robot, seed, 1e-3, Effect.at(robot, "camera_scale", values=[0.03]))
     hypotheses = Hypotheses.of(start.simulation, start.observations).effects
     assert [cause.name for cause in together(start, hypotheses).causes] == ["camera_scale"]
 
 
-def test_a_scale_that_large_tolerances_absorb_is_told_as_an_alternative() -> None:
+def test_camera_scale_absorbed_by_tolerances_is_an_alternative() -> None:
     robot = desk_arm()
     start = rough(robot, 2, 3e-3, Effect.at(robot, "camera_scale", values=[0.02]))
     hypotheses = Hypotheses.of(start.simulation, start.observations).effects
@@ -170,7 +170,7 @@ def test_tolerances_of_a_workshop_are_no_cause_instead() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 1, 3, 4])
-def test_a_small_shift_of_a_link_is_found_where_small_tolerances_would_follow_it(seed) -> None:
+def test_small_link_shift_is_found_despite_tolerances(seed) -> None:
     robot = surveyed_arm()
     shift = Effect.at(robot, "link_geometry", WRIST, values=[5e-4, -5e-4, 5e-4, 0.0, 0.0, 0.0])
     lens = Effect.at(robot, "camera_focal", values=[2e-3])
@@ -180,7 +180,7 @@ def test_a_small_shift_of_a_link_is_found_where_small_tolerances_would_follow_it
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_camera_that_stands_half_a_millimetre_off_is_found_where_tolerances_would_follow_it(seed) -> None:
+def test_submillimetre_camera_displacement_is_found_despite_tolerances(seed) -> None:
     robot = surveyed_arm()
     pose = Effect.at(robot, "camera_pose", values=4e-4 * np.random.default_rng([3, seed]).normal(size=6))
     start = start_of(robot, walk(robot, seed, 400), (pose,), seed)
@@ -189,7 +189,7 @@ def test_a_camera_that_stands_half_a_millimetre_off_is_found_where_tolerances_wo
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_refitted_set_has_the_tolerances_that_it_shows(seed) -> None:
+def test_refitted_set_has_self_consistent_tolerances(seed) -> None:
     place = _Place(rough(desk_arm(), seed, 8e-3).tolerating(Scales()), [], ())
     fit = place.refitted(place.here)
     scales = fit.background.scales
@@ -197,7 +197,7 @@ def test_a_refitted_set_has_the_tolerances_that_it_shows(seed) -> None:
     assert scales.angles == pytest.approx(tolerated(fit).scales.angles, rel=0.3)
 
 
-def test_of_several_causes_the_one_needed_least_is_left_out(monkeypatch) -> None:
+def test_least_needed_cause_is_left_out(monkeypatch) -> None:
     robot = desk_arm()
     offsets = [Effect.at(robot, "joint_offset", joint, values=[0.02]) for joint in (ELBOW, WRIST)]
     place = _Place(rough(robot, 0, 1e-3, *offsets).tolerating(Scales()).with_causes(offsets), offsets, ())
@@ -221,7 +221,7 @@ def named() -> Sets:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_what_a_group_costs_is_the_difference_of_two_sets(named, seed) -> None:
+def test_group_cost_is_the_difference_of_set_costs(named, seed) -> None:
     rng = np.random.default_rng(seed)
     chosen = tuple(np.flatnonzero(rng.random(len(named.effects)) < 0.3).tolist())
     absent = [group for group in named._groups if not set(group) & set(chosen)]
@@ -237,17 +237,17 @@ def test_the_names_of_a_set_have_no_order(named) -> None:
     assert named._cost((zero, scale)) == pytest.approx(named._cost((zero,)) + named._cost((scale,)) - np.log(2.0))
 
 
-def test_the_choices_of_a_links_numbers_are_as_probable_together_as_one() -> None:
+def test_link_parameter_choices_have_total_probability_one() -> None:
     ways = ways_to_choose(Effect.at(desk_arm(), "link_geometry", BASE))
     assert (1.0 / ways[1:]).sum() == pytest.approx(1.0)
 
 
-def test_all_shifts_are_more_probable_than_two_of_them_and_a_turn() -> None:
+def test_pure_shifts_are_likelier_than_mixed_link_parameters() -> None:
     ways = ways_to_choose(Effect.at(desk_arm(), "link_geometry", BASE))
     assert ways[0b000111] == ways[0b111000] < 0.1 * ways[0b100011]
 
 
-def test_a_pose_has_a_size_of_its_own_and_a_scale_that_of_prints() -> None:
+def test_camera_pose_adds_a_prior_scale_parameter() -> None:
     robot = surveyed_arm()
     fit = fit_of(robot, Effect.at(robot, "camera_scale", values=[0.03]))
     sizes = [

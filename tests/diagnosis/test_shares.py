@@ -28,7 +28,7 @@ def test_shares_add_up_to_the_whole(divided: Shares) -> None:
     assert sum(divided.causes) + divided.links + divided.drives == pytest.approx(1.0)
 
 
-def test_a_zero_has_its_share_though_a_link_could_turn(divided: Shares) -> None:
+def test_joint_offset_keeps_its_share_against_link_tolerances(divided: Shares) -> None:
     zero, scale = divided.causes
     assert zero > 0.8
     assert scale > 0.005
@@ -40,7 +40,7 @@ def _cause(joint: str, probability: float, share: float, gain: float) -> Cause:
     return Cause("backlash", joint, None, {}, probability, share, gain, (), rivals, "")
 
 
-def test_a_cause_of_little_weight_leaves_the_verdict_decided() -> None:
+def test_unsure_minor_cause_leaves_the_verdict_decided() -> None:
     assert not _cause("a", 0.6, share=0.5, gain=1.2).leaves_open
 
 
@@ -48,11 +48,11 @@ def test_a_cause_that_nothing_replaces_leaves_it_open() -> None:
     assert _cause("a", 0.6, share=0.5, gain=18.0).leaves_open
 
 
-def test_what_weighs_most_comes_first() -> None:
+def test_heaviest_cause_comes_first() -> None:
     causes = [_cause("small", 1.0, 1.0, 2.0), _cause("link", 1.0, 80.0, 0.0), _cause("play", 1.0, 4.0, 18.0)]
     assert [cause.where for cause in in_order(causes)] == ["link", "play", "small"]
 
 
-def test_fixes_that_are_not_the_marker_come_before_what_may_wait() -> None:
+def test_outliers_are_listed_before_minor_causes() -> None:
     outliers = replace(_cause("outliers", 1.0, 0.0, 0.0), effect="outliers")
     assert [cause.where for cause in in_order([_cause("small", 1.0, 1.0, 2.0), outliers])] == ["outliers", "small"]

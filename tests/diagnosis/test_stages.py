@@ -5,7 +5,7 @@ from __future__ import annotations
 from bodyschema.diagnosis.stages import RIVALS, SEARCH, SETS, UNNAMED, Stages
 
 
-def test_a_percentage_never_falls_and_its_stage_is_told() -> None:
+def test_progress_never_falls_and_names_its_stage() -> None:
     lines: list[str] = []
     stages = Stages(lines.append)
     for stage, before in ((SETS, None), (SEARCH, SETS), (UNNAMED, SEARCH), (RIVALS, UNNAMED)):

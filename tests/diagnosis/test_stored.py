@@ -44,14 +44,14 @@ def test_a_joint_offset_is_stored(robot) -> None:
     assert stored([start, found], is_marker(found)) is found
 
 
-def test_tolerances_fitted_to_a_change_with_time_are_not_stored(robot) -> None:
+def test_tolerances_fitted_to_drift_are_not_stored(robot) -> None:
     start = placed(robot, 0.05 * np.sin(np.linspace(0.0, 30.0, ROWS)))
     large = start.tolerating(Scales(MOST, MOST, MOST))
     assert np.square(large.residuals).sum() < np.square(start.residuals).sum()
     assert stored([start, large], is_marker(large)) is start
 
 
-def test_what_is_written_is_placed_by_all_rows(robot) -> None:
+def test_written_model_is_aligned_to_all_rows(robot) -> None:
     start = placed(robot, np.zeros(ROWS))
     ignoring = start.to(start.observations.without(np.arange(ROWS) < ROWS // 2))
     for fit in (ignoring, ignoring.tolerating(Scales())):
@@ -60,7 +60,7 @@ def test_what_is_written_is_placed_by_all_rows(robot) -> None:
         np.testing.assert_allclose(left.mean(axis=0), 0.0, atol=1e-3 * SIGMA_M)
 
 
-def test_what_is_written_is_placed_by_both_sides_of_a_play(robot) -> None:
+def test_written_model_is_aligned_between_marker_sides(robot) -> None:
     start = placed(robot, np.zeros(ROWS))
     ways = start.run.columns(Effect.at(robot, "tool_offset")) @ np.array([0.6, 0.0, 0.8])
     beyond = np.where(np.arange(ROWS) // 10 % 3, 2e-3, -2e-3)[:, None] * ways
@@ -71,7 +71,7 @@ def test_what_is_written_is_placed_by_both_sides_of_a_play(robot) -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2, 5])
-def test_tolerances_beside_a_marker_that_hangs_where_gravity_takes_it_are_stored(robot, seed) -> None:
+def test_tolerances_beside_gravity_loaded_marker_play_are_stored(robot, seed) -> None:
     rng, motion = np.random.default_rng(seed), walk(robot, seed)
     links = tuple(
         Effect.at(robot, "link_geometry", joint, values=rng.normal(size=6) * np.repeat([5e-4, 2e-3], 3))
@@ -95,7 +95,7 @@ def test_tolerances_beside_a_marker_that_hangs_where_gravity_takes_it_are_stored
     assert after < before
 
 
-def test_rows_that_a_cause_ignored_place_the_arm_that_is_stored_without_it(robot) -> None:
+def test_fallback_model_is_refitted_to_all_rows(robot) -> None:
     start = placed(robot, np.zeros(ROWS))
     ignoring = start.to(start.observations.without(np.arange(ROWS) < ROWS // 2))
     best = _stored(ignoring, ignoring, ignoring, ResidualStructure((), (), False, 1.0), Blocks.cut(ROWS))

@@ -73,7 +73,7 @@ def with_a_link_that_bends(robot: RobotDescription, times_the_noise: float, seed
 
 
 @pytest.mark.soak
-def test_a_link_that_bends_is_unexplained_and_no_cause_is_named(robot) -> None:
+def test_bending_link_is_unexplained_without_named_cause(robot) -> None:
     file = found(with_a_link_that_bends(robot, 0.5, 1), robot)
     assert (file.verdict, file.causes) == ("unexplained", ())
     assert file.unexplained.what == (f"what carries {ELBOW} gives under the arm's weight",)
@@ -81,7 +81,7 @@ def test_a_link_that_bends_is_unexplained_and_no_cause_is_named(robot) -> None:
 
 @pytest.mark.parametrize("size", [1.0, 4.0])
 @pytest.mark.soak
-def test_a_mount_that_gives_alike_about_all_axes_is_unexplained_and_no_cause_is_named(robot, size) -> None:
+def test_isotropically_soft_mount_is_unexplained_without_named_cause(robot, size) -> None:
     file = found(on_a_soft_mount(robot, size, 1), robot)
     assert (file.verdict, file.causes) == ("unexplained", ())
     assert file.unexplained.what[0].endswith("gives under the arm's weight")
@@ -116,7 +116,7 @@ def made_to_a_tenth_of_a_millimetre(robot: RobotDescription, cause: Effect, seed
 
 @pytest.mark.parametrize("seed", range(1, 4))
 @pytest.mark.parametrize("only", [NEAREST, pytest.param((), marks=pytest.mark.soak)], ids=["nearest", "all"])
-def test_a_joint_that_gives_is_named_where_the_urdf_states_no_masses(robot, only, seed) -> None:
+def test_joint_compliance_is_named_without_urdf_masses(robot, only, seed) -> None:
     # Where nothing else is off, a function of both joints explains what other masses change as well.
     truth = Effect.at(robot, "joint_compliance", SHOULDER, values=[0.03])
     recording = made_to_a_tenth_of_a_millimetre(robot, truth, seed)
@@ -132,7 +132,7 @@ def test_a_joint_that_gives_is_named_where_the_urdf_states_no_masses(robot, only
 
 
 @pytest.mark.soak
-def test_what_may_be_a_mount_that_gives_is_told_with_how_to_see_it(robot) -> None:
+def test_possible_soft_mount_is_reported_with_a_check(robot) -> None:
     truth = Effect.at(robot, "joint_compliance", SHOULDER, values=[4e-4])
     file = found(seen(robot, walk(robot, 1), (truth,), 1), robot)
     (cause,) = file.causes
@@ -141,7 +141,7 @@ def test_what_may_be_a_mount_that_gives_is_told_with_how_to_see_it(robot) -> Non
     assert any(line.startswith(f"Watch whether {rival.what}") for line in file.advice)
 
 
-def test_the_frames_that_bear_a_joint_begin_with_its_own_link_and_end_with_the_next_joints(robot) -> None:
+def test_supporting_frames_span_link_up_to_previous_joint(robot) -> None:
     poses = Simulation(robot).gravity.in_supports(robot.joints.index(SHOULDER))
     assert len(poses) == 1
     np.testing.assert_allclose(poses[0][:3, 3], [0.03, 0.0, 0.06])

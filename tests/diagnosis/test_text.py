@@ -29,37 +29,37 @@ def _link(untold_m: float) -> Cause:
     return Cause("link_geometry", "elbow", None, told | untold, 1.0, 100.0, 80.0, (), (), "")
 
 
-def test_a_link_that_only_turns_is_off_by_an_angle_alone():
+def test_purely_rotated_link_is_described_by_angle_only():
     assert (
         finding("link_geometry", "elbow", None, TURN) == "the link before joint elbow is off by 0.57°, mainly about y"
     )
 
 
-def test_a_link_that_is_off_in_some_directions_has_them_named():
+def test_link_error_names_its_directions():
     said = finding("link_geometry", "elbow", None, {"x_m": 0.003, "z_m": 0.004, "ry_rad": 0.01})
     assert said == "the link before joint elbow is off by 5 mm in x and z and 0.57° about y"
 
 
-def test_a_link_that_is_off_mainly_about_one_axis_has_it_named():
+def test_link_error_names_its_main_axis():
     said = finding("link_geometry", "elbow", None, {"rx_rad": 0.0117, "ry_rad": -0.0007, "rz_rad": 0.001})
     assert said == "the link before joint elbow is off by 0.67°, mainly about x"
     said = finding("link_geometry", "elbow", None, {"x_m": 0.003, "y_m": 1e-4, "z_m": 0.0, "ry_rad": 0.01})
     assert said == "the link before joint elbow is off by 3 mm, mainly in x, and 0.57° about y"
 
 
-def test_a_shift_that_the_recording_does_not_tell_is_in_no_sentence():
+def test_undetermined_shift_is_omitted_from_the_sentence():
     errors = Errors(5.0, 5.0, 1.0, 1.0, 0.9)
     assert "1 mm in x and 0.57°" in sentence("explained", [_link(1.0)], errors, Gain(80.0, (75.0, 85.0)))
 
 
-def test_a_gain_on_fitted_pairs_alone_is_called_none():
+def test_gain_absent_on_held_out_data_is_denied():
     errors = Errors(5.0, 3.6, 1.8, 3.9, 0.7)
     said = sentence("unexplained", [_link(1.0)], errors, Gain(-9.0, (-20.0, 2.0)))
     assert "no others" in said
     assert "-9" not in said
 
 
-def test_the_sentence_tells_what_the_smooth_model_adds():
+def test_sentence_states_the_smooth_model_s_contribution():
     errors = Errors(10.0, 10.0, 5.0, 2.0, 1.9)
     said = sentence("unexplained", [_link(1.0)], errors, Gain(80.0, (75.0, 85.0)), named_mm=6.0)
     assert "10 → 2 mm on held-out data, 6 mm without the smooth model" in said
@@ -88,7 +88,7 @@ def test_the_headline_of_many_causes_fits_two_lines():
     assert len(said) < 2 * 96
 
 
-def test_two_long_causes_do_not_both_stand_in_the_headline():
+def test_headline_names_only_one_of_two_long_causes():
     causes = [_zero(f"shoulder_pitch_of_arm_{k}", 0.6, share=10.0 + k) for k in range(2)]
     said = sentence("undecided", causes, Errors(5.0, 5.0, 1.0, 1.0, 0.9), Gain(80.0, (75.0, 85.0)))
     head = said.partition(". RMS")[0]
@@ -115,7 +115,7 @@ def test_an_instrument_is_not_called_a_camera():
     assert finding("camera_moved", None, None, SHIFT, "instrument") == "the instrument moved by 1 mm"
 
 
-def test_a_wrong_scale_is_a_wrong_size_to_a_camera() -> None:
+def test_scale_error_of_camera_blames_the_target_size() -> None:
     numbers = {"scale_error": -0.03}
     assert finding("camera_scale", None, None, numbers) == (
         "all that is measured is 3 % too small: a tag, ball or board has another size than stated"
@@ -123,7 +123,7 @@ def test_a_wrong_scale_is_a_wrong_size_to_a_camera() -> None:
     assert finding("camera_scale", None, None, numbers, "instrument") == "all that is measured is 3 % too small"
 
 
-def test_a_slides_ripple_is_told_where_its_pitch_is_unsure():
+def test_prismatic_ripple_is_described_despite_unsure_pitch():
     numbers = {
         "amplitude_m": Interval(2e-4, (1e-4, 3e-4)),
         "phase_rad": Interval(0.0, (-9.0, 9.0)),
@@ -134,14 +134,14 @@ def test_a_slides_ripple_is_told_where_its_pitch_is_unsure():
     assert "joint lift has a ripple of ±0.2 mm, 10 times a metre" in said.lower()
 
 
-def test_tolerances_that_do_not_show_are_told_by_what_they_are_at_most():
+def test_undetected_tolerances_are_reported_as_upper_bounds():
     size, none = Interval(0.3, (0.2, 0.4)), Interval(0.01, (0.0, 0.02))
     assert made_to(Tolerances(size, none, none), "camera") == (
         "The arm is made to about 0.3 mm and at most 0.02°; its drives run true to at most ±0.02°."
     )
 
 
-def test_what_large_tolerances_may_be_is_told_in_the_headline_and_beside_them() -> None:
+def test_alternatives_to_tolerances_appear_in_headline_and_details() -> None:
     size, gain = Interval(0.6, (0.5, 0.7)), Gain(80.0, (75.0, 85.0))
     link = Indistinguishable("link_geometry", "elbow", None, "this_motion", 0.3)
     rough = Tolerances(size, size, size, links_share_percent=90.0, rivals=(link,))
@@ -159,13 +159,13 @@ def test_what_large_tolerances_may_be_is_told_in_the_headline_and_beside_them() 
     assert "explains (or a wrong scale of all that is measured, 60 %)" in unexplained
 
 
-def test_an_alternative_that_is_more_probable_is_told_to_be_so() -> None:
+def test_more_probable_alternative_is_stated_as_such() -> None:
     errors, gain = Errors(5.0, 5.0, 1.0, 1.0, 0.9), Gain(80.0, (75.0, 85.0))
     said = sentence("undecided", [_zero("elbow", probability=0.1)], errors, gain)
     assert said.startswith("The zero of joint elbow is off by +1.15° (more probably a wrong link before joint elbow)")
 
 
-def test_small_causes_less_probable_than_others_are_no_causes_in_the_headline() -> None:
+def test_headline_calls_improbable_small_causes_corrections() -> None:
     causes = [_zero("elbow"), *(_zero(f"joint_{k}", probability=0.1, share=1.0) for k in range(2))]
     errors, gain = Errors(5.0, 5.0, 1.0, 1.0, 0.9), Gain(80.0, (75.0, 85.0))
     of = Interval(0.1, (0.05, 0.2))
@@ -173,13 +173,13 @@ def test_small_causes_less_probable_than_others_are_no_causes_in_the_headline() 
     assert "small errors everywhere and 2 corrections whose cause is not known" in said
 
 
-def test_without_small_errors_everywhere_they_are_none_either() -> None:
+def test_headline_calls_them_corrections_without_tolerances_too() -> None:
     causes = [_zero("elbow"), *(_zero(f"joint_{k}", probability=0.1, share=1.0) for k in range(2))]
     said = sentence("explained", causes, Errors(5.0, 5.0, 1.0, 1.0, 0.9), Gain(80.0, (75.0, 85.0)))
     assert said.startswith("The zero of joint elbow is off by +1.15° and 2 corrections whose cause is not known")
 
 
-def test_small_causes_less_probable_than_others_stand_in_no_table_and_change_nothing() -> None:
+def test_improbable_small_causes_are_untabled_without_action() -> None:
     heavy, few = _zero("elbow"), [_zero(f"joint_{k}", probability=0.1, share=1.0) for k in range(2)]
     none, gain = Errors(5.0, 5.0, 1.0, 1.0, 0.9), Gain(80.0, (75.0, 85.0))
     left = Unexplained(0.0, (), 1.0)
@@ -195,7 +195,7 @@ def test_small_causes_less_probable_than_others_stand_in_no_table_and_change_not
     ]
 
 
-def test_fixes_that_are_not_the_marker_follow_small_errors_everywhere() -> None:
+def test_outliers_follow_tolerances_in_the_headline() -> None:
     of, gain = Interval(0.1, (0.05, 0.2)), Gain(80.0, (75.0, 85.0))
     outliers = Cause("outliers", None, None, {"share": Interval(0.006, (0.002, 0.01))}, 1.0, 0.0, 0.0, (), (), "")
     rough = Tolerances(of, of, of, links_share_percent=90.0)

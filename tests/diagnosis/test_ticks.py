@@ -44,7 +44,7 @@ def test_each_joint_has_its_own_tick(robot) -> None:
     np.testing.assert_allclose(ticks(q), [0.0, TICK_RAD, COARSE_RAD, 0.0], rtol=1e-6)
 
 
-def test_a_joint_that_was_read_at_few_places_has_no_tick(robot) -> None:
+def test_joint_read_at_few_positions_has_no_tick(robot) -> None:
     q = np.repeat(rounded(walk(robot, 1).q[:15], TICK_RAD), 20, axis=0)
     np.testing.assert_array_equal(ticks(q), 0.0)
 
@@ -59,20 +59,20 @@ def noisy(robot: RobotDescription, factor: float, tick: float, seed: int) -> Obs
 
 
 @pytest.mark.parametrize("factor", [0.5, 1.0, 2.0, 4.0])
-def test_the_size_of_the_instruments_noise_is_told_from_that_of_the_rounding(robot, factor) -> None:
+def test_instrument_noise_is_separated_from_encoder_rounding(robot, factor) -> None:
     found = [instrument_factor(aligned(noisy(robot, factor, COARSE_RAD, seed), Simulation(robot))) for seed in range(5)]
     assert np.exp(np.mean(np.log(found))) == pytest.approx(factor, rel=0.15)
 
 
 @pytest.mark.parametrize("factor", [1.0, 3.0])
-def test_what_is_left_is_as_large_as_rounding_and_instrument_together_once_the_factor_is_known(robot, factor) -> None:
+def test_residual_matches_rounding_plus_scaled_instrument_noise(robot, factor) -> None:
     observations = noisy(robot, factor, COARSE_RAD, 1)
     found = instrument_factor(aligned(observations, Simulation(robot)))
     fit = aligned(observations.with_factor(found), Simulation(robot))
     assert fit.noise.sigma == pytest.approx(1.0, abs=0.1)
 
 
-def test_the_rounding_of_whole_ticks_is_the_variance_that_the_joints_pass_on(robot) -> None:
+def test_rounding_covariance_matches_propagated_tick_variance(robot) -> None:
     observations = noisy(robot, 1.0, COARSE_RAD, 1)
     simulation, motion = Simulation(robot), observations.motion
     rng = np.random.default_rng(3)

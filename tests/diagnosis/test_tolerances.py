@@ -61,20 +61,20 @@ def test_nothing_is_named_where_all_is_within_tolerance(plain: DiagnosisFile) ->
     assert "small errors everywhere" in plain.sentence
 
 
-def test_it_is_told_how_exactly_the_arm_is_made(plain: DiagnosisFile) -> None:
+def test_link_length_tolerance_is_estimated_with_interval(plain: DiagnosisFile) -> None:
     assert plain.tolerances is not None
     assert 0.5e3 * LENGTH_M < plain.tolerances.length_mm.value < 2e3 * LENGTH_M
     low, high = plain.tolerances.length_mm.ci95
     assert low < plain.tolerances.length_mm.value < high
 
 
-def test_it_is_told_by_how_much_drives_err_over_a_turn(plain: DiagnosisFile) -> None:
+def test_drive_error_interval_contains_the_truth(plain: DiagnosisFile) -> None:
     assert plain.tolerances is not None
     low, high = plain.tolerances.drive_deg.ci95
     assert low < np.degrees(DRIVE_RAD) < high
 
 
-def test_tolerances_make_the_simulation_nearly_as_right_as_the_noise(plain: DiagnosisFile) -> None:
+def test_tolerances_reduce_error_nearly_to_the_noise(plain: DiagnosisFile) -> None:
     assert plain.rms_mm.noise_floor is not None
     assert plain.rms_mm.extended < 1.5e3 * NOISE_M * np.sqrt(3.0) < 0.5 * plain.rms_mm.aligned
     assert plain.rms_mm.noise_floor < plain.rms_mm.extended
@@ -88,7 +88,7 @@ def with_zeros(robot: RobotDescription) -> DiagnosisFile:
     return found_in(robot, 2, *(Effect.at(robot, "joint_offset", at, values=[size]) for at, size in HIDDEN.items()))
 
 
-def test_several_zeros_are_named_and_no_link_in_their_place(with_zeros: DiagnosisFile) -> None:
+def test_joint_offsets_are_named_without_substitute_links(with_zeros: DiagnosisFile) -> None:
     file = with_zeros
     assert {(cause.effect, cause.where) for cause in file.causes} == {("joint_offset", joint) for joint in HIDDEN}
     by_joint = {cause.where: cause.parameters["offset_rad"].value for cause in file.causes}
@@ -96,19 +96,19 @@ def test_several_zeros_are_named_and_no_link_in_their_place(with_zeros: Diagnosi
     assert by_joint[ELBOW] == pytest.approx(-0.04, abs=5.0 * ANGLE_RAD)
 
 
-def test_a_bent_link_is_named_where_it_is_larger_than_tolerance(robot: RobotDescription) -> None:
+def test_link_bent_beyond_tolerance_is_named(robot: RobotDescription) -> None:
     bent = Effect.at(robot, "link_geometry", ELBOW, values=[4e-3, 0.0, 5e-3, 0.0, 0.02, 0.01])
     file = found_in(robot, 3, bent)
     assert [(cause.effect, cause.where) for cause in file.causes] == [("link_geometry", ELBOW)]
 
 
 @pytest.mark.parametrize("seed", [5, 8])
-def test_a_camera_is_named_though_large_tolerances_could_follow_it(robot: RobotDescription, seed: int) -> None:
+def test_camera_pose_is_named_despite_absorbing_tolerances(robot: RobotDescription, seed: int) -> None:
     file = found_in(robot, seed, Effect.at(robot, "camera_pose", values=[3e-3, 1e-3, -2e-3, 6e-3, -3e-3, 5e-3]))
     assert [(cause.effect, cause.where) for cause in file.causes] == [("camera_pose", None)]
 
 
-def test_a_link_that_large_tolerances_may_hide_leaves_the_verdict_open(robot: RobotDescription) -> None:
+def test_link_hidden_by_tolerances_leaves_verdict_undecided(robot: RobotDescription) -> None:
     file = found_in(robot, 5, Effect.at(robot, "link_geometry", ELBOW, values=[2e-3, 0.0, 2.5e-3, 0.0, 0.01, 0.005]))
     assert file.tolerances is not None
     assert (file.verdict, file.causes) == ("undecided", ())
@@ -127,7 +127,7 @@ def _with_small_tolerances(robot: RobotDescription) -> Fit:
     return start.with_causes([offset]).tolerating(Scales(0.5, 0.5, 0.5))
 
 
-def test_an_interval_allows_for_other_sizes_of_the_tolerances(robot: RobotDescription, monkeypatch) -> None:
+def test_interval_includes_uncertainty_of_the_tolerances(robot: RobotDescription, monkeypatch) -> None:
     fit = _with_small_tolerances(robot)
     (place,) = fit.places(fit.causes[0])
     integrated = fit.covariance[place, place]
@@ -136,7 +136,7 @@ def test_an_interval_allows_for_other_sizes_of_the_tolerances(robot: RobotDescri
 
 
 @pytest.mark.parametrize("count", [5, 39])
-def test_an_interval_hardly_depends_on_the_number_of_nodes(robot: RobotDescription, monkeypatch, count) -> None:
+def test_interval_hardly_depends_on_quadrature_node_count(robot: RobotDescription, monkeypatch, count) -> None:
     fit = _with_small_tolerances(robot)
     (place,) = fit.places(fit.causes[0])
     before = fit.covariance[place, place]
@@ -144,7 +144,7 @@ def test_an_interval_hardly_depends_on_the_number_of_nodes(robot: RobotDescripti
     assert np.sqrt(replace(fit).covariance[place, place] / before) == pytest.approx(1.0, abs=0.05)
 
 
-def test_a_slide_may_run_less_true_than_links_are_made(robot: RobotDescription) -> None:
+def test_prismatic_ripple_is_tolerated_despite_exact_links(robot: RobotDescription) -> None:
     rng = np.random.default_rng(5)
     q = rng.uniform(robot.lower, robot.upper, (ROWS, len(robot.joints)))
     recording = measured(robot, motion_of(q), Simulation(robot).positions(motion_of(q)))
@@ -153,7 +153,7 @@ def test_a_slide_may_run_less_true_than_links_are_made(robot: RobotDescription) 
     assert fit.background.tolerates(replace(ripple, prismatic=True))
 
 
-def test_a_background_is_in_the_extended_simulation_and_comes_back(robot: RobotDescription, tmp_path: Path) -> None:
+def test_background_survives_extended_toml_round_trip(robot: RobotDescription, tmp_path: Path) -> None:
     simulation = Simulation(robot, (), None, made(robot, np.random.default_rng(3)))
     again = load_simulation(write_extended(simulation, tmp_path, "x"))
     q = np.random.default_rng(4).uniform(robot.lower, robot.upper, (20, len(robot.joints)))
@@ -161,7 +161,7 @@ def test_a_background_is_in_the_extended_simulation_and_comes_back(robot: RobotD
     assert again.effects == ()
 
 
-def test_a_background_with_an_unknown_joint_is_refused_with_its_line(robot: RobotDescription, tmp_path: Path) -> None:
+def test_background_with_unknown_joint_is_rejected_with_line(robot: RobotDescription, tmp_path: Path) -> None:
     file = write_extended(Simulation(robot, (), None, made(robot, np.random.default_rng(3))), tmp_path, "x")
     file.write_text(file.read_text().replace(f'where = "{ELBOW}"', 'where = "knee"', 1))
     with pytest.raises(ConfigError, match="background 5") as refused:
@@ -186,7 +186,7 @@ def test_a_written_simulation_is_refitted_to_second_order() -> None:
     assert left < 0.7 * first_order
 
 
-def test_a_ratio_is_named_though_large_drive_errors_could_follow_it(robot: RobotDescription) -> None:
+def test_joint_scale_is_named_despite_absorbing_drive_errors(robot: RobotDescription) -> None:
     rng = np.random.default_rng([7, 6])
     # The elbow moves little, so that its eccentricity can do what its ratio does.
     reach = np.where(np.array(robot.joints) == ELBOW, 0.15, 0.7)
@@ -216,7 +216,7 @@ def test_two_offsets_that_need_each_other_are_tolerances(robot: RobotDescription
     assert [beyond_tolerances(fit, cause, doubt=4.0) for cause in fit.causes] == [beyond, beyond]
 
 
-def test_sizes_that_do_not_show_are_bounded_by_the_data_alone(robot: RobotDescription) -> None:
+def test_bounds_of_undetected_tolerances_scale_with_the_noise(robot: RobotDescription) -> None:
     rng, found = np.random.default_rng([7, 9]), []
     q = rng.uniform(0.7 * robot.lower, 0.7 * robot.upper, (ROWS, len(robot.joints)))
     noise = rng.normal(size=(ROWS, 3))
@@ -241,11 +241,11 @@ def test_tolerances_cannot_stand_for_a_moment(robot: RobotDescription) -> None:
     ("name", "loss", "told"),
     [("link_geometry", 0.01, False), ("link_geometry", 0.4, True), ("joint_eccentricity", 0.01, True)],
 )
-def test_a_slight_gain_keeps_no_link_that_tolerances_explain(robot: RobotDescription, name, loss, told) -> None:
+def test_slight_gain_keeps_no_link_explained_by_tolerances(robot: RobotDescription, name, loss, told) -> None:
     assert _is_told(Effect.at(robot, name, ELBOW), False, loss) is told
 
 
-def test_naming_a_link_costs_the_same_whole_as_number_by_number(robot: RobotDescription) -> None:
+def test_link_costs_the_same_whole_or_by_parameter(robot: RobotDescription) -> None:
     link = Effect.at(robot, "link_geometry", ELBOW, values=[1e-3, 0.0, 0.0, 0.0, 0.02, 0.0])
     fit = start_of(robot, scattered(robot, 3, ROWS), (link,), 3).tolerating(Scales())
     resting = link.with_values(np.zeros(6))
@@ -254,7 +254,7 @@ def test_naming_a_link_costs_the_same_whole_as_number_by_number(robot: RobotDesc
     assert at_once.of((0,)).worth == pytest.approx(in_parts.of((0, 1, 2)).worth, abs=1e-3)
 
 
-def test_intervals_do_not_depend_on_how_far_away_the_instrument_stands() -> None:
+def test_intervals_are_independent_of_instrument_distance() -> None:
     robot, rng = desk_arm(), np.random.default_rng([7, 10])
     motion, ratio = scattered(robot, 3, ROWS), Effect.at(robot, "joint_scale", ELBOW, values=[0.02])
     x = Simulation(robot, (ratio,), None, made(robot, rng)).positions(motion) + 5e-6 * rng.normal(size=(ROWS, 3))
@@ -267,7 +267,7 @@ def test_intervals_do_not_depend_on_how_far_away_the_instrument_stands() -> None
     np.testing.assert_allclose(widths[1], widths[0], rtol=0.02)
 
 
-def test_the_links_of_a_roughly_made_arm_are_not_named_one_and_all() -> None:
+def test_links_of_roughly_made_arm_are_not_named() -> None:
     robot, rng = desk_arm(), np.random.default_rng([4, 46])
     sizes = [np.append(1.8e-3 * rng.normal(size=3), np.radians(0.36) * rng.normal(size=3)) for _ in robot.joints]
     pairs = zip(robot.joints, sizes, strict=True)

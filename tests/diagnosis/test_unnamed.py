@@ -56,7 +56,7 @@ def file(diagnosis) -> DiagnosisFile:
     return conclusion(diagnosis)
 
 
-def test_an_error_that_depends_on_another_joints_square_is_unexplained_with_both_joints(file) -> None:
+def test_squared_coupling_is_unexplained_with_both_joints(file) -> None:
     assert file.verdict == "unexplained"
     assert set(file.unexplained.depends_on) == {SHOULDER, ELBOW}
     assert file.unexplained.p_value < 1e-6
@@ -66,15 +66,15 @@ def test_no_cause_is_named_for_it(file) -> None:
     assert file.causes == ()
 
 
-def test_the_model_of_what_has_no_name_predicts_rows_that_it_was_not_fitted_to(file) -> None:
+def test_unnamed_model_predicts_held_out_rows(file) -> None:
     assert file.rms_mm.extended < 0.2 * file.rms_mm.aligned
 
 
-def test_what_is_left_is_no_larger_than_the_error(file) -> None:
+def test_unexplained_rms_is_below_the_aligned_error(file) -> None:
     assert 0.5 * file.rms_mm.aligned < file.unexplained.rms_mm < file.rms_mm.aligned
 
 
-def test_the_error_without_the_model_is_that_of_causes_and_tolerances() -> None:
+def test_error_without_model_still_includes_tolerances() -> None:
     robot, rng = surveyed_arm(), np.random.default_rng(3)
     joints = [Effect.at(robot, "link_geometry", joint) for joint in robot.joints]
     made = tuple(
@@ -102,7 +102,7 @@ def stored(diagnosis: Diagnosis, folder: Path) -> Simulation:
     return load_simulation(write_extended(diagnosis.extended.simulation, folder, "x"))
 
 
-def test_the_stored_model_makes_the_simulation_right_on_another_way(robot, diagnosis, tmp_path) -> None:
+def test_stored_model_corrects_another_path(robot, diagnosis, tmp_path) -> None:
     motion = walk(robot, 2)
     left = stored(diagnosis, tmp_path).positions(motion) - squared_positions(robot, motion)
     learnt = walk(robot, 1, ROWS).q
@@ -110,13 +110,13 @@ def test_the_stored_model_makes_the_simulation_right_on_another_way(robot, diagn
     assert np.sqrt(np.square(left[inside.all(axis=1)]).sum(axis=1).mean()) < 0.5 * SIGMA_M * np.sqrt(3.0)
 
 
-def test_a_further_diagnosis_with_the_stored_model_finds_nothing(robot, diagnosis, tmp_path) -> None:
+def test_rediagnosis_with_stored_model_finds_nothing(robot, diagnosis, tmp_path) -> None:
     simulation = stored(diagnosis, tmp_path)
     again = conclusion(diagnose(squared_recording(robot), simulation, only=NEAREST))
     assert (again.verdict, again.causes, again.unexplained.depends_on) == ("nothing_found", (), ())
 
 
-def test_the_held_out_error_is_that_of_the_stored_model(robot, diagnosis, file, tmp_path) -> None:
+def test_held_out_error_matches_the_stored_model_s_error(robot, diagnosis, file, tmp_path) -> None:
     motion = walk(robot, 1, ROWS)
     off = stored(diagnosis, tmp_path).positions(motion) - squared_positions(robot, motion)
     truth_mm = 1e3 * np.sqrt(np.square(off).sum(axis=1).mean() + 3.0 * SIGMA_M**2)
@@ -124,7 +124,7 @@ def test_the_held_out_error_is_that_of_the_stored_model(robot, diagnosis, file, 
 
 
 @pytest.mark.soak
-def test_what_wanders_with_time_is_not_in_the_model_and_that_is_told(robot) -> None:
+def test_time_drift_is_reported_as_outside_the_model(robot) -> None:
     motion = walk(robot, 1, rows=60)
     q = motion.q.copy()
     q[:, robot.joints.index(SHOULDER)] += 0.02 * np.sin(np.linspace(0.0, 9.0, len(q)))
@@ -140,7 +140,7 @@ def test_what_wanders_with_time_is_not_in_the_model_and_that_is_told(robot) -> N
 
 
 @pytest.mark.soak
-def test_a_link_that_grows_as_it_warms_up_is_unexplained_and_no_cause_is_named(robot) -> None:
+def test_warming_link_is_unexplained_without_named_cause(robot) -> None:
     motion = walk(robot, 1)
     columns = Simulation(robot).run(motion).columns(Effect.at(robot, "link_geometry", ELBOW))
     grown = 1.0 - np.exp(-motion.clock / (0.15 * motion.clock[-1]))
@@ -152,7 +152,7 @@ def test_a_link_that_grows_as_it_warms_up_is_unexplained_and_no_cause_is_named(r
 
 
 @pytest.mark.soak
-def test_depth_that_errs_with_the_place_in_the_image_is_unexplained_and_learnt() -> None:
+def test_image_dependent_depth_error_is_unexplained_but_learnt() -> None:
     robot, motion = surveyed_arm(), walk(surveyed_arm(), 1)
     right = Simulation(robot).positions(motion)
     x = right * (1.0 + 0.04 * np.square(right[:, :1] / right[:, 2:]))
@@ -184,7 +184,7 @@ def smooth_walk(robot: RobotDescription, seed: int, rows: int) -> Motion:
 
 @pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.parametrize("robot", [desk_arm(), surveyed_arm()], ids=["placed", "surveyed"])
-def test_clocks_that_run_apart_are_told_beside_the_mean_delay(robot, seed) -> None:
+def test_clock_drift_is_reported_beside_mean_latency(robot, seed) -> None:
     motion, simulation = smooth_walk(robot, seed, 300), Simulation(robot)
     late = np.linspace(0.02, 0.5, len(motion))
     x = simulation.positions(motion.earlier(late))
@@ -205,7 +205,7 @@ def wandering(rows: int, seed: int) -> FloatArray:
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_what_wanders_and_no_family_predicts_is_unexplained_and_no_noise(robot, seed) -> None:
+def test_unpredictable_wandering_is_unexplained_rather_than_noise(robot, seed) -> None:
     motion, simulation = walk(robot, seed, ROWS), Simulation(robot)
     noise = SIGMA_M * np.random.default_rng([seed, 1]).normal(size=(ROWS, 3))
     x = simulation.positions(motion) + noise + 20.0 * SIGMA_M * wandering(ROWS, seed)

@@ -40,12 +40,12 @@ def triangulated(x: FloatArray, turn: FloatArray) -> FloatArray:
 
 
 @given(TURNS)
-def test_what_turned_eyes_report_is_what_their_pixels_triangulate(turn) -> None:
+def test_vergence_report_matches_pixel_triangulation(turn) -> None:
     np.testing.assert_allclose(reported(points(), CALIBRATION, turn), triangulated(points(), turn), atol=1e-12)
 
 
 @given(TURNS)
-def test_what_turned_eyes_report_is_undone(turn) -> None:
+def test_vergence_report_is_invertible(turn) -> None:
     np.testing.assert_allclose(undone(reported(points(), CALIBRATION, turn), CALIBRATION, turn), points(), atol=1e-6)
 
 
@@ -66,7 +66,7 @@ def with_turned_eyes(vergence: float, seed: int) -> DiagnosisFile:
 
 
 @pytest.mark.parametrize("vergence", [0.002, pytest.param(-0.005, marks=pytest.mark.soak)])
-def test_eyes_that_are_turned_towards_each_other_are_unexplained_and_no_scale(vergence) -> None:
+def test_vergence_is_unexplained_rather_than_scale(vergence) -> None:
     file = with_turned_eyes(vergence, 1)
     assert (file.verdict, file.causes) == ("unexplained", ())
     assert file.unexplained.what == ("the eyes are turned towards each other",)
@@ -74,12 +74,12 @@ def test_eyes_that_are_turned_towards_each_other_are_unexplained_and_no_scale(ve
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.soak
-def test_a_turn_that_the_data_hardly_tell_from_a_scale_is_no_scale_for_sure(seed) -> None:
+def test_ambiguous_vergence_is_never_a_sure_scale(seed) -> None:
     file = with_turned_eyes(0.0002, seed)
     assert not any(cause.effect == "camera_scale" and cause.probability > 0.9 for cause in file.causes)
 
 
-def test_a_wrong_scale_is_named_and_not_taken_for_turned_eyes() -> None:
+def test_camera_scale_is_not_mistaken_for_vergence() -> None:
     scale = Effect.at(ROBOT, "camera_scale", values=[0.004])
     file = found(Simulation(ROBOT, (scale,)).positions(walk(ROBOT, 1, ROWS)), 1)
     assert (file.verdict, [cause.effect for cause in file.causes]) == ("explained", ["camera_scale"])

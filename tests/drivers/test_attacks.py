@@ -61,7 +61,7 @@ def echo(data: bytes, replies: list[Reply], t: float) -> list[Reply]:
 
 
 @pytest.mark.parametrize("make", MAKES.values(), ids=MAKES)
-def test_an_adapter_that_echoes_is_read_like_any_other(make) -> None:
+def test_echoing_adapter_gives_correct_readings(make) -> None:
     arm = make()
     arm.port.device = Wire(arm.chain, echo)
     with arm.joints:
@@ -81,7 +81,7 @@ def test_a_scan_through_an_echo_finds_the_servos() -> None:
     assert [(servo.id, servo.model, servo.troubles) for servo in told] == [(1, "XM430-W350", ()), (4, "MX-28", ())]
 
 
-def test_an_echo_is_not_taken_for_a_servo_with_that_id() -> None:
+def test_echo_is_not_taken_for_a_servo() -> None:
     clock, chain = VirtualClock(), Chain([Servo(BY_NAME["MX-28"], 1, lambda _: 0.0)])
     with EepromEditor(DYNAMIXEL, clock, lambda _, baud: (VirtualPort(Wire(chain, echo), clock, baud), 0.0)) as bench:
         bus = bench.bus("bench", 1_000_000)
@@ -89,7 +89,7 @@ def test_an_echo_is_not_taken_for_a_servo_with_that_id() -> None:
 
 
 @pytest.mark.parametrize("make", MAKES.values(), ids=MAKES)
-def test_answers_to_others_at_the_opening_are_waited_out(make) -> None:
+def test_answers_of_other_servos_at_opening_raise_loss(make) -> None:
     arm = make()
 
     def of_another(_data: bytes, replies: list[Reply], _t: float) -> list[Reply]:
@@ -102,7 +102,7 @@ def test_answers_to_others_at_the_opening_are_waited_out(make) -> None:
 
 @pytest.mark.parametrize("model", WEAK)
 @pytest.mark.parametrize("later", [1, 2, 3, 4])
-def test_an_answer_that_comes_again_is_not_that_to_a_later_question(model, later) -> None:
+def test_repeated_answer_never_answers_a_later_request(model, later) -> None:
     bus_of, chain_of, servo_of, models = WEAK[model]
     clock, angles = VirtualClock(), [0.5]
     chain = chain_of([servo_of(models[model], 1, lambda _: angles[0], return_delay_s=500e-6)])
@@ -171,7 +171,7 @@ def once(arm: Any, place: int, value: int) -> Change:
     "make", [MAKES["protocol 1"], MAKES["feetech"], MAKES["SCS"]], ids=["protocol 1", "STS", "SCS"]
 )
 @pytest.mark.parametrize(("place", "value"), [(4, 0x20), (5, 1)], ids=["alert", "torque"])
-def test_an_alert_or_torque_is_not_believed_from_one_answer(make, place, value) -> None:
+def test_single_answer_does_not_prove_alert_or_torque(make, place, value) -> None:
     arm = make()
     with arm.joints:
         arm.joints.read(0.1)
@@ -184,7 +184,7 @@ def test_an_alert_or_torque_is_not_believed_from_one_answer(make, place, value) 
 @pytest.mark.parametrize(
     "make", [MAKES["protocol 1"], MAKES["feetech"], MAKES["SCS"]], ids=["protocol 1", "STS", "SCS"]
 )
-def test_torque_is_not_believed_to_be_off_from_one_answer(make) -> None:
+def test_single_answer_does_not_prove_torque_off(make) -> None:
     arm = make()
     arm.chain.servo(1)["torque"] = 1
     arm.port.device = Wire(arm.chain, once(arm, 5, 0))

@@ -100,7 +100,7 @@ def reading(bench: DryRun, make: str) -> JointReading:
 
 
 @EACH
-def test_the_driver_reads_the_angles_that_the_bench_was_given(make, tmp_path) -> None:
+def test_driver_reads_the_angles_given_to_bench(make, tmp_path) -> None:
     with standing(tmp_path, make) as bench:
         assert reading(bench, make).q == pytest.approx(POSE, abs=TICK)
         assert bench.arm.count > 0
@@ -114,7 +114,7 @@ def test_each_bus_has_a_port_of_its_own(tmp_path) -> None:
 
 
 @EACH
-def test_nothing_is_left_of_a_bench_that_has_ended(make, tmp_path) -> None:
+def test_ended_bench_leaves_no_files(make, tmp_path) -> None:
     with standing(tmp_path, make):
         pass
     assert list(tmp_path.iterdir()) == []
@@ -166,7 +166,7 @@ def test_a_glitch_is_over_with_the_next_event(make, tmp_path) -> None:
 
 
 @SERVOS
-def test_a_power_cycle_loses_what_stands_in_ram(make, tmp_path) -> None:
+def test_power_cycle_clears_the_ram(make, tmp_path) -> None:
     bench = standing(tmp_path, make, "power-cycle", "torque@waist")
     assert bench.arm.servo("waist")["torque"] == 1
     next(bench.events())[2]()
@@ -198,7 +198,7 @@ def turning(*faults: str) -> DynamixelArm:
     return DynamixelArm(GAZING, dict.fromkeys(JOINTS, lambda t: 0.1 * t), faults=asked, now=lambda: 2.0)
 
 
-def test_joints_of_the_gaze_stand_still_until_their_servos_turn_them() -> None:
+def test_gaze_joints_move_only_by_their_servos() -> None:
     arm = turning()
     waist, elbow = arm.servo("waist"), arm.servo("elbow")
     assert waist.angle(5.0) == pytest.approx(0.2)
@@ -208,7 +208,7 @@ def test_joints_of_the_gaze_stand_still_until_their_servos_turn_them() -> None:
     assert waist.angle(6.0) == pytest.approx(0.2 + 100 * TICK, abs=TICK)
 
 
-def test_a_head_that_has_torque_from_the_beginning_stays_where_it_is() -> None:
+def test_head_with_initial_torque_stays_in_place() -> None:
     shoulder = turning("torque@shoulder").servo("shoulder")  # counts against the joint
     before = shoulder.angle(3.0)
     assert shoulder.angle(9.0) == pytest.approx(before, abs=TICK)
@@ -245,19 +245,19 @@ def test_each_kind_can_be_asked_for(make, kind) -> None:
         ("late=often", "'often' is no share"),
     ],
 )
-def test_what_is_no_fault_is_said_to_be_none(text, said) -> None:
+def test_invalid_fault_error_names_the_problem(text, said) -> None:
     with pytest.raises(ConfigError) as caught:
         AskedFault.parsed(text, JOINTS, KINDS)
     assert f"--fault {text}: " in str(caught.value)
     assert said in str(caught.value)
 
 
-def test_a_fault_of_a_joint_strikes_each_of_its_answers_and_no_other() -> None:
+def test_joint_fault_strikes_all_and_only_its_answers() -> None:
     faults = WireFaults([(5, 1.0, KINDS.on_the_wire["mute"])], Random(1))
     assert [bool(faults(Reply(id, 0.0, b"12")).data) for id in (5, 1, 5, 2)] == [False, True, False, True]
 
 
-def test_a_share_is_that_of_the_answers_that_suffer() -> None:
+def test_fault_share_sets_the_rate_of_struck_answers() -> None:
     faults = WireFaults([(None, 0.1, KINDS.on_the_wire["mute"])], Random(1))
     struck = sum(not faults(Reply(1, 0.0, b"12")).data for _ in range(5000))
     assert 0.08 < struck / 5000 < 0.12
@@ -266,7 +266,7 @@ def test_a_share_is_that_of_the_answers_that_suffer() -> None:
 # --- motion
 
 
-def test_a_path_is_played_to_its_end_and_back() -> None:
+def test_path_is_played_to_its_end_and_back() -> None:
     (joint,) = played(np.array([[0.0], [1.0], [3.0]]), rate_hz=10.0, begin_s=5.0)
     assert [joint(5.0 + t) for t in (0.0, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5)] == pytest.approx([0, 0.5, 1, 3, 1, 0, 1])
 
@@ -316,7 +316,7 @@ def through(source: Any, make: str) -> ThroughDriver:
 
 
 @SERVOS
-def test_readings_through_servos_keep_their_times_and_have_the_servos_resolution(make) -> None:
+def test_servo_readings_keep_times_and_have_servo_resolution(make) -> None:
     poses = [(0.5 + 1e-3 * k, 0.1, -0.2 - 2e-3 * k) for k in range(20)]
     with through(Scripted(poses), make) as source:
         seen = [source.read(1.0) for _ in poses]

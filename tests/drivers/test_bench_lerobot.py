@@ -98,7 +98,7 @@ def told(arm: str) -> list[tuple[bytes, bytes]]:
 
 
 @pytest.mark.parametrize("arm", ["so101", "koch"])
-def test_packets_of_lerobot_are_answered_as_it_accepted_them(arm: str) -> None:
+def test_emulator_answers_lerobot_packets_as_recorded(arm: str) -> None:
     servos, now_s = chain(ARMS[arm].make, arm), 0.0
     for sent, answer in told(arm):
         now_s += 0.1
@@ -108,7 +108,7 @@ def test_packets_of_lerobot_are_answered_as_it_accepted_them(arm: str) -> None:
 
 @pytest.mark.parametrize("unit", ["degrees", "range_m100_100", "range_0_100"])
 @pytest.mark.parametrize("arm", ["so101", "koch"])
-def test_lerobot_reads_what_is_computed_from_its_calibration(lerobot, arm: str, unit: str, tmp_path: Path) -> None:
+def test_lerobot_reads_values_computed_from_its_calibration(lerobot, arm: str, unit: str, tmp_path: Path) -> None:
     with connected(lerobot, arm, unit, tmp_path) as (bus, _):
         assert patiently(lambda: bus.is_calibrated)
         read = bus.sync_read("Present_Position", num_retry=20)

@@ -98,19 +98,19 @@ def bench(model: str, tmp_path: Path) -> Iterator[Bench]:
 
 
 @EACH
-def test_ping_finds_who_is_there(bench: Bench) -> None:
+def test_ping_finds_present_servos(bench: Bench) -> None:
     assert all(bench.client.ping(id) for id in IDS)
 
 
 @pytest.mark.parametrize("model", ["XL330-M288"])
-def test_ping_finds_nobody_else(bench: Bench) -> None:
+def test_ping_finds_no_absent_servo(bench: Bench) -> None:
     bench.client.close()
     bench.connect(OF_ABSENT_S)
     assert not bench.client.ping(9)
 
 
 @EACH
-def test_a_scan_tells_the_model_s_number(bench: Bench) -> None:
+def test_scan_reports_the_model_number(bench: Bench) -> None:
     assert scanned(lambda: bench.client.scan([1, 3, 7]), {1: bench.model.number, 7: bench.model.number})
 
 
@@ -120,7 +120,7 @@ def test_a_position_is_read(bench: Bench) -> None:
 
 
 @EACH
-def test_what_is_written_is_read_again(bench: Bench) -> None:
+def test_written_value_is_read_back(bench: Bench) -> None:
     bench.client.write_register(2, "goal_position", 700)
     assert bench.client.read_register(2, "goal_position") == 700
     assert bench.chain.servo(2)["goal"] == 700
@@ -140,13 +140,13 @@ def test_sync_write_writes_each_its_own(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("model", TOGETHER)
-def test_sync_read_gives_each_servo_s_position_in_the_order_asked(bench: Bench) -> None:
+def test_sync_read_returns_positions_in_requested_order(bench: Bench) -> None:
     told = bench.client.sync_read_register([7, 1, 2], "present_position")
     assert told == [bench.ticks(7), bench.ticks(1), bench.ticks(2)]
 
 
 @pytest.mark.parametrize("model", TOGETHER)
-def test_after_a_sync_read_with_one_missing_the_next_is_right(bench: Bench) -> None:
+def test_sync_read_recovers_after_a_missing_servo(bench: Bench) -> None:
     bench.client.close()
     bench.connect(OF_BOTH_S)
     with pytest.raises(RuntimeError):
@@ -155,7 +155,7 @@ def test_after_a_sync_read_with_one_missing_the_next_is_right(bench: Bench) -> N
 
 
 @pytest.mark.parametrize("model", ["MX-28", "AX-12A", "SCS0009"])
-def test_who_has_no_sync_read_is_silent(bench: Bench) -> None:
+def test_models_without_sync_read_stay_silent(bench: Bench) -> None:
     bench.client.close()
     bench.connect(OF_ABSENT_S)
     with pytest.raises(RuntimeError, match="timed out"):
@@ -174,13 +174,13 @@ def test_a_broadcast_ping_finds_all_of_protocol_2(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("model", ["STS3215"])
-def test_a_broadcast_ping_finds_a_feetech_servo_that_is_alone(bench: Bench) -> None:
+def test_broadcast_ping_finds_a_lone_feetech_servo(bench: Bench) -> None:
     del bench.chain.servos[1:]  # "only applicable when there is only one servo on the bus": several answer at once
     assert scanned(bench.client.broadcast_scan, {1: 777})
 
 
 @pytest.mark.parametrize("model", ["XL330-M288", "XL430-W250"])
-def test_a_reboot_is_answered_and_loses_what_stands_in_ram(bench: Bench) -> None:
+def test_reboot_is_answered_and_clears_torque_in_ram(bench: Bench) -> None:
     bench.client.write_register(1, "torque_enable", 1)
     assert bench.client.reboot(1)
     assert bench.client.read_register(1, "torque_enable") == 0
@@ -193,7 +193,7 @@ def test_eeprom_is_locked_while_torque_is_on(bench: Bench) -> None:
 
 
 @EACH
-def test_a_new_id_is_answered_by_the_old_one(bench: Bench) -> None:
+def test_id_change_is_answered_by_the_old_id(bench: Bench) -> None:
     definition = type(bench.client).definition()
     bench.client.close()
     with rustypot.Bus(str(bench.shell.link), 1_000_000, TIMEOUT_S, {}) as opened:
@@ -202,7 +202,7 @@ def test_a_new_id_is_answered_by_the_old_one(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("model", [*TOGETHER, "SCS0009"])  # of the others rustypot knows no rates
-def test_a_new_rate_holds_from_the_next_question_on(bench: Bench) -> None:
+def test_new_rate_applies_from_the_next_request(bench: Bench) -> None:
     definition = type(bench.client).definition()
     bench.client.close()
     with rustypot.Bus(str(bench.shell.link), 1_000_000, TIMEOUT_S, {}) as opened:
@@ -213,7 +213,7 @@ def test_a_new_rate_holds_from_the_next_question_on(bench: Bench) -> None:
 
 
 @pytest.mark.parametrize("model", ["STS3215"])
-def test_an_id_written_to_a_locked_eeprom_is_lost_with_the_power(bench: Bench) -> None:
+def test_id_in_locked_eeprom_reverts_on_power_cycle(bench: Bench) -> None:
     bench.client.write_register(1, "id", 42)
     assert bench.client.ping(42)
     bench.chain.power_cycle(0.0)
@@ -221,13 +221,13 @@ def test_an_id_written_to_a_locked_eeprom_is_lost_with_the_power(bench: Bench) -
 
 
 @pytest.mark.parametrize("model", ["XL330-M288", "MX-28", "STS3215"])
-def test_what_is_wrong_with_a_servo_is_in_the_error_of_its_answers(bench: Bench) -> None:
+def test_servo_fault_sets_the_error_of_its_answers(bench: Bench) -> None:
     bench.chain.servo(1).fail(0x20)
     _, error = bench.client.read_register_with_error(1, "present_position")
     assert error == (0x80 if bench.model.protocol == 2 else 0x20)
 
 
-def test_servos_of_several_models_and_protocols_share_a_bus(tmp_path: Path) -> None:
+def test_mixed_models_and_protocols_share_a_bus(tmp_path: Path) -> None:
     there = {1: "XL330-M288", 2: "XL430-W250", 3: "MX-28"}
     chain = DynamixelChain(DynamixelServo(DYNAMIXEL[model], id, lambda _: 0.5) for id, model in there.items())
     definitions = {id: getattr(rustypot, CONTROLLERS[model]).definition() for id, model in there.items()}

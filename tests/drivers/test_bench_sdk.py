@@ -78,7 +78,7 @@ def signed(number: int) -> int:
     return number - 2**32 if number >= 2**31 else number
 
 
-def test_ping_tells_the_model(port) -> None:
+def test_ping_reports_the_model(port) -> None:
     assert P2.ping(port, 2) == (1020, sdk.COMM_SUCCESS, 0)
     assert P1.ping(port, 11) == (12, sdk.COMM_SUCCESS, 0)
 
@@ -89,7 +89,7 @@ def test_broadcast_ping_finds_all_of_the_protocol(port) -> None:
     assert found == {1: [1020, 46], 2: [1020, 46], 3: [1020, 46], 21: [2020, 46]}
 
 
-def test_an_id_that_is_not_there_does_not_answer(port) -> None:
+def test_absent_id_does_not_answer(port) -> None:
     assert P2.ping(port, 9)[1] == sdk.COMM_RX_TIMEOUT
 
 
@@ -98,7 +98,7 @@ def test_the_position_is_read_with_its_turns(port, id) -> None:
     assert signed(P2.read4ByteTxRx(port, id, 132)[0]) == ticks(id)
 
 
-def test_positions_of_protocol_1_and_of_the_p_series_are_read(port) -> None:
+def test_protocol_1_and_p_series_positions_are_read(port) -> None:
     assert P1.read2ByteTxRx(port, 11, 36)[0] == 512 + round(0.5 / (math.radians(300) / 1024))
     assert P1.read2ByteTxRx(port, 12, 36)[0] == 2048 - round(0.5 * 4096 / (2 * math.pi))
     assert P2.read4ByteTxRx(port, 21, 580)[0] == round(1003846 / (2 * math.pi))
@@ -141,7 +141,7 @@ def test_fast_bulk_read_reads_other_registers_of_each(port) -> None:
 @pytest.mark.parametrize(
     ("id", "pointer", "data", "goal"), [(1, 168, 224, 116), (1, 632, 661, 116), (21, 168, 634, 564)]
 )
-def test_indirect_data_is_what_its_address_points_at(port, chain, id, pointer, data, goal) -> None:
+def test_indirect_data_mirrors_the_addressed_register(port, chain, id, pointer, data, goal) -> None:
     assert P2.read2ByteTxRx(port, id, pointer)[0] == data
     assert P2.write2ByteTxRx(port, id, pointer, goal) == (sdk.COMM_SUCCESS, 0)
     assert P2.write1ByteTxRx(port, id, data, 7) == (sdk.COMM_SUCCESS, 0)
@@ -175,7 +175,7 @@ def test_a_registered_write_waits_for_action(port, chain) -> None:
     assert P2.read4ByteTxRx(port, 1, 116)[0] == 2048
 
 
-def test_bytes_that_look_like_a_header_pass_through_the_stuffing(port, chain) -> None:
+def test_header_like_bytes_pass_through_the_stuffing(port, chain) -> None:
     chain.servo(1)["goal"] = int.from_bytes(bytes(HEADER_LIKE), "little", signed=True)
     assert P2.readTxRx(port, 1, 116, 4) == (HEADER_LIKE, sdk.COMM_SUCCESS, 0)
 
@@ -187,7 +187,7 @@ def test_eeprom_is_locked_while_torque_is_on(port) -> None:
     assert P2.read1ByteTxRx(port, 1, 9)[0] == 0
 
 
-def test_what_is_measured_cannot_be_written(port) -> None:
+def test_measured_values_cannot_be_written(port) -> None:
     assert P2.write4ByteTxRx(port, 1, 132, 5) == (sdk.COMM_SUCCESS, 7)
 
 
@@ -208,7 +208,7 @@ def test_status_return_level_0_answers_ping_only(port) -> None:
 
 
 @pytest.mark.parametrize("bits", [0x01, 0x04, 0x08, 0x10, 0x20])
-def test_each_hardware_error_sets_the_alert_bit_until_reboot(port, chain, bits) -> None:
+def test_hardware_error_sets_the_alert_until_reboot(port, chain, bits) -> None:
     chain.servo(1).fail(bits)
     value, result, error = P2.read1ByteTxRx(port, 1, 70)
     assert (value, result, error) == (bits, sdk.COMM_SUCCESS, 0x80)
@@ -229,7 +229,7 @@ def test_a_power_cycle_loses_turns_and_torque(port, chain) -> None:
     assert P2.read1ByteTxRx(port, 3, 64)[0] == 0
 
 
-def test_torque_on_in_position_mode_falls_back_into_one_turn(port) -> None:
+def test_torque_on_in_position_mode_drops_whole_turns(port) -> None:
     before = P2.read4ByteTxRx(port, 3, 132)[0]
     P2.write1ByteTxRx(port, 3, 64, 1)
     assert before == ticks(3)
@@ -263,7 +263,7 @@ def test_the_homing_offset_is_added(port) -> None:
         ("AX-12A", 28, 1, 32),
     ],
 )
-def test_limits_and_gains_are_those_of_a_new_servo(model, address, size, number) -> None:
+def test_limits_and_gains_match_a_new_servo(model, address, size, number) -> None:
     chain = Chain([Servo(BY_NAME[model], 1, lambda t: 0.0, return_delay_s=0)])
     chain.power_cycle(1.0)
     handler = P2 if BY_NAME[model].protocol == 2 else P1
@@ -271,7 +271,7 @@ def test_limits_and_gains_are_those_of_a_new_servo(model, address, size, number)
     assert read(VirtualHandler(chain), 1, address) == (number, sdk.COMM_SUCCESS, 0)
 
 
-def test_factory_reset_keeps_what_it_is_asked_to(port, chain) -> None:
+def test_factory_reset_except_id_keeps_the_id(port, chain) -> None:
     chain.servo(2)["return_delay"] = 3
     assert P2.factoryReset(port, 2, 0x02)[0] == sdk.COMM_SUCCESS
     assert P2.read1ByteTxRx(port, 2, 9)[0] == 250
@@ -299,7 +299,7 @@ def test_a_fault_shows_at_the_sdk_and_passes(port, chain, fault, result) -> None
     assert P2.read4ByteTxRx(port, 1, 132) == (ticks(1), sdk.COMM_SUCCESS, 0)
 
 
-def test_a_program_that_has_it_open_notices_the_unplugging(chain, tmp_path, monkeypatch) -> None:
+def test_program_with_open_port_notices_the_unplugging(chain, tmp_path, monkeypatch) -> None:
     # The SDK spins while it waits, in this process: the emulator may be scheduled late.
     monkeypatch.setattr(sdk.port_handler, "LATENCY_TIMER", 1000)
     with PtyShell(chain, tmp_path / "bus") as shell:

@@ -78,17 +78,17 @@ def machine(tmp_path: Path) -> Machine:
     return Machine(tmp_path)
 
 
-def test_a_port_that_is_there_and_free_is_ok(machine) -> None:
+def test_free_port_is_ok(machine) -> None:
     assert [check.state for check in machine.checks()] == ["ok"]
 
 
-def test_a_missing_port_is_told_with_the_one_that_is_there(machine) -> None:
+def test_missing_port_fix_names_the_existing_port(machine) -> None:
     (check,) = machine.checks(machine.root / "dev" / "gone")
     assert check.state == "wrong"
     assert f'set port = "{machine.by_id}"' in check.fix
 
 
-def test_who_has_the_port_is_told_with_the_command_that_ends_it(machine) -> None:
+def test_busy_port_fix_kills_its_holder(machine) -> None:
     machine.process(4711, "wizard --fast", "/dev/null", machine.port)
     (check,) = machine.checks()
     assert (check.state, check.fix) == ("wrong", "kill 4711")
@@ -101,7 +101,7 @@ def test_the_running_sampler_may_have_the_port(machine) -> None:
     assert (check.state, check.said.endswith("the running sampler has it open")) == ("ok", True)
 
 
-def test_who_serves_the_other_end_of_a_pseudo_terminal_does_not_hold_it(machine) -> None:
+def test_pseudo_terminal_master_does_not_count_as_holder(machine) -> None:
     machine.process(1, "bench", "/dev/ptmx", "/dev/pts/7")
     machine.process(2, "reader", "/dev/pts/7")
     assert [holder.pid for holder in holders("/dev/pts/7", machine.root)] == [2]
@@ -112,7 +112,7 @@ def test_this_process_is_no_other_one(machine) -> None:
     assert holders(str(machine.port), machine.root) == []
 
 
-def test_a_latency_timer_of_16_ms_is_told_with_the_cure(machine) -> None:
+def test_slow_latency_timer_warning_names_the_udev_fix(machine) -> None:
     machine.latency(16)
     check = machine.checks()[-1]
     assert (check.subject, check.state) == ("latency timer", "warning")
@@ -125,12 +125,12 @@ def test_a_latency_timer_of_1_ms_is_ok(machine) -> None:
     assert machine.checks()[-1].state == "ok"
 
 
-def test_a_name_that_may_change_is_told_with_the_one_that_stays(machine) -> None:
+def test_unstable_port_name_fix_gives_the_stable_one(machine) -> None:
     check = machine.checks(machine.port)[-1]
     assert (check.state, check.fix) == ("warning", f'set port = "{machine.by_id}" in robot.toml')
 
 
-def test_a_port_of_another_group_is_told_with_the_command(machine, monkeypatch) -> None:
+def test_inaccessible_port_fix_adds_user_to_group(machine, monkeypatch) -> None:
     monkeypatch.setattr(checks.os, "access", lambda *_: False)
     monkeypatch.setattr(checks.os, "getgroups", list)
     check = machine.checks()[0]
@@ -156,7 +156,7 @@ class Told:
 
 
 @EACH
-def test_servos_that_are_well_are_told_with_their_rate(make, tmp_path) -> None:
+def test_healthy_servos_are_reported_with_their_rate(make, tmp_path) -> None:
     told = Told(make, tmp_path)
     if told.of("rate")[0].state == "wrong":  # on a full machine the bench may not answer in so short a time
         told = Told(make, tmp_path, read_s=20.0)
@@ -172,20 +172,20 @@ def test_a_missing_servo_is_wrong(make, tmp_path) -> None:
 
 @EACH
 @pytest.mark.parametrize("joint", JOINTS)
-def test_an_alert_is_wrong_and_says_what_to_do(make, tmp_path, joint) -> None:
+def test_overload_alert_is_wrong_with_its_remedy(make, tmp_path, joint) -> None:
     check = Told(make, tmp_path, f"overload@{joint}").of("servos")[1]
     assert (check.state, check.said) == ("wrong", f"joint {joint} (ID {JOINTS.index(joint) + 1}): it is overloaded")
     assert check.fix == MAKES[make][5]
 
 
 @EACH
-def test_slow_answers_are_told_with_the_register(make, tmp_path) -> None:
+def test_slow_answers_are_reported_with_the_register(make, tmp_path) -> None:
     check = Told(make, tmp_path, delay_s=500e-6).of("servos")[1]
     assert (check.state, check.fix) == ("warning", "bodyschema servos return_delay=0 --bus arm")
 
 
 @EACH
-def test_errors_are_counted_by_what_went_wrong(make, tmp_path) -> None:
+def test_errors_are_counted_by_kind(make, tmp_path) -> None:
     check = Told(make, tmp_path, "checksum=0.3").of("errors")[0]
     assert check.state == "warning"
     assert "× a garbled answer" in check.said
@@ -199,7 +199,7 @@ def test_the_doctor_leaves_torque_as_it_is(make, tmp_path) -> None:
 
 
 @EACH
-def test_a_port_that_cannot_be_opened_is_one_finding(make) -> None:
+def test_unopenable_port_is_one_finding(make) -> None:
     _, config, the_make, open_port, *_ = MAKES[make]
     (check,) = servo_checks(the_make, config, SystemClock(), open_port)
     assert (check.state, "elsewhere is not there" in check.said) == ("wrong", True)

@@ -99,7 +99,7 @@ def test_an_unknown_covariance_has_its_reason(correction, monkeypatch) -> None:
 
 
 @pytest.mark.parametrize("wrong", [float("nan"), float("inf")])
-def test_a_position_that_is_not_finite_is_passed_over(wrong, correction, monkeypatch) -> None:
+def test_joint_state_with_non_finite_position_is_skipped(wrong, correction, monkeypatch) -> None:
     monkeypatch.syspath_prepend(str(READERS))
     from ros2_node import CorrectedJoints
 

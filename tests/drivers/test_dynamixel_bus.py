@@ -52,7 +52,7 @@ def fitted(model: str) -> IdentifiedServo:
 
 
 @given(PIECES)
-def test_only_intact_answers_of_who_was_asked_are_believed_whatever_comes(pieces) -> None:
+def test_only_intact_answers_of_requested_servos_are_accepted(pieces) -> None:
     clock = VirtualClock()
     bus = Bus("arm", TalkingPort(clock, list(pieces)), clock, 0.0)
     exchange = bus.ask(sync_request(BY_NAME["XM430-W350"].layout, (1, 2), fast=False))
@@ -78,20 +78,20 @@ def test_protocol_1_believes_no_more(pieces) -> None:
 
 
 @given(st.binary(min_size=16, max_size=16))
-def test_any_block_of_protocol_2_is_a_sample_or_refused(data) -> None:
+def test_any_protocol_2_block_is_sample_or_refused(data) -> None:
     answer = Answer(Status(1, 0, data, 27), 100.0, 100.001, 99.999)
     sample = Channel(fitted("XM430-W350")).take(answer)
     assert sample is None or sample.ticks == int.from_bytes(data[12:], "little", signed=True)
 
 
 @given(st.binary(min_size=11, max_size=11))
-def test_any_block_of_protocol_1_is_a_sample_or_refused(data) -> None:
+def test_any_protocol_1_block_is_sample_or_refused(data) -> None:
     answer = Answer(Status(1, 0, data, 17), 100.0, 100.001, 99.999)
     sample = Channel(fitted("AX-12A")).take(answer)
     assert sample is None or 0 <= sample.ticks <= 1023
 
 
-def test_an_answer_before_the_wire_can_have_brought_it_is_refused() -> None:
+def test_answer_faster_than_the_wire_is_refused() -> None:
     clock = VirtualClock()
 
     class Hasty(TalkingPort):

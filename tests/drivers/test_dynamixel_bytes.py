@@ -36,7 +36,7 @@ def test_the_checksum_goes_on_where_it_stopped(first, second) -> None:
 
 @pytest.mark.parametrize("protocol", [1, 2])
 @given(data=NOISE, id=st.integers(0, 252), error=st.integers(0, 255))
-def test_what_a_servo_says_is_what_the_driver_reads(protocol, data, id, error) -> None:
+def test_status_packet_is_parsed_as_sent(protocol, data, id, error) -> None:
     packet = status_packet(protocol, id, error, data[:200])
     status = packets_of(protocol).take(packet, 0)
     assert status is not None
@@ -52,7 +52,7 @@ def test_a_part_of_a_packet_is_not_complete(protocol, data, id, cut) -> None:
 
 @pytest.mark.parametrize("packets", [PACKETS1, PACKETS2])
 @given(data=NOISE, at=st.integers(0, 5))
-def test_any_bytes_are_a_packet_or_incomplete_or_refused(packets, data, at) -> None:
+def test_any_bytes_are_packet_incomplete_or_refused(packets, data, at) -> None:
     try:
         status = packets.take(data, at)
     except Garbled:
@@ -61,7 +61,7 @@ def test_any_bytes_are_a_packet_or_incomplete_or_refused(packets, data, at) -> N
 
 
 @given(st.lists(st.binary(min_size=16, max_size=16), min_size=1, max_size=6), st.data())
-def test_a_common_answer_is_taken_apart_or_refused_when_a_byte_is_wrong(blocks, draw) -> None:
+def test_fast_answer_is_split_or_refused_when_corrupt(blocks, draw) -> None:
     packet = fast_header([16] * len(blocks))
     for id, data in enumerate(blocks, 1):
         packet += fast_block(packet, id, 0, data)
@@ -76,7 +76,7 @@ def test_a_common_answer_is_taken_apart_or_refused_when_a_byte_is_wrong(blocks, 
 
 
 @given(st.integers(0, 252), st.integers(0, 600), NOISE.filter(bool))
-def test_an_instruction_is_understood_by_the_bench_whatever_it_writes(id, address, data) -> None:
+def test_bench_parses_any_write_instruction(id, address, data) -> None:
     found, done = instructions_in(bytearray(PACKETS2.write(id, address, data[:60])))
     assert [(i.id, i.code, i.params, i.intact) for i in found] == [
         (id, 3, address.to_bytes(2, "little") + data[:60], True)
@@ -100,7 +100,7 @@ def test_the_bench_finds_an_instruction_after_noise(noise) -> None:
     assert chain.send(PACKETS2.read(1, 132, 4), 1.0, 1_000_000)
 
 
-def test_a_corrupt_packet_is_refused_but_for_what_the_checksum_lets_through() -> None:
+def test_corrupt_packet_rarely_passes_the_checksum() -> None:
     rng = Random(1)
     fault, packet, passed = corrupt(4), status_packet(2, 1, 0, bytes(range(16))), 0
     for _ in range(20_000):
@@ -113,7 +113,7 @@ def test_a_corrupt_packet_is_refused_but_for_what_the_checksum_lets_through() ->
 
 
 @pytest.mark.parametrize("model", [m for m in MODELS if m.protocol == 2], ids=lambda model: model.name)
-def test_addresses_and_units_are_those_of_the_control_tables_of_the_sdk(model) -> None:
+def test_addresses_and_units_match_sdk_control_tables(model) -> None:
     tables = files("dynamixel_easy_sdk") / "control_table"
     names = dict(line.split("\t")[:2] for line in (tables / "dynamixel.model").read_text().splitlines()[1:])
     text = (tables / names[str(model.number)].strip()).read_text()

@@ -40,7 +40,7 @@ def read(arm: Arm, count: int = 1) -> list[JointReading]:
 
 @pytest.mark.parametrize("models", [("XM430-W350",) * 3, MIXED])
 @pytest.mark.parametrize("fast", ["auto", "never"])
-def test_a_reading_is_where_each_joint_was_when_it_was_asked(models, fast) -> None:
+def test_reading_matches_each_joint_angle_when_sampled(models, fast) -> None:
     with (arm := Arm(models, fast=fast)).joints:
         for _ in range(50):
             reading = read(arm)[0]
@@ -82,7 +82,7 @@ def test_two_buses_make_one_reading() -> None:
 # --- torque and settings
 
 
-def test_torque_is_off_before_the_first_reading_and_never_switched_on() -> None:
+def test_torque_is_off_before_readings_and_stays_off() -> None:
     arm = Arm()
     arm.chain.servo(2)["torque"] = 1
     with arm.joints:
@@ -107,7 +107,7 @@ def test_torque_is_switched_off_though_answers_get_lost() -> None:
         assert arm.chain.servo(2)["torque"] == 0
 
 
-def test_torque_that_is_switched_on_meanwhile_is_found_and_switched_off() -> None:
+def test_torque_switched_on_meanwhile_is_found_and_cleared() -> None:
     arm = Arm()
     with arm.joints:
         read(arm)
@@ -118,7 +118,7 @@ def test_torque_that_is_switched_on_meanwhile_is_found_and_switched_off() -> Non
         assert arm.chain.servo(3)["torque"] == 0
 
 
-def test_torque_is_restored_where_it_was_on_if_asked() -> None:
+def test_torque_is_restored_where_on_if_requested() -> None:
     arm = Arm(("XM430-W350", "AX-12A", "XM430-W350"), restore_torque=True)
     arm.chain.servo(1)["torque"] = arm.chain.servo(2)["torque"] = 1
     with arm.joints:
@@ -128,7 +128,7 @@ def test_torque_is_restored_where_it_was_on_if_asked() -> None:
         assert abs(arm.chain.servo(id)["goal"] - arm.chain.servo(id).count(arm.clock.now())) <= 3
 
 
-def test_torque_is_not_restored_between_a_loss_and_the_next_opening() -> None:
+def test_torque_stays_off_between_loss_and_reopening() -> None:
     arm = Arm(restore_torque=True)
     arm.chain.servo(1)["torque"] = 1
     with arm.joints:
@@ -142,7 +142,7 @@ def test_torque_is_not_restored_between_a_loss_and_the_next_opening() -> None:
     assert [servo["torque"] for servo in arm.chain.servos] == [1, 0, 0]
 
 
-def test_what_each_servo_is_set_to_is_on_record() -> None:
+def test_record_holds_the_settings_of_each_servo() -> None:
     arm = Arm()
     arm.chain.servo(1)["homing_offset"] = -17
     with arm.joints:
@@ -153,7 +153,7 @@ def test_what_each_servo_is_set_to_is_on_record() -> None:
 # --- servos present
 
 
-def test_a_missing_servo_and_a_wrong_one_are_shown_in_one_table() -> None:
+def test_missing_and_wrong_servos_share_one_table() -> None:
     arm = Arm(("XM430-W350", "XM430-W350", "XL330-M288"))
     arm.chain.servos[1:] = [Servo(BY_NAME["XL430-W250"], 3, swing(0))]
     with pytest.raises(SourceError) as refusal, arm.joints:
@@ -174,14 +174,14 @@ def test_two_servos_of_one_id_are_refused() -> None:
         pass
 
 
-def test_two_servos_of_one_id_and_model_are_refused_by_their_positions() -> None:
+def test_duplicate_id_and_model_is_refused_by_positions() -> None:
     arm = Arm()
     arm.chain.servos.append(Servo(BY_NAME["XM430-W350"], 2, swing(9), return_delay_s=0))
     with pytest.raises(SourceError, match=r"joint2 .* garbled answers: two servos"), arm.joints:
         pass
 
 
-def test_a_servo_that_answers_ping_only_is_told_apart() -> None:
+def test_servo_answering_only_ping_names_status_level() -> None:
     arm = Arm()
     arm.chain.servo(1)["status_return"] = 0
     with (
@@ -193,7 +193,7 @@ def test_a_servo_that_answers_ping_only_is_told_apart() -> None:
         pass
 
 
-def test_a_port_that_is_gone_is_reported_by_the_readings_and_not_by_a_temperature() -> None:
+def test_gone_port_is_reported_by_readings_not_temperature() -> None:
     def gone(_: bytes) -> None:
         raise SourceLost("the port is gone")
 
@@ -214,7 +214,7 @@ def test_a_servo_at_another_rate_does_not_answer() -> None:
 
 
 @pytest.mark.parametrize(("knows", "fast"), [(True, True), (False, False)])
-def test_fast_sync_read_is_used_where_all_know_it(knows, fast) -> None:
+def test_fast_sync_read_requires_support_by_all_servos(knows, fast) -> None:
     arm = Arm()
     arm.chain.servo(2).fast = knows
     with arm.joints:
@@ -245,7 +245,7 @@ def test_a_fault_costs_a_reading_and_nothing_else(fault, models, fast) -> None:
     assert arm.joints.epoch == 1
 
 
-def test_a_late_answer_is_not_taken_for_that_to_the_next_question() -> None:
+def test_late_answer_is_not_matched_to_next_request() -> None:
     steep = [lambda t: 8.0 * math.sin(t), lambda t: 0.0, lambda t: 0.0]
     with (arm := Arm(paths=steep, fast="never")).joints:
         for k in range(60):
@@ -254,7 +254,7 @@ def test_a_late_answer_is_not_taken_for_that_to_the_next_question() -> None:
                 assert abs(reading.q[0] - steep[0](reading.t)) < 8.0 * 0.6e-3 + TICK
 
 
-def test_an_answer_with_an_alert_is_as_good_and_the_remedy_is_told(caplog) -> None:
+def test_alert_keeps_readings_and_reports_the_remedy(caplog) -> None:
     with caplog.at_level(logging.WARNING), (arm := Arm()).joints:
         arm.chain.servo(2).fail(0x20)
         assert max(arm.error(reading) for reading in read(arm, 200)) < 2 * TICK
@@ -267,7 +267,7 @@ def test_an_answer_with_an_alert_is_as_good_and_the_remedy_is_told(caplog) -> No
         assert arm.joints.health == ()
 
 
-def test_what_the_others_answered_is_kept_when_one_is_mute() -> None:
+def test_mute_servo_does_not_discard_other_answers() -> None:
     with (arm := Arm(fast="never")).joints:
         read(arm)
         arm.faults.add(3, mute)
@@ -295,7 +295,7 @@ def test_an_encoder_s_glitch_is_not_believed(fast) -> None:
         assert max(arm.error(reading) for reading in read(arm, 20)) < 2 * TICK
 
 
-def test_an_encoder_that_jumped_for_good_is_another_epoch() -> None:
+def test_permanent_encoder_jump_starts_another_epoch() -> None:
     arm = Arm(limits=[(-2.0, 2.0)] * 3)
     with arm.joints:
         read(arm)
@@ -335,7 +335,7 @@ def test_positions_go_on_across_turns(model) -> None:
     assert reading.q[0] > 3 * 2 * math.pi
 
 
-def test_a_turn_count_lost_with_the_power_is_restored_from_the_last_pose() -> None:
+def test_lost_turn_count_is_restored_from_last_pose() -> None:
     place = [0.0]
     arm = Arm(("XM430-W350",), [lambda t: place[0] + (9.0 if t > 50 else 0.0)])
     with arm.joints:
@@ -347,7 +347,7 @@ def test_a_turn_count_lost_with_the_power_is_restored_from_the_last_pose() -> No
         assert read(arm)[0].q[0] == pytest.approx(9.2, abs=TICK)
 
 
-def test_a_joint_whose_turn_cannot_be_told_is_named() -> None:
+def test_joint_with_ambiguous_turn_is_named() -> None:
     place = [9.0]
     arm = Arm(("XM430-W350",), [lambda t: place[0]], last_pose=[9.0])
     with arm.joints:
@@ -383,7 +383,7 @@ def test_limits_within_a_turn_tell_the_turn() -> None:
         pytest.param("never", 0.0, marks=pytest.mark.soak),
     ],
 )
-def test_times_are_those_of_the_sampling_to_half_a_millisecond(fast, delay_s) -> None:
+def test_times_match_sampling_to_half_a_millisecond(fast, delay_s) -> None:
     with (arm := Arm(("XM430-W350",) * 6, latency_s=2e-3, delay_s=delay_s, fast=fast)).joints:
         off = [abs(reading.t - arm.sampled()) for reading in (read(arm)[0] for _ in range(300))]
     assert np.count_nonzero(np.array(off) >= 0.5e-3) <= 10  # at the beginning, while the delay is hardly known
@@ -391,7 +391,7 @@ def test_times_are_those_of_the_sampling_to_half_a_millisecond(fast, delay_s) ->
 
 @pytest.mark.parametrize(("model", "fast"), [("XM430-W350", "auto"), ("XM430-W350", "never"), ("MX-28", "never")])
 @pytest.mark.parametrize("held_s", [0.0, 2e-3])
-def test_a_reading_tells_how_sure_its_time_is(model, fast, held_s) -> None:
+def test_reading_reports_its_time_uncertainty(model, fast, held_s) -> None:
     with (arm := Arm((model,) * 6, [lambda _: 0.5] * 6, latency_s=4e-3, held_s=held_s, fast=fast)).joints:
         for _ in range(50):
             reading = read(arm)[0]
@@ -399,7 +399,7 @@ def test_a_reading_tells_how_sure_its_time_is(model, fast, held_s) -> None:
             assert 0 <= reading.t_sigma < 4e-3
 
 
-def test_six_servos_are_read_two_hundred_times_a_second() -> None:
+def test_six_servos_are_read_at_200_hz() -> None:
     with (arm := Arm(("XM430-W350",) * 6, fast="never")).joints:
         begin = arm.clock.now()
         read(arm, 200)
@@ -415,7 +415,7 @@ def test_six_servos_are_read_two_hundred_times_a_second() -> None:
         pytest.param(MIXED, "auto", marks=pytest.mark.soak),
     ],
 )
-def test_in_a_storm_of_faults_no_wrong_reading_is_believed(models, fast) -> None:
+def test_fault_storm_yields_no_wrong_reading(models, fast) -> None:
     arm = Arm(models, fast=fast, seed=5)
     with arm.joints:
         arm.chain.faults = storm(0.06, Random(6), swapped)

@@ -53,7 +53,7 @@ def test_readings_are_right_with_wire_time(shell, fast) -> None:
     assert np.median(off) < 0.02  # on a busy machine the time of a single one may be off
 
 
-def test_times_are_those_of_the_sampling_where_nothing_holds_it_up(shell) -> None:
+def test_undelayed_reading_time_matches_the_sampling(shell) -> None:
     off = []
     with driver(shell) as joints:
         for _ in range(100):

@@ -37,14 +37,14 @@ def test_instructions_are_those_of_the_manual_s_examples() -> None:
 
 
 @given(data=NOISE, id=st.integers(0, 252), error=st.integers(0, 255))
-def test_what_a_servo_says_is_what_the_driver_reads(data, id, error) -> None:
+def test_status_packet_is_parsed_as_sent(data, id, error) -> None:
     packet = summed(id, error, data[:200])
     status = PACKETS.take(packet, 0)
     assert status == Status(id, error, data[:200], len(packet))
 
 
 @given(data=NOISE, at=st.integers(0, 5))
-def test_any_bytes_are_a_packet_or_incomplete_or_refused(data, at) -> None:
+def test_any_bytes_are_packet_incomplete_or_refused(data, at) -> None:
     try:
         status = PACKETS.take(data, at)
     except Garbled:
@@ -53,7 +53,7 @@ def test_any_bytes_are_a_packet_or_incomplete_or_refused(data, at) -> None:
 
 
 @given(PIECES)
-def test_only_intact_answers_of_who_was_asked_are_believed_whatever_comes(pieces) -> None:
+def test_only_intact_answers_of_requested_servos_are_accepted(pieces) -> None:
     clock = VirtualClock()
     bus = Bus("arm", TalkingPort(clock, list(pieces)), clock, 0.0)
     exchange = bus.ask(Request(lambda n: PACKETS.sync_read((1, 2), 56, n), (1, 2), 15, 0))
@@ -83,14 +83,14 @@ def test_the_bench_survives_any_bytes(chunks) -> None:
 
 
 @given(st.integers(0, 252), st.integers(0, 255), st.binary(min_size=1, max_size=60))
-def test_an_instruction_is_understood_by_the_bench_whatever_it_writes(id, address, data) -> None:
+def test_bench_parses_any_write_instruction(id, address, data) -> None:
     found, done = instructions_in(bytearray(PACKETS.write(id, address, data)))
     assert [(i.id, i.code, i.params) for i in found] == [(id, 3, bytes((address,)) + data)]
     assert done == found[0].end
 
 
 @given(st.integers(-2047, 2047))
-def test_signs_are_told_by_one_bit_in_the_order_of_the_series(value) -> None:
+def test_sign_bit_follows_the_series_byte_order(value) -> None:
     little, big = Register(31, 2, sign_bit=11), Register(31, 2, sign_bit=11, order="big")
     assert little.value(little.bytes(value)) == big.value(big.bytes(value)) == value
     assert little.bytes(value) == big.bytes(value)[::-1]
@@ -113,7 +113,7 @@ def told(chain: Chain, address: int, size: int, t: float = 1.0) -> bytes:
     return reply.data[5:-1]
 
 
-def test_what_is_written_to_a_locked_eeprom_is_lost_with_the_power() -> None:
+def test_write_to_locked_eeprom_reverts_on_power_cycle() -> None:
     for lock, kept in ((1, 0), (0, 5)):
         chain = Chain([Servo(BY_NAME["STS3215"], 1, lambda t: 0.0, return_delay_s=0)])
         chain.send(PACKETS.write(1, 55, bytes((lock,))), 0.0, BAUD)
@@ -123,20 +123,20 @@ def test_what_is_written_to_a_locked_eeprom_is_lost_with_the_power() -> None:
         assert told(chain, 7, 1, 3.0) == bytes((kept,))
 
 
-def test_what_is_measured_cannot_be_written() -> None:
+def test_measured_values_cannot_be_written() -> None:
     chain = Chain([Servo(BY_NAME["STS3215"], 1, lambda t: 0.0)])
     chain.send(PACKETS.write(1, 56, b"\x05\x00"), 0.0, BAUD)
     assert told(chain, 56, 2) == (2048).to_bytes(2, "little")
 
 
-def test_the_middle_can_be_set_by_the_torque_register() -> None:
+def test_torque_register_can_set_the_middle() -> None:
     chain = Chain([Servo(BY_NAME["STS3215"], 1, lambda t: 1.0)])
     chain.send(PACKETS.write(1, 40, bytes((CALIBRATE,))), 0.0, BAUD)
     assert told(chain, 56, 2) == (2048).to_bytes(2, "little")
     assert told(chain, 40, 1, 2.0) == b"\x00"
 
 
-def test_an_overload_switches_torque_off_until_the_power_comes_back() -> None:
+def test_overload_switches_torque_off_until_power_cycle() -> None:
     chain = Chain([Servo(BY_NAME["STS3215"], 1, lambda t: 0.0)])
     servo = chain.servo(1)
     servo["torque"] = 1
@@ -148,7 +148,7 @@ def test_an_overload_switches_torque_off_until_the_power_comes_back() -> None:
     assert reply.data[4] == 0
 
 
-def test_servos_answer_a_sync_read_one_after_the_other() -> None:
+def test_sync_read_is_answered_in_requested_order() -> None:
     chain = Chain([Servo(BY_NAME["STS3215"], id, lambda t: 0.5, return_delay_s=0) for id in (1, 2, 3)])
     replies = chain.send(PACKETS.sync_read((3, 1), 56, 2), 0.0, BAUD)
     assert [reply.data[2] for reply in replies] == [3, 1]

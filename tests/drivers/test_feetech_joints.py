@@ -38,7 +38,7 @@ def read(arm: FeetechArm, count: int = 1) -> list[JointReading]:
 
 @pytest.mark.parametrize("models", [("STS3215",) * 6, MIXED])
 @pytest.mark.parametrize("sync", ["auto", "never"])
-def test_a_reading_is_where_each_joint_was_when_it_was_asked(models, sync) -> None:
+def test_reading_matches_each_joint_angle_when_sampled(models, sync) -> None:
     with (arm := FeetechArm(models, sync=sync)).joints:
         for _ in range(50):
             reading = read(arm)[0]
@@ -46,7 +46,7 @@ def test_a_reading_is_where_each_joint_was_when_it_was_asked(models, sync) -> No
                 assert abs(q - arm.chain.samplings[servo.id].angle) <= servo.model.rad_per_tick / 2 + 1e-12
 
 
-def test_one_tick_is_exactly_a_turn_by_4096_and_of_the_scs_series_300_degrees_by_1024() -> None:
+def test_tick_is_exact_for_sts_and_scs_series() -> None:
     scs = math.radians(300) / 1024
     with (arm := FeetechArm(("STS3215", "SCS0009"), [lambda t: 1000 * TICK, lambda t: -100 * scs])).joints:
         assert read(arm)[0].q.tolist() == [1000 * TICK, -100 * scs]
@@ -63,7 +63,7 @@ def test_sync_read_is_used_where_all_know_it(knows, code) -> None:
     assert arm.port.heard[0].code == code
 
 
-def test_speed_and_current_are_told_with_their_signs() -> None:
+def test_speed_and_current_keep_their_signs() -> None:
     arm = FeetechArm(("STS3215",), [lambda t: -0.5 * t % 6.0])
     arm.chain.servo(1)["current"] = -20
     with arm.joints:
@@ -77,7 +77,7 @@ def test_speed_and_current_are_told_with_their_signs() -> None:
 # --- torque and settings
 
 
-def test_torque_is_off_before_the_first_reading_and_never_switched_on() -> None:
+def test_torque_is_off_before_readings_and_stays_off() -> None:
     arm = FeetechArm(MIXED)
     arm.chain.servo(2)["torque"] = 1
     with arm.joints:
@@ -92,7 +92,7 @@ def test_nothing_is_written_where_nothing_needs_to_be() -> None:
     assert arm.port.writes() == []
 
 
-def test_torque_is_verified_of_servos_that_do_not_answer_writes() -> None:
+def test_torque_off_succeeds_without_write_answers() -> None:
     arm = FeetechArm()
     arm.chain.servo(1)["status_return"] = 0
     arm.chain.servo(1)["torque"] = 1
@@ -109,7 +109,7 @@ def test_torque_that_is_switched_on_meanwhile_is_found() -> None:
             read(arm, 1000)
 
 
-def test_torque_is_restored_where_it_was_on_if_asked() -> None:
+def test_torque_is_restored_where_on_if_requested() -> None:
     arm = FeetechArm(("STS3215", "SCS0009"), restore_torque=True)
     arm.chain.servo(2)["torque"] = 1
     with arm.joints:
@@ -118,7 +118,7 @@ def test_torque_is_restored_where_it_was_on_if_asked() -> None:
     assert abs(arm.chain.servo(2)["goal"] - arm.chain.servo(2).position(arm.clock.now())) <= 3
 
 
-def test_what_each_servo_is_set_to_is_on_record() -> None:
+def test_record_holds_the_settings_of_each_servo() -> None:
     arm = FeetechArm()
     arm.chain.servo(1)["homing_offset"] = -17
     with arm.joints:
@@ -130,7 +130,7 @@ def test_what_each_servo_is_set_to_is_on_record() -> None:
 # --- servos present
 
 
-def test_a_missing_servo_and_a_wrong_one_are_shown_in_one_table() -> None:
+def test_missing_and_wrong_servos_share_one_table() -> None:
     arm = FeetechArm()
     arm.chain.servos[1:] = [Servo(BY_NAME["STS3250"], 3, swing(0))]
     with pytest.raises(SourceError) as refusal, arm.joints:
@@ -172,7 +172,7 @@ def test_a_fault_costs_a_reading_and_nothing_else(fault, sync) -> None:
     assert arm.joints.epoch == 1
 
 
-def test_an_answer_with_an_error_is_as_good_and_the_remedy_is_told(caplog) -> None:
+def test_error_flag_keeps_readings_and_reports_the_remedy(caplog) -> None:
     with caplog.at_level(logging.WARNING), (arm := FeetechArm()).joints:
         arm.chain.servo(2).fail(0x20)
         assert max(arm.error(reading) for reading in read(arm, 200)) < 2 * TICK
@@ -182,7 +182,7 @@ def test_an_answer_with_an_error_is_as_good_and_the_remedy_is_told(caplog) -> No
         assert len(caplog.messages) == 1
 
 
-def test_what_the_others_answered_is_kept_when_one_is_mute() -> None:
+def test_mute_servo_does_not_discard_other_answers() -> None:
     with (arm := FeetechArm()).joints:
         read(arm)
         arm.faults.add(3, mute)
@@ -210,7 +210,7 @@ def test_an_encoder_s_glitch_is_not_believed() -> None:
 
 
 @pytest.mark.parametrize("sync", ["auto", "never"])
-def test_in_a_storm_of_faults_no_wrong_reading_is_believed(sync) -> None:
+def test_fault_storm_yields_no_wrong_reading(sync) -> None:
     arm = FeetechArm(("STS3215",) * 6, sync=sync, seed=5)
     with arm.joints:
         arm.chain.faults = struck = storm(0.04, Random(6), swapped)
@@ -231,7 +231,7 @@ def test_positions_go_on_across_turns(multi_turn) -> None:
     assert readings[-1].q[0] > 3 * 2 * math.pi
 
 
-def test_a_turn_count_lost_with_the_power_is_restored_from_the_last_pose() -> None:
+def test_lost_turn_count_is_restored_from_last_pose() -> None:
     place = [9.0]
     arm = FeetechArm(("STS3215",), [lambda t: place[0]], last_pose=[9.1])
     arm.chain.power_cycle(arm.clock.now())
@@ -242,7 +242,7 @@ def test_a_turn_count_lost_with_the_power_is_restored_from_the_last_pose() -> No
         arm.joints.__enter__()
 
 
-def test_times_are_those_of_the_sampling_to_half_a_millisecond() -> None:
+def test_times_match_sampling_to_half_a_millisecond() -> None:
     with (arm := FeetechArm(("STS3215",) * 6, latency_s=1e-3)).joints:
         off = [abs(reading.t - arm.sampled()) for reading in (read(arm)[0] for _ in range(300))]
     assert np.percentile(off, 99) < 0.5e-3
@@ -250,7 +250,7 @@ def test_times_are_those_of_the_sampling_to_half_a_millisecond() -> None:
 
 @pytest.mark.parametrize(("model", "sync"), [("STS3215", "auto"), ("STS3215", "never"), ("SCS0009", "never")])
 @pytest.mark.parametrize("held_s", [0.0, 2e-3])
-def test_a_reading_tells_how_sure_its_time_is(model, sync, held_s) -> None:
+def test_reading_reports_its_time_uncertainty(model, sync, held_s) -> None:
     with (arm := FeetechArm((model,) * 6, [lambda _: 0.5] * 6, latency_s=4e-3, held_s=held_s, sync=sync)).joints:
         for _ in range(50):
             reading = read(arm)[0]
@@ -259,7 +259,7 @@ def test_a_reading_tells_how_sure_its_time_is(model, sync, held_s) -> None:
         assert reading.t_sigma > 1e-5
 
 
-def test_a_reading_that_was_held_up_is_dropped_where_no_clock_tells_its_time() -> None:
+def test_delayed_reading_without_servo_clock_is_dropped() -> None:
     with (arm := FeetechArm(("STS3215",) * 6)).joints:
         read(arm, 60)
         arm.faults.add(1, lambda reply, _: replace(reply, start=reply.start + 2e-3), 1)
@@ -269,13 +269,13 @@ def test_a_reading_that_was_held_up_is_dropped_where_no_clock_tells_its_time() -
 
 
 @given(st.lists(st.floats(0, 8e-3), min_size=60, max_size=200))
-def test_most_readings_of_an_adapter_that_holds_bytes_back_are_kept(unsure) -> None:
+def test_most_readings_of_a_delaying_adapter_are_kept(unsure) -> None:
     punctuality = Punctuality()
     kept = [punctuality.is_usual(width) for width in unsure]
     assert sum(kept) >= len(kept) // 2 - 1
 
 
-def test_six_servos_are_read_two_hundred_times_a_second() -> None:
+def test_six_servos_are_read_at_200_hz() -> None:
     with (arm := FeetechArm(("STS3215",) * 6)).joints:
         begin = arm.clock.now()
         read(arm, 200)

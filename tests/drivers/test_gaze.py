@@ -34,7 +34,7 @@ def dropped(robot: GazingRobot, seconds: float = 3.0) -> str:
     return robot.gaze.complaints[0]
 
 
-def test_the_hand_stays_in_view_on_a_path_on_which_it_leaves_it_without_gaze() -> None:
+def test_gaze_keeps_hand_otherwise_lost_in_view() -> None:
     with (still := GazingRobot()).joints:
         without = still.in_view(still.run(PATH_S, looking=False))
     with (gazing := GazingRobot()).joints:
@@ -44,7 +44,7 @@ def test_the_hand_stays_in_view_on_a_path_on_which_it_leaves_it_without_gaze() -
     assert without.mean() < 0.7
 
 
-def test_the_head_does_not_move_when_its_torque_goes_on() -> None:
+def test_head_stays_still_when_torque_goes_on() -> None:
     with (robot := GazingRobot()).joints:
         before = robot.q()[:2]
         robot.switch_on()
@@ -130,7 +130,7 @@ def truth():
 
 
 @pytest.mark.soak
-def test_the_learnt_model_is_taken_where_it_is_good(truth) -> None:
+def test_good_learnt_model_is_used(truth) -> None:
     nominal = GazingRobot(truth=truth)
     learnt = GazingRobot(learner(nominal.robot, truth, 0.002), truth)
     assert off_middle(learnt) < 0.8 * off_middle(nominal)
@@ -138,7 +138,7 @@ def test_the_learnt_model_is_taken_where_it_is_good(truth) -> None:
 
 
 @pytest.mark.parametrize(("sigma", "support"), [(0.1, True), (0.002, False), (math.nan, True)])
-def test_a_model_that_is_not_good_is_not_taken(truth, sigma, support) -> None:
+def test_uncertain_or_unsupported_model_is_not_used(truth, sigma, support) -> None:
     robot = GazingRobot(learner(GazingRobot().robot, truth, sigma, support), truth)
     with robot.joints:
         robot.switch_on()
@@ -149,7 +149,7 @@ def test_a_model_that_is_not_good_is_not_taken(truth, sigma, support) -> None:
 # --- torque
 
 
-def test_another_mode_is_refused_with_the_command_that_changes_it() -> None:
+def test_wrong_mode_error_names_the_fixing_command() -> None:
     robot = GazingRobot()
     robot.chain.servo(2)["operating_mode"] = CURRENT_MODE
     with robot.joints, pytest.raises(RequestError, match="bodyschema servos operating_mode=3 --joint neck_pitch"):
@@ -164,7 +164,7 @@ def test_a_head_with_a_homing_offset_is_refused() -> None:
         robot.switch_on()
 
 
-def test_a_head_that_was_turned_round_stays_where_it_is() -> None:
+def test_head_turned_by_a_revolution_stays_put() -> None:
     robot = GazingRobot()
     robot.heads[0].turn_by_hand(2 * math.pi)
     robot.chain.servo(1)["torque"] = 0
@@ -175,7 +175,7 @@ def test_a_head_that_was_turned_round_stays_where_it_is() -> None:
         assert robot.heads[0](robot.clock.now()) == pytest.approx(before, abs=0.01)
 
 
-def test_asked_off_and_on_at_once_the_head_stays_where_it_is() -> None:
+def test_head_stays_when_switched_off_and_on_again() -> None:
     robot = GazingRobot()
     robot.heads[0].turn_by_hand(2 * math.pi)
     with robot.joints:
@@ -203,7 +203,7 @@ def test_a_fault_ends_it(bits) -> None:
         assert HEAD[0] in dropped(robot)
 
 
-def test_after_a_kill_the_head_stays_where_its_watchdog_stopped_it() -> None:
+def test_head_stays_at_watchdog_stop_after_a_kill() -> None:
     with (robot := GazingRobot()).joints:
         robot.switch_on()
         robot.run(1.0)
@@ -233,7 +233,7 @@ def often_switched() -> Iterator[None]:
 
 
 @pytest.mark.soak
-def test_cameras_see_where_a_head_was_while_its_servo_turns_it(often_switched) -> None:
+def test_past_head_angle_is_stable_during_concurrent_turning(often_switched) -> None:
     shaft = DrivenShaft(0.5)
     turning = threading.Thread(target=lambda: [shaft(t) for t in range(5_000)])
     turning.start()

@@ -65,7 +65,7 @@ def test_once_dropped_it_stays_dropped_whatever_comes(cycles) -> None:
 
 
 @given(pairs, pairs, pairs)
-def test_a_motion_is_let_pass_only_when_all_of_it_is_finite_and_slow(q, velocity, current) -> None:
+def test_only_finite_and_slow_motion_passes(q, velocity, current) -> None:
     (watching := guard()).begin(0.0)
     passed = not is_dropped(watching, 0.004, motion(0.004, q, velocity, current))
     allowed = np.isfinite([*q, *velocity, *current]).all() and np.abs(velocity).max() <= SPEED
@@ -73,7 +73,7 @@ def test_a_motion_is_let_pass_only_when_all_of_it_is_finite_and_slow(q, velocity
 
 
 @given(st.floats(0.021, 1.0), st.floats(-20, 20))
-def test_a_speed_is_found_from_positions_though_the_servo_says_that_it_stands(dt, speed) -> None:
+def test_speed_limit_also_applies_to_position_differences(dt, speed) -> None:
     (watching := guard()).begin(0.0)
     watching.check(0.001, motion(1.0))
     too_fast = abs(speed * dt) / dt > SPEED
@@ -87,12 +87,12 @@ def test_it_is_let_pass_only_in_time(dt) -> None:
     assert is_dropped(watching, dt, motion(0.0)) == (not 0 <= dt <= HEARTBEAT_S)
 
 
-def test_some_doubtful_readings_are_let_pass_and_more_are_not() -> None:
+def test_guard_drops_after_too_many_doubtful_readings() -> None:
     (watching := guard()).begin(0.0)
     assert [is_dropped(watching, k * 0.01, None) for k in range(1, DOUBTS + 1)] == [False] * (DOUBTS - 1) + [True]
 
 
-def test_a_believed_reading_between_doubtful_ones_starts_the_count_anew() -> None:
+def test_accepted_reading_resets_the_doubt_count() -> None:
     (watching := guard()).begin(0.0)
     told = [None] * (DOUBTS - 1) + [motion(0.0)] + [None] * (DOUBTS - 1)
     assert not any(is_dropped(watching, k * 0.01, each) for k, each in enumerate(told, 1))
@@ -123,7 +123,7 @@ def test_an_alert_ends_it() -> None:
     assert is_dropped(watching, 0.01, motion(0.0, alert=(False, True)))
 
 
-def test_a_short_overcurrent_is_let_pass_and_a_long_one_is_not() -> None:
+def test_only_sustained_overcurrent_is_dropped() -> None:
     (watching := guard()).begin(0.0)
     times = [k * 0.05 for k in range(1, 20)]
     first = next(t for t in times if is_dropped(watching, t, motion(t, current=(0.0, 1.3))))
@@ -131,7 +131,7 @@ def test_a_short_overcurrent_is_let_pass_and_a_long_one_is_not() -> None:
 
 
 @given(st.floats(0, 3), st.tuples(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6)))
-def test_no_current_is_over_its_limit_or_over_the_ramp(after_s, torques) -> None:
+def test_current_stays_within_limit_and_ramp(after_s, torques) -> None:
     (law := currents()).begin(10.0)
     found = law.at(10.0 + after_s, np.array(torques))
     assert (np.abs(found) <= [CURRENT, 0.5]).all()
@@ -148,7 +148,7 @@ def test_before_the_beginning_there_is_no_current(now) -> None:
 
 
 @given(st.integers(0, 1), st.sampled_from([math.nan, math.inf, -math.inf]))
-def test_a_torque_that_is_no_number_gives_no_current(place, wrong) -> None:
+def test_non_finite_torque_gives_no_current(place, wrong) -> None:
     (law := currents()).begin(0.0)
     torques = np.ones(2)
     torques[place] = wrong
@@ -156,7 +156,7 @@ def test_a_torque_that_is_no_number_gives_no_current(place, wrong) -> None:
         law.at(5.0, torques)
 
 
-def test_torques_of_another_number_of_joints_give_no_current() -> None:
+def test_wrong_number_of_torques_gives_no_current() -> None:
     with pytest.raises(Drop):
         currents().at(5.0, frozen_array([1.0]))
 

@@ -31,7 +31,7 @@ def block(language: str, about: str = "") -> str:
 
 @pytest.mark.parametrize("uncommented", [False, True])
 @pytest.mark.parametrize("driver", ["dynamixel", "feetech", "serial_lines"])
-def test_the_tables_for_robot_toml_are_accepted_also_with_all_keys(driver, uncommented) -> None:
+def test_documented_tables_are_accepted_with_all_keys(driver, uncommented) -> None:
     shown = block("toml", driver)
     text = re.sub(r"^# (?=[a-z_]+ =)", "", shown, flags=re.MULTILINE) if uncommented else shown
     config = msgspec.convert(tomllib.loads(text)["drivers"], DriversConfig)
@@ -40,7 +40,7 @@ def test_the_tables_for_robot_toml_are_accepted_also_with_all_keys(driver, uncom
 
 
 @pytest.mark.parametrize("driver", ["feetech", "serial_lines"])
-def test_the_defaults_of_other_drivers_that_are_shown_are_the_defaults(driver) -> None:
+def test_documented_driver_defaults_match_the_code(driver) -> None:
     shown = block("toml", driver)
     plain = getattr(msgspec.convert(tomllib.loads(shown)["drivers"], DriversConfig), driver)
     for key, value in re.findall(r"^# (\w+) = (\S+)", shown.partition("\n\n")[0], flags=re.MULTILINE):

@@ -71,7 +71,7 @@ def test_one_lost_answer_at_opening_keeps_sync_read(make, code) -> None:
     assert arm.joints.health == ()
 
 
-def test_reading_one_by_one_is_told_and_left_again() -> None:
+def test_one_by_one_fallback_is_reported_and_ends() -> None:
     arm = FeetechArm()
     arm.chain.faults = lost = LosesAnswersTo(arm, SYNC_READ, math.inf)
     with arm.joints:
@@ -113,7 +113,7 @@ def late_by(seconds: float):
 
 @pytest.mark.parametrize("model", BUSES)
 @given(late_s=st.floats(3e-3, 0.05), pause_s=st.sampled_from([0.0, 1e-3]))
-def test_a_late_answer_is_never_that_to_the_next_question(model, late_s, pause_s) -> None:
+def test_late_answer_never_answers_the_next_request(model, late_s, pause_s) -> None:
     angles = [0.5]
     bus, clock, faults, servo = rig(model, angles)
     ask = bus.read_request(servo, 1, servo.layout["position"])
@@ -130,7 +130,7 @@ def test_a_late_answer_is_never_that_to_the_next_question(model, late_s, pause_s
 
 
 @pytest.mark.parametrize("model", BUSES)
-def test_a_late_answer_does_not_hold_the_next_question_up(model) -> None:
+def test_late_answer_does_not_delay_the_next_request(model) -> None:
     bus, clock, faults, servo = rig(model, [0.5])
     ask = bus.read_request(servo, 1, servo.layout["position"])
     faults.add(1, late_by(6e-3), 1)
@@ -157,7 +157,7 @@ class RepeatsItself:
 @pytest.mark.parametrize(
     "make", [MAKES["feetech"], MAKES["SCS"], MAKES["protocol 1"]], ids=["STS", "SCS", "protocol 1"]
 )
-def test_an_earlier_answer_in_place_of_the_own_one_is_seldom_believed(make) -> None:
+def test_repeated_earlier_answer_is_rarely_accepted(make) -> None:
     arm = make()
     wrong = 0
     with arm.joints:
@@ -169,7 +169,7 @@ def test_an_earlier_answer_in_place_of_the_own_one_is_seldom_believed(make) -> N
 
 
 @pytest.mark.parametrize("loss", [0.02, 0.05])
-def test_lost_answers_leave_the_readings_that_they_did_not_strike(loss) -> None:
+def test_lost_answers_cost_only_the_readings_struck(loss) -> None:
     arm = FeetechArm(("STS3215",) * 6)
     arm.chain.faults = Storm({"mute": (loss, mute)}, Random(3))
     with arm.joints:

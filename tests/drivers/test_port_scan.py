@@ -118,7 +118,7 @@ def test_both_makes_are_told_apart_on_one_bus() -> None:
 
 
 @pytest.mark.parametrize("number", [1, 12, 300, 65535])
-def test_a_feetech_servo_of_an_unknown_model_is_told_with_its_number(number) -> None:
+def test_unknown_feetech_model_is_reported_by_number(number) -> None:
     strange = feetech("STS3215", 3)
     strange["model"] = number
     (told,) = found(strange, bauds=[1_000_000])
@@ -127,12 +127,12 @@ def test_a_feetech_servo_of_an_unknown_model_is_told_with_its_number(number) -> 
     )  # fmt: skip
 
 
-def test_two_feetech_servos_with_one_id_are_told() -> None:
+def test_duplicate_feetech_id_is_reported() -> None:
     told = found(feetech("STS3215", 3, rad=0.3), feetech("STS3215", 3, rad=0.7), feetech("STS3215", 5))
     assert [(s.id, s.is_double) for s in told] == [(3, True), (5, False)]
 
 
-def test_what_a_feetech_servo_tells_of_itself_is_told() -> None:
+def test_feetech_scan_reports_firmware_state_and_troubles() -> None:
     holding = feetech("STS3215", 3)
     holding["torque"] = 1
     holding.fail(0x04)
@@ -146,33 +146,33 @@ def test_what_a_feetech_servo_tells_of_itself_is_told() -> None:
     assert told.troubles == ("it is too hot: let it cool down",)
 
 
-def test_a_servo_at_a_rate_that_robot_toml_cannot_name_is_told() -> None:
+def test_unsupported_rate_is_reported_as_trouble() -> None:
     (told,) = found(servo("MX-28", 3, 500_000), bauds=())
     assert told.troubles == ("robot.toml has no such rate: give it 1,000,000 bit/s",)
 
 
-def test_what_a_servo_tells_of_itself_is_told() -> None:
+def test_scan_reports_firmware_state_and_voltage() -> None:
     (told,) = found(servo("XM430-W350", 3))
     assert (told.firmware, told.temperature_c, told.has_torque, told.troubles) == ("46", 31.0, False, ())
     assert told.voltage_v == pytest.approx(12.0)
 
 
 @pytest.mark.parametrize("model", ["XM430-W350", "MX-28"])
-def test_an_overloaded_servo_is_told_with_what_to_do(model) -> None:
+def test_overloaded_servo_is_reported_with_its_remedy(model) -> None:
     sick = servo(model, 3)
     sick.fail(0x20)
     assert "it is overloaded: free the joint" in found(sick)[0].troubles[0]
 
 
 @pytest.mark.parametrize("model", ["XM430-W350", "MX-28"])
-def test_torque_that_is_on_is_told_and_left_on(model) -> None:
+def test_active_torque_is_reported_and_left_on(model) -> None:
     holding = servo(model, 3)
     holding["torque"] = 1
     assert found(holding)[0].has_torque is True
     assert holding["torque"] == 1
 
 
-def test_two_servos_of_one_model_with_one_id_are_told() -> None:
+def test_duplicate_id_of_one_model_is_reported() -> None:
     twins = [Servo(BY_NAME["XM430-W350"], 3, lambda _, q=q: q, booted_s=q) for q in (0.3, 0.7)]
     (told,) = found(*twins)
     assert told.is_double
@@ -180,18 +180,18 @@ def test_two_servos_of_one_model_with_one_id_are_told() -> None:
 
 
 @pytest.mark.parametrize(("one", "other"), [("XM430-W350", "XL330-M288"), ("MX-28", "AX-12A")])
-def test_two_servos_of_two_models_with_one_id_are_told(one, other) -> None:
+def test_duplicate_id_of_two_models_is_reported(one, other) -> None:
     told = found(servo(one, 3), servo(other, 3), servo(one, 5))
     assert [(s.id, s.is_double) for s in told] == [(3, True), (5, False)]
 
 
-def test_a_servo_that_answers_no_read_is_told_with_its_register() -> None:
+def test_servo_answering_no_read_names_its_register() -> None:
     silent = servo("XM430-W350", 3)
     silent["status_return"] = 0
     assert "Status Return Level (68" in found(silent)[0].troubles[0]
 
 
-def test_a_servo_of_either_make_that_answers_no_read_is_told_of_both() -> None:
+def test_servo_answering_no_read_names_both_possible_makes() -> None:
     silent = servo("MX-28", 3)
     silent["status_return"] = 0
     dynamixel_1, of_feetech = found(silent)[0].troubles
@@ -199,7 +199,7 @@ def test_a_servo_of_either_make_that_answers_no_read_is_told_of_both() -> None:
     assert of_feetech == f"if Feetech: {FeetechPackets.pinged_only}"
 
 
-def test_a_feetech_servo_without_read_is_not_told_of_its_level() -> None:
+def test_feetech_servo_answering_no_read_has_no_trouble() -> None:
     assert "Status Return" not in FeetechPackets.pinged_only
     level_0 = feetech("STS3215", 3)
     level_0["status_return"] = 0
@@ -214,13 +214,13 @@ class XL320(Servo):
         return (Error.NONE, table[address : address + size]) if address + size <= len(table) else (Error.ACCESS, b"")
 
 
-def test_an_xl_320_is_named_and_told_to_have_no_driver() -> None:
+def test_xl_320_is_named_as_without_driver() -> None:
     told = found(XL320(BY_NAME["XL330-M288"], 5, lambda _: 0.0), servo("XL330-M288", 6), bauds=[1_000_000])
     assert [(s.id, s.model) for s in told] == [(5, "XL-320"), (6, "XL330-M288")]
     assert told[0].troubles[0].startswith("no driver reads an XL-320")
 
 
-def test_a_scan_writes_to_nobody() -> None:
+def test_scan_writes_to_no_servo() -> None:
     bench = Bench([servo("XM430-W350", 1), servo("MX-28", 4), feetech("STS3215", 5)])
     bench.scan()
     told = instructions_in(bench.sent)[0]
@@ -234,14 +234,14 @@ def test_all_rates_take_less_than_15_s() -> None:
     assert bench.clock.now() - begin < 15.0
 
 
-def test_what_is_being_done_is_said_for_each_rate() -> None:
+def test_progress_is_reported_for_each_rate() -> None:
     bench = Bench([servo("XM430-W350", 1)])
     bench.scan(1_000_000, 57_600)
     assert bench.said[-1] == "bus: Dynamixel 1.0 and Feetech at 57,600 bit/s; 1 servo so far"
     assert len(bench.said) == 4
 
 
-def test_a_port_that_is_lost_keeps_what_was_found() -> None:
+def test_lost_port_keeps_the_servos_found() -> None:
     bench = Bench([servo("XM430-W350", 1)])
 
     def opened(port, baud, clock):
@@ -254,7 +254,7 @@ def test_a_port_that_is_lost_keeps_what_was_found() -> None:
 
 
 @pytest.mark.usefixtures("patient_host")
-def test_a_scan_of_a_real_port_finds_its_servos(tmp_path: Path) -> None:
+def test_scan_of_a_pseudo_terminal_finds_its_servos(tmp_path: Path) -> None:
     there = [(1, "XM430-W350"), (2, "MX-28")]
     servos = [servo("XM430-W350", 1, booted_s=0.0), servo("MX-28", 2)]
     port = str(tmp_path / "bus")
@@ -263,7 +263,7 @@ def test_a_scan_of_a_real_port_finds_its_servos(tmp_path: Path) -> None:
     assert [(s.id, s.model) for s in told.servos] == there
 
 
-def test_ports_are_named_by_what_stays_the_same(tmp_path: Path) -> None:
+def test_ports_get_their_stable_names(tmp_path: Path) -> None:
     for name in ("ttyUSB0", "ttyACM3", "ttyS0"):
         (tmp_path / "dev").mkdir(exist_ok=True)
         (tmp_path / "dev" / name).touch()
@@ -278,7 +278,7 @@ def test_a_machine_without_adapters_has_no_ports(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("lost", [1, 2, 3, 4])
-def test_a_servo_is_found_although_one_of_its_answers_is_lost(lost) -> None:
+def test_servo_is_found_despite_one_lost_answer(lost) -> None:
     answers = count(1)
 
     def lose(reply: Reply) -> Reply:

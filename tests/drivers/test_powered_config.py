@@ -54,7 +54,7 @@ def test_nothing_has_torque_by_default() -> None:
 
 
 @pytest.mark.parametrize("model", ["XL430-W250", "AX-12A", "MX-28", "MX-106", "MX-28(2.0)", "XC430-W240"])
-def test_a_servo_without_current_control_is_refused_by_its_joint(model) -> None:
+def test_servo_without_current_control_error_names_joint(model) -> None:
     with pytest.raises(ConfigError, match=r"joint 'shoulder': a .* has no current control") as refused:
         check(floating(), model=model)
     assert model in str(refused.value)
@@ -78,7 +78,7 @@ def test_an_unknown_torque_constant_has_to_be_given() -> None:
         (gazing(more="limits_deg = { shoulder = [10, -10] }"), "", "the lower limit is not below the upper"),
     ],
 )
-def test_a_mistake_is_told_with_its_line(tables, settings, message) -> None:
+def test_mistake_is_reported_with_its_line(tables, settings, message) -> None:
     with pytest.raises(ConfigError, match=message) as refused:
         check(tables, settings=settings)
     assert refused.value.line is not None
@@ -106,12 +106,12 @@ def test_the_watchdog_is_no_shorter_than_the_heartbeat(heartbeat_ms, watchdog) -
     assert config.zero_force.watchdog == watchdog
 
 
-def test_one_model_with_current_control_has_no_torque_constant() -> None:
+def test_one_current_controlled_model_lacks_a_torque_constant() -> None:
     able = {model.name for model in MODELS if model.protocol == 2 and model.current_unit is not None}
     assert able - set(TORQUE_AT_CURRENT) == {"XW540-H260"}  # as in docs/zero_force.md
 
 
-def test_each_torque_constant_is_of_a_servo_with_current_control() -> None:
+def test_torque_constants_belong_to_current_controlled_servos() -> None:
     for name in TORQUE_AT_CURRENT:
         assert BY_NAME[name].current_unit is not None
         torque, current = TORQUE_AT_CURRENT[name]

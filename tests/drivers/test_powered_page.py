@@ -26,7 +26,7 @@ def block(name: str) -> str:
 
 
 @pytest.mark.parametrize("name", TABLES)
-def test_all_keys_that_are_shown_are_known_and_no_key_is_missing(name) -> None:
+def test_documented_keys_match_the_config_fields(name) -> None:
     shown = re.sub(r"^# (?=[a-z_]+ =)", "", block(name), flags=re.MULTILINE)
     table = tomllib.loads(shown)["drivers"]["dynamixel"][name]
     msgspec.convert(table, TABLES[name])
@@ -43,7 +43,7 @@ def test_the_defaults_that_are_shown_are_the_defaults(name) -> None:
     assert len(shown) >= 3
 
 
-def test_the_messages_that_are_shown_are_those_of_the_code() -> None:
+def test_documented_messages_exist_in_the_code() -> None:
     body = PAGE.partition("## Messages\n")[2].partition("\n## ")[0]
     shown = [
         text

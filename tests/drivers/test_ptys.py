@@ -110,7 +110,7 @@ def test_readings_are_right_with_wire_time(make: Make, tmp_path) -> None:
 
 
 @EACH
-def test_nobody_else_of_us_opens_the_port(make: Make, tmp_path) -> None:
+def test_open_port_refuses_a_second_driver(make: Make, tmp_path) -> None:
     with make(tmp_path) as (_, driver), patiently(driver()) as joints:
         wait_for_reading(joints)
         with pytest.raises(SourceError, match="is in use by another program"):
@@ -118,7 +118,7 @@ def test_nobody_else_of_us_opens_the_port(make: Make, tmp_path) -> None:
 
 
 @EACH
-def test_an_unplugged_port_is_told_once_and_back_after_the_replug(make: Make, tmp_path, caplog) -> None:
+def test_unplugged_port_is_reported_once_and_recovers(make: Make, tmp_path, caplog) -> None:
     with make(tmp_path) as (shell, driver):
         joints = driver()
         reconnecting = ReconnectingSource(joints, "the encoders", SystemClock())
@@ -139,7 +139,7 @@ def test_an_unplugged_port_is_told_once_and_back_after_the_replug(make: Make, tm
     assert after.t > before.t
 
 
-def test_a_board_that_nobody_reads_for_long_can_be_unplugged_and_is_read_again(tmp_path) -> None:
+def test_long_unread_board_is_readable_after_replug(tmp_path) -> None:
     angles = {name: (4096, swing(id)) for name, id in zip(NAMES, IDS, strict=True)}
     board = EncoderBoard(angles, rate_hz=100.0, begun_s=time.monotonic() - 60.0)  # a minute to say at once
     with PtyShell(board, tmp_path / "bus") as shell:

@@ -56,7 +56,7 @@ def test_both_sides_are_sources() -> None:
     assert isinstance(replay.marker, MarkerSource)
 
 
-def test_every_fix_has_a_reading_with_its_rows_joint_angles_at_its_time() -> None:
+def test_each_row_yields_simultaneous_fix_and_reading() -> None:
     played = recording(20)
     readings, fixes = play(Replay(played, speed=0))
     assert [reading.t for reading in readings] == [fix.t for fix in fixes]
@@ -91,7 +91,7 @@ def test_times_go_on_where_the_clock_was_reset() -> None:
     assert np.diff(t).tolist() == [1.0, RESET_GAP_S, 2.0]
 
 
-def test_the_end_is_said_by_both_sides() -> None:
+def test_both_sides_report_the_end() -> None:
     replay = Replay(recording(3), speed=0)
     with replay.joints as joints, replay.marker as marker:
         for source in (joints, marker):
@@ -140,7 +140,7 @@ def test_two_threads_play_it_through() -> None:
 
 
 @pytest.mark.parametrize(("speed", "seconds"), [(1.0, 2.0), (4.0, 0.5)])
-def test_a_row_is_played_when_its_time_has_come(speed: float, seconds: float) -> None:
+def test_row_is_played_at_its_time(speed: float, seconds: float) -> None:
     clock = Hand()
     replay = Replay(recording(2, t=[10.0, 12.0]), speed=speed, now=clock)
     with replay.marker as marker:
@@ -165,7 +165,7 @@ def test_a_source_that_is_not_open_refuses(source: Callable[[Replay], JointSourc
         source(Replay(recording())).read(0.0)
 
 
-def test_without_any_word_on_noise_a_millimetre_is_taken() -> None:
+def test_default_noise_is_one_millimetre() -> None:
     _, fixes = play(Replay(recording(1), speed=0))
     assert np.allclose(fixes[0].cov, np.eye(3) * 1e-6, rtol=1e-12, atol=0)
 

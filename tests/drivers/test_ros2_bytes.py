@@ -95,11 +95,11 @@ ZID, CLI = "cb6e75cf8194a4d81370b618e0a4ed07", "_ros2cli_413596"
 
 
 @pytest.mark.parametrize(("data", "message"), [(ROSBAGS_LITTLE, TWO), (ROSBAGS_BIG, TWO), (ROSBAGS_GERMAN, GERMAN)])
-def test_what_rosbags_wrote_is_read(data, message) -> None:
+def test_message_written_by_rosbags_is_read(data, message) -> None:
     assert decode_joint_state(data) == message
 
 
-def test_what_rclpy_wrote_is_read_whatever_its_padding() -> None:
+def test_message_written_by_rclpy_is_read_despite_padding() -> None:
     message = decode_joint_state(RCLPY)
     assert message.header == Header(STAMP_NS, "base_link")
     assert message.names[::5] == ("shoulder_pan_joint", "wrist_3_joint")
@@ -107,13 +107,13 @@ def test_what_rclpy_wrote_is_read_whatever_its_padding() -> None:
     assert message.velocities == message.efforts == (0.0,) * 6
 
 
-def test_the_bench_writes_what_rosbags_writes() -> None:
+def test_bench_message_matches_rosbags() -> None:
     assert encode_joint_state(TWO) == ROSBAGS_LITTLE
     assert encode_joint_state(TWO, big_endian=True) == ROSBAGS_BIG
     assert encode_joint_state(GERMAN) == ROSBAGS_GERMAN
 
 
-def test_an_empty_text_may_do_without_its_zero_byte() -> None:
+def test_empty_text_needs_no_zero_byte() -> None:
     data = struct.pack("<4sIIIIIII", b"\0\1\0\0", 5, 0, 0, 0, 0, 0, 0)
     assert decode_joint_state(data) == JointState(Header(5 * NANO), ())
 
@@ -141,7 +141,7 @@ def test_a_point_is_written_as_rosbags_writes_it() -> None:
     assert encode_point(Header(STAMP_NS, "base_link"), (0.1, -0.2, 0.3)) == ROSBAGS_POINT
 
 
-def test_a_pose_is_written_as_rmw_cyclonedds_writes_it() -> None:
+def test_pose_bytes_match_rmw_cyclonedds() -> None:
     covariance = tuple(0.1 if place % 7 == 0 else 0.0 for place in range(36))
     turn = (0.0, 0.0, math.sin(0.5), math.cos(0.5))
     assert encode_pose(Header(7 * NANO + 8, "map"), (1.5, -2.25, 0.0), turn, covariance) == CYCLONE_POSE
@@ -162,7 +162,7 @@ def test_anything_after_the_end_is_refused() -> None:
         decode_joint_state(ROSBAGS_LITTLE + b"\0")
 
 
-def test_a_message_that_is_too_long_is_refused_unread() -> None:
+def test_oversized_message_is_refused_unread() -> None:
     with pytest.raises(Malformed, match="more than a message"):
         decode_joint_state(bytes(LARGEST_MESSAGE + 1))
 
@@ -173,19 +173,19 @@ def test_other_representations_are_refused(representation) -> None:
         decode_joint_state(representation + ROSBAGS_LITTLE[2:])
 
 
-def test_lengths_beyond_the_message_are_refused_before_anything_is_read() -> None:
+def test_length_beyond_the_message_is_refused() -> None:
     data = bytearray(ROSBAGS_LITTLE)
     data[12:16] = b"\xff\xff\xff\xff"
     with pytest.raises(Malformed, match="4294967295 elements"):
         decode_joint_state(bytes(data))
 
 
-def test_values_that_are_not_one_for_each_name_are_refused() -> None:
+def test_value_count_must_match_name_count() -> None:
     with pytest.raises(Malformed, match="2 names, but 3 values"):
         decode_joint_state(encode_joint_state(JointState(Header(1), ("a", "b"), (1.0, 2.0, 3.0))))
 
 
-def test_a_text_with_a_zero_byte_inside_is_refused() -> None:
+def test_text_with_inner_zero_byte_is_refused() -> None:
     with pytest.raises(Malformed, match="does not end"):
         decode_joint_state(ROSBAGS_LITTLE.replace(b"elbow", b"el\0ow"))
 
@@ -205,7 +205,7 @@ def test_any_bytes_are_a_message_or_refused(data) -> None:
 
 
 @given(st.data())
-def test_a_message_with_other_bytes_somewhere_is_a_message_or_refused(data) -> None:
+def test_corrupted_message_is_decoded_or_refused(data) -> None:
     spoilt = bytearray(data.draw(st.sampled_from([ROSBAGS_LITTLE, ROSBAGS_BIG, RCLPY])))
     for _ in range(data.draw(st.integers(1, 4))):
         at = data.draw(st.integers(0, len(spoilt) - 1))
@@ -232,12 +232,12 @@ def test_every_message_is_read_as_it_was_written(names, stamp_ns, frame, big_end
 # --- rmw_zenoh
 
 
-def test_an_attachment_is_made_and_read_as_rmw_zenoh_does() -> None:
+def test_attachment_is_encoded_and_decoded_like_rmw_zenoh() -> None:
     assert rmw.attachment(0x1B, 0x18C67C893AC5A140, GID) == ATTACHMENT
     assert rmw.sender_of(ATTACHMENT) == (GID, 0x1B)
 
 
-def test_an_attachment_is_what_zenoh_s_own_serialiser_makes() -> None:
+def test_attachment_matches_zenoh_s_own_serialiser() -> None:
     import zenoh.ext
 
     made = zenoh.ext.z_serialize((zenoh.ext.Int64(7), zenoh.ext.Int64(STAMP_NS), GID))
@@ -266,12 +266,12 @@ def test_a_node_has_the_token_that_was_caught() -> None:
     assert rmw.node_token(0, ZID, CLI) == f"@ros2_lv/0/{ZID}/0/0/NN/%/%/{CLI}"
 
 
-def test_a_publisher_has_the_token_that_was_caught_but_for_its_number() -> None:
+def test_publisher_token_matches_capture_except_entity_number() -> None:
     caught = f"@ros2_lv/0/{ZID}/0/4/MP/%/%/{CLI}/%chatter/{STRING.name}/{STRING.digest}/::,10:,:,:,,"
     assert rmw.publisher_token(0, ZID, CLI, "/chatter", STRING) == caught.replace("/0/4/MP/", "/0/1/MP/")
 
 
-def test_the_topics_of_tokens_are_told() -> None:
+def test_topics_are_extracted_from_tokens() -> None:
     token = rmw.publisher_token(3, ZID, CLI, "/arm/tip", POINT_STAMPED)
     known = [token, rmw.node_token(3, ZID, CLI), "@ros2_lv/x", "", token.replace("lv/3", "lv/three")]
     assert list(rmw.topics_in(known)) == [rmw.Topic(3, "/arm/tip", POINT_STAMPED.name)]
@@ -286,6 +286,6 @@ def test_any_other_tokens_are_passed_over(tokens) -> None:
 
 
 @given(parts)
-def test_a_token_of_whatever_domain_is_a_topic_or_passed_over(domain) -> None:
+def test_token_of_any_domain_is_topic_or_ignored(domain) -> None:
     token = rmw.publisher_token(3, ZID, CLI, "/arm/tip", POINT_STAMPED).replace("lv/3", f"lv/{domain}")
     assert {topic.name for topic in rmw.topics_in([token])} <= {"/arm/tip"}

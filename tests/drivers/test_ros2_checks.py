@@ -20,28 +20,28 @@ def checks_of(robot: Robot, joints: tuple[str, ...] = JOINTS) -> dict[str, Check
     return {check.subject: check for check in told}
 
 
-def test_a_robot_that_is_well_has_its_rate_told() -> None:
+def test_healthy_robot_is_ok_with_its_rate() -> None:
     told = checks_of(Robot())
     assert {check.state for check in told.values()} == {"ok"}
     assert told["rate"].said in {"99 readings/s come", "100 readings/s come"}
     assert told["errors"].said.startswith("0 of ")
 
 
-def test_a_joint_that_is_not_told_is_wrong_and_the_remedy_is_its_name() -> None:
+def test_unpublished_joint_is_wrong_and_fix_maps_names() -> None:
     told = checks_of(Robot(), ("elbow", "pan", "wrist"))
     assert told["joint states"].state == "wrong"
     assert "does not name wrist" in told["joint states"].said
     assert told["joint states"].fix == "Say in [drivers.ros2] names what ROS calls each joint"
 
 
-def test_a_robot_that_says_nothing_is_wrong_within_three_seconds() -> None:
+def test_silent_robot_is_wrong_within_three_seconds() -> None:
     robot = Robot([])
     begin = robot.clock.now()
     assert checks_of(robot)["joint states"].state == "wrong"
     assert robot.clock.now() - begin < 3.0
 
 
-def test_a_router_that_is_not_there_is_wrong_and_the_remedy_starts_it() -> None:
+def test_missing_router_is_wrong_and_fix_starts_it() -> None:
     def refuse(*_: object) -> None:
         raise SourceLost("no zenoh router answers on tcp/h:7447. Start it on the robot: ros2 run ...", retry_s=1.0)
 

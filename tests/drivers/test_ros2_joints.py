@@ -31,7 +31,7 @@ def said(name: str, *joints: str, rate_hz: float = 100.0, **settings) -> Node:
 # --- readings
 
 
-def test_joints_come_in_our_order_with_the_time_of_their_stamp() -> None:
+def test_joints_follow_configured_order_and_stamp_time() -> None:
     robot = Robot()
     with robot.joints:
         readings = robot.read(1.005)
@@ -46,7 +46,7 @@ def test_joints_may_have_other_names_in_ros() -> None:
         assert max(map(robot.error, robot.read(0.5))) < 1e-9
 
 
-def test_joints_of_the_robot_that_are_not_ours_are_passed_over() -> None:
+def test_unconfigured_joints_are_ignored() -> None:
     robot = Robot(joints=("pan",))
     with robot.joints:
         assert {len(reading.q) for reading in robot.read(0.5)} == {1}
@@ -60,7 +60,7 @@ def test_a_sliding_joint_has_a_gate_in_metres() -> None:
         assert sliding.read(0.055) == []
 
 
-def test_messages_that_take_their_time_are_told_at_the_time_of_their_stamps() -> None:
+def test_delayed_messages_are_timed_by_their_stamps() -> None:
     rng = Random(3)
     robot = Robot(delay=lambda: 0.002 + rng.expovariate(500.0))
     with robot.joints:
@@ -78,20 +78,20 @@ def test_the_time_sigma_holds_from_the_first_reading(delays_per_s) -> None:
     assert max(abs(reading.t - reading.q[0]) - 3 * reading.t_sigma for reading in readings) < 0.0
 
 
-def test_the_time_sigma_is_about_a_millisecond_on_a_quick_network() -> None:
+def test_time_sigma_is_a_millisecond_on_quick_network() -> None:
     robot = Robot()
     with robot.joints:
         assert 0.1e-3 < robot.read(5.0)[-1].t_sigma < 1.5e-3
 
 
-def test_the_time_sigma_grows_with_the_scatter_of_the_delays() -> None:
+def test_time_sigma_grows_with_delay_scatter() -> None:
     rng = Random(3)
     robot = Robot(delay=lambda: rng.uniform(0.0, 0.02))
     with robot.joints:
         assert 5e-3 < robot.read(5.0)[-1].t_sigma < 15e-3
 
 
-def test_of_joints_of_several_nodes_the_least_sure_time_counts() -> None:
+def test_least_certain_node_sets_the_time_sigma() -> None:
     robot = Robot([said("a", "pan", "lift"), said("b", "elbow", rate_hz=10.0)])
     with robot.joints:
         slow = robot.read(3.0)[-1].t_sigma
@@ -110,7 +110,7 @@ def test_a_clock_of_another_rate_is_followed(drift) -> None:
     assert max(map(robot.error, readings)) < FASTEST * 0.003
 
 
-def test_the_robot_s_own_stamp_of_a_reading_is_told() -> None:
+def test_reading_keeps_the_robot_s_own_stamp() -> None:
     robot = Robot()
     with robot.joints:
         reading = robot.read(0.1)[-1]
@@ -120,7 +120,7 @@ def test_the_robot_s_own_stamp_of_a_reading_is_told() -> None:
 # --- joints of several nodes
 
 
-def test_joints_of_several_nodes_are_brought_to_one_time() -> None:
+def test_joints_of_several_nodes_share_one_time() -> None:
     robot = Robot([said("a", "pan", "lift"), said("b", "elbow", rate_hz=31.0)])
     with robot.joints:
         readings = robot.read(5.0)
@@ -135,7 +135,7 @@ def test_nodes_may_have_clocks_of_their_own() -> None:
         assert max(map(robot.error, robot.read(2.0))) < 1e-3
 
 
-def test_positions_too_far_apart_in_time_are_not_brought_together() -> None:
+def test_positions_far_apart_in_time_are_not_merged() -> None:
     robot = Robot([said("a", "pan", "lift"), said("b", "elbow", rate_hz=3.0)])
     with robot.joints:
         readings = robot.read(3.0)
@@ -143,7 +143,7 @@ def test_positions_too_far_apart_in_time_are_not_brought_together() -> None:
     assert robot.joints.refused[Refusal.GAP] > 0
 
 
-def test_of_two_nodes_with_the_same_joint_the_first_is_believed() -> None:
+def test_first_node_wins_for_a_shared_joint() -> None:
     other = Node({"pan": lambda t: 0.0}, 100.0, name="gui")
     robot = Robot([said("a", *PATHS), other])
     with robot.joints:
@@ -151,7 +151,7 @@ def test_of_two_nodes_with_the_same_joint_the_first_is_believed() -> None:
     assert robot.joints.refused[Refusal.RIVAL] > 90
 
 
-def test_a_node_that_was_restarted_is_believed_again_after_a_second() -> None:
+def test_restarted_node_is_accepted_after_a_second() -> None:
     robot = Robot([said("a", *PATHS)])
     with robot.joints:
         robot.read(1.0)
@@ -173,7 +173,7 @@ def test_a_node_that_was_restarted_is_believed_again_after_a_second() -> None:
         (Fault.CLOCK_JUMP, {Refusal.DELAYED, Refusal.OUT_OF_ORDER}),
     ],
 )
-def test_a_spoilt_message_is_refused_counted_and_costs_no_other(fault, reasons) -> None:
+def test_faulty_message_is_counted_and_costs_only_itself(fault, reasons) -> None:
     robot = Robot()
     with robot.joints:
         robot.read(1.005)
@@ -185,7 +185,7 @@ def test_a_spoilt_message_is_refused_counted_and_costs_no_other(fault, reasons) 
     assert set(robot.joints.refused) <= reasons
 
 
-def test_a_message_without_a_joint_costs_no_more_than_itself() -> None:
+def test_message_missing_a_joint_costs_only_itself() -> None:
     robot = Robot()
     with robot.joints:
         robot.read(1.005)
@@ -196,7 +196,7 @@ def test_a_message_without_a_joint_costs_no_more_than_itself() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 3))])
-def test_no_wrong_reading_is_believed_among_faults_of_many_kinds(seed) -> None:
+def test_mixed_faults_yield_no_wrong_reading(seed) -> None:
     kinds = tuple(fault for fault in Fault if fault not in SEEN_BY_THE_GATE)
     robot = Robot(share=0.2, kinds=kinds, seed=seed)
     with robot.joints:
@@ -208,7 +208,7 @@ def test_no_wrong_reading_is_believed_among_faults_of_many_kinds(seed) -> None:
 
 
 @pytest.mark.parametrize("kind", SEEN_BY_THE_GATE)
-def test_what_only_the_gate_can_see_is_wrong_by_no_more_than_a_joint_can_move(kind) -> None:
+def test_speed_gate_bounds_error_of_otherwise_undetected_faults(kind) -> None:
     robot = Robot(share=0.2, kinds=(kind,))
     with robot.joints:
         readings = robot.read(10.0)
@@ -229,7 +229,7 @@ def test_stamps_that_are_zero_are_refused() -> None:
     ("names", "positions", "reason"),
     [(("pan", "pan"), (0.0, 1.0), Refusal.TWICE), (("pan",), (), Refusal.NO_POSITIONS)],
 )
-def test_messages_that_do_not_tell_where_a_joint_is_are_refused(names, positions, reason) -> None:
+def test_ambiguous_or_missing_positions_are_refused(names, positions, reason) -> None:
     robot = Robot([], joints=("pan",))
     robot.link.receive = feed(robot, [JointState(Header(5), names, positions)])
     with robot.joints:
@@ -247,7 +247,7 @@ def feed(robot: Robot, messages: list[JointState]):
     return receive
 
 
-def test_each_reason_is_said_once(caplog) -> None:
+def test_each_refusal_reason_is_reported_once(caplog) -> None:
     robot = Robot(share=0.5, kinds=(Fault.NAN,))
     with robot.joints, caplog.at_level(logging.WARNING):
         robot.read(5.0)
@@ -276,7 +276,7 @@ def test_any_number_of_strangers_costs_bounded_memory() -> None:
 
 
 @pytest.mark.parametrize("seconds", [-3600.0, -7.0, 0.5, 3600.0])
-def test_when_its_clock_is_set_the_new_time_is_learnt_within_a_second_or_so(seconds) -> None:
+def test_clock_change_is_learnt_within_about_a_second(seconds) -> None:
     robot = Robot()
     with robot.joints:
         robot.read(1.0)
@@ -287,7 +287,7 @@ def test_when_its_clock_is_set_the_new_time_is_learnt_within_a_second_or_so(seco
     assert max(map(robot.error, readings)) < 1e-6
 
 
-def test_a_clock_that_is_set_back_a_little_looks_like_a_slow_network_for_ten_seconds() -> None:
+def test_small_backward_clock_step_costs_ten_seconds() -> None:
     robot = Robot()
     with robot.joints:
         robot.read(1.0)
@@ -299,7 +299,7 @@ def test_a_clock_that_is_set_back_a_little_looks_like_a_slow_network_for_ten_sec
     assert max(map(robot.error, readings)) < 1e-6
 
 
-def test_when_the_network_is_held_up_nothing_is_told_at_a_wrong_time_and_all_is_well_after() -> None:
+def test_stalled_network_gives_no_wrong_times_and_recovers() -> None:
     robot, begin = Robot(), 100.0
     robot.link._delay = lambda: max(0.0, 2.0 - (robot.link._due[0][0] - begin - 3.0)) if stalled(robot, begin) else 0.0
     with robot.joints:
@@ -309,7 +309,7 @@ def test_when_the_network_is_held_up_nothing_is_told_at_a_wrong_time_and_all_is_
     assert set(robot.joints.refused) == {Refusal.DELAYED}
 
 
-def test_a_network_that_stutters_about_the_longest_delay_does_not_shift_the_time() -> None:
+def test_stuttering_network_does_not_shift_the_time() -> None:
     rng = Random(5)
     robot = Robot(delay=lambda: rng.choice((0.0,) * 30 + (0.08, 0.0995, 0.1, 0.1005, 0.15)))
     with robot.joints:
@@ -322,7 +322,7 @@ def stalled(robot: Robot, begin: float) -> bool:
     return 3.0 <= robot.link._due[0][0] - begin < 5.0
 
 
-def test_a_joint_that_is_suddenly_somewhere_else_ends_the_opening() -> None:
+def test_sudden_joint_jump_is_a_loss() -> None:
     robot = Robot(paths=PATHS | {"pan": lambda t: 0.0 if t < 101.0 else 2.0})
     with robot.joints, pytest.raises(SourceLost, match="suddenly somewhere else"):
         robot.read(2.0)
@@ -348,7 +348,7 @@ def test_a_robot_that_falls_silent_is_waited_for() -> None:
     assert robot.joints.health == ()
 
 
-def test_reading_what_is_not_open_is_an_error() -> None:
+def test_reading_an_unopened_source_is_an_error() -> None:
     with pytest.raises(SourceError):
         Robot().joints.read(0.1)
 
@@ -362,12 +362,12 @@ def complaint(robot: Robot) -> str:
         return "; ".join(robot.joints.health)
 
 
-def test_the_names_that_come_are_told_where_ours_does_not() -> None:
+def test_missing_joint_complaint_lists_published_names() -> None:
     said_of_it = complaint(Robot(joints=("pan", "tilt")))
     assert "does not name tilt; it names elbow, lift, pan" in said_of_it
 
 
-def test_what_is_wrong_with_all_messages_is_told() -> None:
+def test_complaint_names_the_fault_of_all_messages() -> None:
     assert "not finite" in complaint(Robot(share=1.0, kinds=(Fault.NAN,)))
 
 
@@ -381,7 +381,7 @@ def test_what_is_wrong_with_all_messages_is_told() -> None:
         ("", "nothing publishes /joint_states at the router"),
     ],
 )
-def test_what_the_router_knows_is_told_where_nothing_comes(token, says) -> None:
+def test_silence_complaint_names_topics_known_to_router(token, says) -> None:
     robot = Robot([])
     robot.link.known = [token]
     assert says in complaint(robot)

@@ -24,7 +24,7 @@ def block(language: str) -> str:
 
 
 @pytest.mark.parametrize("uncommented", [False, True])
-def test_the_tables_for_robot_toml_are_accepted_also_with_all_keys(uncommented) -> None:
+def test_documented_tables_are_accepted_with_all_keys(uncommented) -> None:
     text = re.sub(r"^# (?=[a-z_]+ =)", "", block("toml"), flags=re.MULTILINE) if uncommented else block("toml")
     config = msgspec.convert(tomllib.loads(text)["drivers"], DriversConfig)
     config.check(["shoulder"], Path("robot.toml"), text)
@@ -40,7 +40,7 @@ def test_the_defaults_that_are_shown_are_the_defaults() -> None:
 
 
 @pytest.mark.parametrize("message", MESSAGES)
-def test_the_messages_that_are_explained_are_those_of_the_driver(message) -> None:
+def test_documented_messages_exist_in_the_driver(message) -> None:
     assert all(part in CODE for part in re.findall(r"`(.*?)`", message))
 
 

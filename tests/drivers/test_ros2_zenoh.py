@@ -68,7 +68,7 @@ def test_namespace_and_domain_are_told_apart(endpoint) -> None:
     assert other.received == 0
 
 
-def test_joint_states_of_a_dds_robot_are_read_from_its_bridge(endpoint) -> None:
+def test_dds_robot_joints_are_read_through_bridge(endpoint) -> None:
     with robot(endpoint, topic="/arm/joint_states", via="ros2dds") as arm:
         arm.start()
         with joints(endpoint, topic="/arm/joint_states", via="ros2dds") as source:
@@ -84,12 +84,12 @@ def test_a_bridge_that_passes_on_nothing_is_named(endpoint) -> None:
     assert "the bridge at" in source.health[0]
 
 
-def test_without_a_router_it_is_said_how_to_start_one(endpoint) -> None:
+def test_missing_router_error_names_the_start_command(endpoint) -> None:
     with pytest.raises(SourceLost, match="ros2 run rmw_zenoh_cpp rmw_zenohd"), joints(endpoint):
         pass
 
 
-def test_when_the_router_goes_it_is_said_and_when_it_comes_back_joints_are_read_again(endpoint) -> None:
+def test_lost_router_is_reported_and_reading_resumes(endpoint) -> None:
     source = joints(endpoint)
     with robot(endpoint) as arm, source:
         arm.start()
@@ -112,7 +112,7 @@ def router(endpoint) -> Iterator[str]:
 
 
 @pytest.mark.parametrize(("message", "kind"), [("point", POINT_STAMPED), ("pose", POSE_WITH_COVARIANCE_STAMPED)])
-def test_the_marker_is_published_as_a_node_of_rmw_zenoh_would(router, message, kind) -> None:
+def test_marker_is_published_like_an_rmw_zenoh_node(router, message, kind) -> None:
     marker = MarkerTopic(frame="eye", message=message)
     x, sigma = np.array([0.1, -0.2, 0.3]), np.array([1e-3, 1e-3, 2e-3])
     with open_session(router) as session, MarkerPublisher(Ros2Config(router=router, domain=3), marker) as published:
@@ -133,7 +133,7 @@ def test_the_marker_is_published_as_a_node_of_rmw_zenoh_would(router, message, k
     assert sequence >= 1
 
 
-def test_the_marker_s_topic_is_in_the_graph_while_it_is_open(router) -> None:
+def test_open_marker_topic_is_in_the_graph(router) -> None:
     with open_session(router) as session, MarkerPublisher(Ros2Config(router=router), MarkerTopic(frame="eye")):
         wanted = rmw.Topic(0, "/bodyschema/marker", POINT_STAMPED.name)
         assert any(wanted in rmw.topics_in([token]) for token in tokens_as_they_come(session, rmw.publishers_key()))

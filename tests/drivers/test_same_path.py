@@ -156,7 +156,7 @@ QUICK = ("simulated source", "Dynamixel 2.0", "Feetech")
 @pytest.mark.parametrize(
     "source", [*QUICK, *(pytest.param(name, marks=pytest.mark.soak) for name in SOURCES if name not in QUICK)]
 )
-def test_one_hand_guided_path_gives_the_same_model_whatever_reads_the_joints(source) -> None:
+def test_every_driver_yields_same_model_from_one_path(source) -> None:
     arm = guided()
     with SOURCES[source](arm) as (joints, begin_s):
         readings, angles = readings_of(joints, begin_s + SECONDS - 0.1), arm.angles(begin_s)

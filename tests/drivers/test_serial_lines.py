@@ -133,7 +133,7 @@ def test_a_header_and_a_reading_are_taken_apart() -> None:
         "a,1,1",
     ],
 )
-def test_a_line_with_a_right_checksum_and_a_wrong_content_is_refused(content) -> None:
+def test_valid_checksum_with_invalid_content_is_refused(content) -> None:
     with pytest.raises(GarbledLine):
         parse(with_checksum(content)[:-1])
 
@@ -148,7 +148,7 @@ def test_any_bytes_are_a_line_or_refused(data) -> None:
 
 
 @given(PIECES)
-def test_whatever_comes_only_readings_that_were_said_are_believed_in_their_order(pieces) -> None:
+def test_only_readings_that_were_sent_are_accepted(pieces) -> None:
     board, said = Board(0.0, 0.0), b"".join(pieces)
     for k, piece in enumerate(pieces):
         board.hear(piece, 100.0 + k * 1e-3)
@@ -175,13 +175,13 @@ def test_a_flood_without_line_feeds_is_forgotten() -> None:
 
 
 @pytest.mark.parametrize("drift", [0.0, 50e-6, 5e-3])
-def test_a_reading_is_where_each_joint_was_at_its_time(drift) -> None:
+def test_reading_matches_each_joint_at_its_time(drift) -> None:
     with (arm := BoardArm(latency_s=2e-3, drift=drift)).joints:
         arm.read(600)  # by then the rate of the board's clock is known
         assert max(arm.error(reading) for reading in arm.read(2000)) < TICK / 2 + 0.9 * 0.5e-3
 
 
-def test_times_are_those_of_the_measurements_to_half_a_millisecond() -> None:
+def test_times_match_measurements_to_half_a_millisecond() -> None:
     steep = [lambda t: 8.0 * (t - 100.0)]  # 8 rad/s show the time to 0.1 ms
     with (arm := BoardArm(steep, ticks=16384, latency_s=4e-3, limits=[(-1e9, 1e9)], drift=1e-4)).joints:
         readings = arm.read(2000)[400:]
@@ -212,12 +212,12 @@ def test_the_time_sigma_holds_from_the_first_reading(drift, latency_s) -> None:
 
 
 @pytest.mark.parametrize("latency_s", [0.0, 4e-3])
-def test_the_time_sigma_is_below_a_millisecond_when_the_clock_is_known(latency_s) -> None:
+def test_time_sigma_is_submillisecond_with_known_clock(latency_s) -> None:
     with (arm := steep_arm(latency_s=latency_s, drift=1e-4)).joints:
         assert 0.3e-3 < arm.read(600)[-1].t_sigma < 1e-3
 
 
-def test_lines_held_up_at_the_opening_are_not_believed() -> None:
+def test_lines_delayed_at_opening_do_not_bias_times() -> None:
     arm = steep_arm()
     begin, end = arm.clock.now(), arm.clock.now() + 0.25
     arm.faults.add(0, lambda reply, _: replace(reply, start=end) if begin < reply.start < end else reply)
@@ -227,7 +227,7 @@ def test_lines_held_up_at_the_opening_are_not_believed() -> None:
     assert max(reading.t_sigma for reading in readings) < 5e-3
 
 
-def test_a_line_that_was_held_up_is_told_at_the_time_of_its_measurement() -> None:
+def test_delayed_line_gets_its_measurement_time() -> None:
     with (arm := steep_arm()).joints:
         arm.read(600)
         arm.faults.add(0, lambda reply, _: replace(reply, start=reply.start + 15e-3), 3)
@@ -253,7 +253,7 @@ def test_positions_go_on_across_turns(ticks) -> None:
     assert readings[-1].q[0] > 5 * 2 * math.pi
 
 
-def test_a_joint_whose_turn_cannot_be_told_is_named() -> None:
+def test_joint_with_ambiguous_turn_is_named() -> None:
     arm = BoardArm([lambda t: 2.5], limits=[(-9.0, 9.0)], last_pose=[0.0])
     said = r"joint 'joint1' \(encoder 'joint1'\) was at 0° and .*lost"
     with pytest.raises(SourceLost, match=said), arm.joints:
@@ -263,7 +263,7 @@ def test_a_joint_whose_turn_cannot_be_told_is_named() -> None:
 # --- boards present
 
 
-def test_an_encoder_that_is_not_announced_and_one_with_other_ticks_are_shown_in_one_table() -> None:
+def test_missing_and_mismatched_encoders_share_one_table() -> None:
     arm = BoardArm(encoders={"ticks_per_turn": 4096})
     arm.board.encoders = {"joint1": (4096, swing(0)), "joint2": (1024, swing(1)), "elbow": (4096, swing(2))}
     with pytest.raises(SourceError) as refusal, arm.joints:
@@ -281,14 +281,14 @@ def test_an_encoder_that_is_not_announced_and_one_with_other_ticks_are_shown_in_
 @pytest.mark.parametrize(
     ("fault", "said"), [(mute, "sends nothing"), (wrong_checksum, "sends no header: compare baud")]
 )
-def test_a_board_that_does_not_introduce_itself_is_refused_with_what_it_does(fault, said) -> None:
+def test_board_without_header_is_refused_with_the_symptom(fault, said) -> None:
     arm = BoardArm()
     arm.faults.add(0, lambda reply, rng: fault(replace(reply, data=reply.data.replace(b"\n", b"")), rng))
     with pytest.raises(SourceLost, match=said), arm.joints:
         pass
 
 
-def test_what_each_encoder_is_set_to_is_on_record() -> None:
+def test_record_holds_the_settings_of_each_encoder() -> None:
     with (arm := BoardArm()).joints:
         assert arm.joints.record[1]["encoder"] == "joint2"
         assert arm.joints.record[1]["rad_per_tick"] == TICK
@@ -318,7 +318,7 @@ def test_gaps_and_garbled_lines_are_counted() -> None:
         assert (counts.missing, counts.garbled) == (3 + 2, 1)  # without its line feed one takes the next with it
 
 
-def test_a_line_that_is_told_twice_is_believed_once() -> None:
+def test_repeated_line_is_accepted_once() -> None:
     with (arm := BoardArm()).joints:
         arm.read(10)
         arm.faults.add(0, lambda reply, _: Reply(0, reply.start, reply.data + reply.data), 1)
@@ -338,7 +338,7 @@ def test_a_board_that_was_restarted_is_another_epoch() -> None:
     assert arm.joints.epoch == 2
 
 
-def test_an_encoder_without_value_makes_no_reading_and_is_named_once(caplog) -> None:
+def test_valueless_encoder_stops_readings_and_warns_once(caplog) -> None:
     with caplog.at_level(logging.WARNING), (arm := BoardArm()).joints:
         arm.read(10)
         arm.board.failing.add("joint2")
@@ -353,7 +353,7 @@ def test_an_encoder_without_value_makes_no_reading_and_is_named_once(caplog) -> 
     assert len(caplog.messages) == 1
 
 
-def test_an_encoder_that_stays_without_value_is_a_loss() -> None:
+def test_persistently_valueless_encoder_is_a_loss() -> None:
     arm = BoardArm()
     with arm.joints:
         arm.read(10)
@@ -382,7 +382,7 @@ def test_an_encoder_s_glitch_is_not_believed() -> None:
         assert max(arm.error(reading) for reading in arm.read(20)) < 2 * TICK
 
 
-def test_in_a_storm_of_faults_no_wrong_reading_is_believed() -> None:
+def test_fault_storm_yields_no_wrong_reading() -> None:
     arm = BoardArm(seed=5, latency_s=1e-3)
     with arm.joints:
         arm.board.faults = struck = storm(0.02, Random(6))
@@ -446,7 +446,7 @@ int main() { setup(); for (int k = 0; k < 5000; k++) loop(); }
 
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler; to run it: apt-get install g++")
-def test_the_sketch_says_what_the_driver_reads(tmp_path) -> None:
+def test_driver_parses_the_lines_of_the_sketch(tmp_path) -> None:
     text = re.sub(r"#include <(Arduino|Wire)\.h>", "", SKETCH.read_text())
     (tmp_path / "sketch.inc").write_text(text)
     (tmp_path / "harness.cpp").write_text(HARNESS)

@@ -25,7 +25,7 @@ def health(arm) -> dict:
 
 
 @pytest.mark.parametrize("make", MAKES, ids=["dynamixel", "feetech"])
-def test_each_servo_tells_supply_and_temperature_within_a_second(make) -> None:
+def test_servos_report_voltage_and_temperature_within_a_second(make) -> None:
     arm = make()
     with arm.joints:
         read(arm, 250)
@@ -35,7 +35,7 @@ def test_each_servo_tells_supply_and_temperature_within_a_second(make) -> None:
 
 
 @pytest.mark.parametrize("make", MAKES, ids=["dynamixel", "feetech"])
-def test_an_overloaded_servo_is_told_apart_from_the_others(make) -> None:
+def test_only_the_overloaded_servo_reports_trouble(make) -> None:
     arm = make()
     with arm.joints:
         arm.chain.servo(2).fail(0x20)
@@ -46,7 +46,7 @@ def test_an_overloaded_servo_is_told_apart_from_the_others(make) -> None:
 
 
 @pytest.mark.parametrize("make", MAKES, ids=["dynamixel", "feetech"])
-def test_a_servo_that_falls_silent_is_marked_until_it_is_back(make) -> None:
+def test_silent_servo_is_marked_until_it_returns(make) -> None:
     arm = make()
     with arm.joints:
         gone = arm.chain.servos.pop(1)
@@ -69,7 +69,7 @@ def test_a_bus_counts_its_troubles_over_all_openings() -> None:
     assert arm.joints.bus_health["arm"].troubles == {}
 
 
-def test_servos_of_a_port_that_is_away_are_marked() -> None:
+def test_servos_of_a_missing_port_are_marked() -> None:
     arm = Arm()
     with arm.joints:
         read(arm, 3)
@@ -85,21 +85,21 @@ def test_servos_of_a_port_that_is_away_are_marked() -> None:
 
 
 @pytest.mark.parametrize("model", ["XM430-W350", "MX-28", "AX-12A"])
-def test_two_dynamixel_servos_of_one_model_and_id_are_refused_at_the_start(model) -> None:
+def test_identical_dynamixel_servos_sharing_an_id_are_refused(model) -> None:
     arm = Arm((model,) * 3)
     arm.chain.servos.append(Servo(arm.chain.servo(2).model, 2, lambda t: swing(0)(t) + 0.4, return_delay_s=0))
     with pytest.raises(SourceError, match=r"joint2 +2 .* garbled answers: two servos with this ID"), arm.joints:
         pytest.fail("it was opened")
 
 
-def test_two_feetech_servos_of_one_model_and_id_are_refused_at_the_start() -> None:
+def test_identical_feetech_servos_sharing_an_id_are_refused() -> None:
     arm = FeetechArm()
     arm.chain.servos.append(FeetechServo(arm.chain.servo(2).model, 2, lambda t: swing(0)(t) + 0.4, return_delay_s=0))
     with pytest.raises(SourceError, match=r"joint2 +2 .* garbled answers: two servos with this ID"), arm.joints:
         pytest.fail("it was opened")
 
 
-def test_a_lost_turn_count_is_asked_for_and_taken_when_somebody_says_so() -> None:
+def test_lost_turn_count_needs_explicit_acceptance() -> None:
     turned = [0.0]
     arm = Arm(paths=[lambda t: 0.1, lambda t: 0.2 + turned[0], lambda t: 0.3])
     with arm.joints:
@@ -118,7 +118,7 @@ def test_a_lost_turn_count_is_asked_for_and_taken_when_somebody_says_so() -> Non
     assert not arm.joints.asks_for_turns
 
 
-def test_what_was_accepted_once_is_not_accepted_the_next_time() -> None:
+def test_turn_acceptance_without_a_question_has_no_effect() -> None:
     turned = [0.0]
     arm = Arm(paths=[lambda t: 0.1, lambda t: 0.2 + turned[0], lambda t: 0.3])
     for angle in (0.0, 100.0):

@@ -44,7 +44,7 @@ def test_a_node_that_starts_later_gets_the_pose(endpoint, monkeypatch) -> None:
     assert token.endswith(rmw.LATCHED_QOS)
 
 
-def test_rosbags_reads_the_transform_and_hashes_its_type_alike() -> None:
+def test_rosbags_reads_transform_with_matching_type_hash() -> None:
     pytest.importorskip("rosbags")
     from rosbags.typesys import Stores, get_typestore
 

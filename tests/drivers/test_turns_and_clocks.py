@@ -15,17 +15,17 @@ from bodyschema.drivers.turns import SpeedGate, nearest_turn
 
 
 @given(st.integers(-(10**6), 10**6), st.floats(-1e6, 1e6))
-def test_the_nearest_turn_is_within_half_a_turn_and_whole_turns_away(raw, near) -> None:
+def test_nearest_turn_adds_whole_turns_to_within_half(raw, near) -> None:
     there = nearest_turn(raw, near, 4096)
     assert abs(there - near) <= 2048 + 1e-6
     assert (there - raw) % 4096 == 0
 
 
-def test_a_sensor_without_turns_is_taken_as_it_is() -> None:
+def test_sensor_without_turns_is_kept_unchanged() -> None:
     assert nearest_turn(1000, 0.0, None) == 1000
 
 
-def test_the_gate_takes_what_a_joint_can_do_and_refuses_the_rest() -> None:
+def test_gate_rejects_only_impossible_joint_motion() -> None:
     gate = SpeedGate([10.0, 10.0], [0.1, 0.1])
     assert gate.offer(0.0, [0.0, 0.0]) is None
     assert gate.offer(0.1, [1.05, 0.0]) is None
@@ -33,7 +33,7 @@ def test_the_gate_takes_what_a_joint_can_do_and_refuses_the_rest() -> None:
     assert gate.offer(0.3, [1.05, 0.0]) is None
 
 
-def test_places_that_agree_tell_a_jump_and_those_that_do_not_tell_none() -> None:
+def test_only_agreeing_positions_count_as_a_jump() -> None:
     for agree in (True, False):
         gate = SpeedGate([1.0], [0.1])
         gate.offer(0.0, [0.0])
@@ -43,7 +43,7 @@ def test_places_that_agree_tell_a_jump_and_those_that_do_not_tell_none() -> None
 
 
 @pytest.mark.parametrize("drift", [50e-6, -0.01, 0.01])
-def test_a_device_clock_narrows_an_event_to_a_fraction_of_what_the_host_knows(drift) -> None:
+def test_device_clock_narrows_the_event_time_interval(drift) -> None:
     rng, clock, widths = Random(3), DeviceClock(1e-3, 32768), []
     offset = 57.1234
     for k in range(20_000):  # through several wraps of the stamp
@@ -58,7 +58,7 @@ def test_a_device_clock_narrows_an_event_to_a_fraction_of_what_the_host_knows(dr
 
 
 @pytest.mark.parametrize("late_s", [0.003, 0.02, 1.0, 20.0])
-def test_an_event_of_another_time_is_refused_and_does_no_harm(late_s) -> None:
+def test_event_of_another_time_is_refused_harmlessly(late_s) -> None:
     clock = DeviceClock(1e-3, 32768)
     for k in range(300):
         t = 10.0 + k * 5.3e-3
@@ -68,7 +68,7 @@ def test_an_event_of_another_time_is_refused_and_does_no_harm(late_s) -> None:
     assert clock.narrow(t - 1e-4, t + 1e-4, int(t / 1e-3) % 32768) is not None
 
 
-def test_the_adapter_s_latency_is_the_system_s_where_it_says(tmp_path) -> None:
+def test_adapter_latency_comes_from_system_if_known(tmp_path) -> None:
     (tmp_path / "ttyUSB7").write_text("16\n")
     assert adapter_latency_s("/dev/ttyUSB7", str(tmp_path / "{}")) == 16e-3
     assert adapter_latency_s("/dev/ttyACM0", str(tmp_path / "{}")) == DEFAULT_LATENCY_S
@@ -76,7 +76,7 @@ def test_the_adapter_s_latency_is_the_system_s_where_it_says(tmp_path) -> None:
 
 @pytest.mark.parametrize("held_s", [1e-3, 16e-3])
 @pytest.mark.parametrize("drift", [0.0, 50e-6, -0.01, 0.01])
-def test_a_stream_s_clock_is_known_in_offset_and_rate_through_its_wrap(drift, held_s) -> None:
+def test_stream_clock_learns_offset_and_rate_through_wrap(drift, held_s) -> None:
     rng, clock, off = Random(3), StreamClock(1e-6, 2**32), []
     for k in range(6000):
         true = 100.0 + k * 5e-3
@@ -90,7 +90,7 @@ def test_a_stream_s_clock_is_known_in_offset_and_rate_through_its_wrap(drift, he
 
 
 @pytest.mark.parametrize("late_s", [0.6, 20.0, -0.05, -20.0])
-def test_a_stream_s_stamp_of_another_time_is_refused_and_does_no_harm(late_s) -> None:
+def test_stream_stamp_of_another_time_is_refused_harmlessly(late_s) -> None:
     clock = StreamClock(1e-6, 2**32)
     for k in range(600):
         t = 50.0 + k * 5e-3
@@ -100,7 +100,7 @@ def test_a_stream_s_stamp_of_another_time_is_refused_and_does_no_harm(late_s) ->
     assert clock.time(t, int(t / 1e-6)) == pytest.approx(t, abs=2e-6)
 
 
-def test_a_stream_that_begins_with_a_backlog_is_soon_right() -> None:
+def test_stream_starting_with_a_backlog_soon_converges() -> None:
     clock, t = StreamClock(1e-6, 2**32), None
     for k in range(400):
         true = 50.0 + k * 5e-3

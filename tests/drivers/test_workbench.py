@@ -64,7 +64,7 @@ def test_a_number_is_written_and_read_back(models) -> None:
 
 
 @pytest.mark.parametrize("models", ARMS)
-def test_what_was_written_outlasts_a_power_cycle(models) -> None:
+def test_written_value_survives_a_power_cycle(models) -> None:
     arm = Arm(models)
     arm.bench.write(arm.bus, arm.change("return_delay", 0))
     arm.chain.power_cycle(arm.clock.now())
@@ -80,14 +80,14 @@ def test_the_eeprom_is_locked_again(models) -> None:
 
 
 @pytest.mark.parametrize("models", ARMS)
-def test_a_servo_with_a_new_id_is_found_there(models) -> None:
+def test_servo_answers_at_its_new_id(models) -> None:
     arm = Arm(models)
     assert arm.bench.write(arm.bus, arm.change("id", 7)).outcome is Outcome.WRITTEN
     assert (arm.bench.is_taken(arm.bus, 7), arm.bench.is_taken(arm.bus, 1)) == (True, False)
 
 
 @pytest.mark.parametrize("models", ARMS)
-def test_all_servos_of_a_bus_are_found_at_the_new_rate(models) -> None:
+def test_all_servos_answer_at_the_new_rate(models) -> None:
     arm = Arm(models)
     changes = [arm.change("baud", 0, id) for id in (1, 2)]
     then = changes[0].setting.words["57600"]
@@ -97,7 +97,7 @@ def test_all_servos_of_a_bus_are_found_at_the_new_rate(models) -> None:
     assert [servo.baud // 100 for servo in arm.chain.servos] in ([576, 576], [571, 571])
 
 
-def test_a_servo_that_refuses_its_new_rate_is_found_at_the_old_one() -> None:
+def test_servo_refusing_a_new_rate_keeps_the_old() -> None:
     arm = Arm()
     arm.chain.servo(1)["torque"] = 1
     change = arm.change("baud", 1)
@@ -105,7 +105,7 @@ def test_a_servo_that_refuses_its_new_rate_is_found_at_the_old_one() -> None:
     assert (done.outcome, done.said) == (Outcome.KEPT, "it still answers at 1,000,000 bit/s")
 
 
-def test_what_a_servo_refuses_is_told_and_not_believed_to_be_written() -> None:
+def test_refused_write_is_reported_as_kept() -> None:
     arm = Arm()
     arm.chain.servo(1)["torque"] = 1  # locks the EEPROM
     done = arm.bench.write(arm.bus, arm.change("return_delay", 0))
@@ -113,7 +113,7 @@ def test_what_a_servo_refuses_is_told_and_not_believed_to_be_written() -> None:
 
 
 @pytest.mark.parametrize("models", ARMS)
-def test_a_cable_that_fails_after_the_write_leaves_it_open_what_stands_there(models) -> None:
+def test_lost_cable_after_write_gives_unknown_outcome(models) -> None:
     arm = Arm(models)
     change = arm.change("return_delay", 0)
 
@@ -136,14 +136,14 @@ def test_torque_is_off_before_anything_is_written(models) -> None:
 
 @pytest.mark.parametrize("models", [ARMS[0], ARMS[2]])
 @pytest.mark.parametrize("angle", [0.3, -0.9, 1.4])
-def test_with_the_offset_of_here_the_position_here_is_the_zero(models, angle) -> None:
+def test_homing_offset_makes_the_current_position_zero(models, angle) -> None:
     arm = Arm(models, angle)
     servo = arm.fitted()
     arm.bench.write(arm.bus, arm.change("homing_offset", arm.bench.homing_offset(arm.bus, servo)))
     assert arm.bench.position(arm.bus, servo) == servo.zero_ticks
 
 
-def test_a_servo_of_another_model_is_not_written_to() -> None:
+def test_servo_of_another_model_is_not_written() -> None:
     arm = Arm()
     wrong = DYNAMIXELS["XM540-W270"]
     with pytest.raises(SourceError, match=r"XM430-W350: wrong model.*nothing was written"):
@@ -151,7 +151,7 @@ def test_a_servo_of_another_model_is_not_written_to() -> None:
 
 
 @pytest.mark.parametrize("models", ARMS)
-def test_a_servo_that_no_file_names_says_what_it_is(models) -> None:
+def test_unlisted_servo_reports_its_model(models) -> None:
     arm = Arm(models)
     assert arm.bench.model_at(arm.bus, 2) == arm.models[1]
 
@@ -159,20 +159,20 @@ def test_a_servo_that_no_file_names_says_what_it_is(models) -> None:
 @pytest.mark.parametrize(
     ("text", "said"), [("255", "from 0 to 254"), ("-1", "from 0 to 254"), ("much", "from 0 to 254")]
 )
-def test_what_is_out_of_range_is_refused_with_the_range(text, said) -> None:
+def test_out_of_range_value_error_states_the_range(text, said) -> None:
     (delay,) = [setting for setting in settings_of(DYNAMIXELS["XM430-W350"]) if setting.name == "return_delay"]
     with pytest.raises(ConfigError, match=said):
         delay.value(text)
 
 
-def test_a_model_without_current_sensor_has_no_current_mode() -> None:
+def test_model_without_current_sensor_lacks_current_mode() -> None:
     (mode,) = [setting for setting in settings_of(DYNAMIXELS["XL430-W250"]) if setting.name == "operating_mode"]
     with pytest.raises(ConfigError, match="there is no such value"):
         mode.value("0")
 
 
 @pytest.mark.parametrize("model", [model for model in MODELS if model.protocol == 2], ids=lambda model: model.name)
-def test_settings_stand_where_the_control_tables_of_the_sdk_have_them(model) -> None:
+def test_settings_match_the_sdk_control_tables(model) -> None:
     tables = files("dynamixel_easy_sdk") / "control_table"
     names = dict(line.split("\t")[:2] for line in (tables / "dynamixel.model").read_text().splitlines()[1:])
     rows = [line.split("\t") for line in (tables / names[str(model.number)].strip()).read_text().splitlines()]
@@ -183,7 +183,7 @@ def test_settings_stand_where_the_control_tables_of_the_sdk_have_them(model) -> 
 
 
 @pytest.mark.parametrize("make", [DYNAMIXEL, FEETECH], ids=lambda make: make.table)
-def test_every_setting_lies_in_the_eeprom_apart_from_the_others(make) -> None:
+def test_settings_lie_in_eeprom_without_overlap(make) -> None:
     for model in make.models.values():
         ends = 0
         for setting in make.settings(model):

@@ -72,7 +72,7 @@ def test_a_hand_moves_it_and_it_stays_there() -> None:
 
 
 @pytest.mark.parametrize("directions", [(1, -1), pytest.param((-1, 1), marks=pytest.mark.soak)])
-def test_a_joint_that_counts_against_its_servo_floats_too(directions) -> None:
+def test_joint_counting_against_its_servo_floats(directions) -> None:
     with (arm := FloatingArm(directions=directions)).joints:
         arm.float()
         before = arm.q
@@ -80,7 +80,7 @@ def test_a_joint_that_counts_against_its_servo_floats_too(directions) -> None:
         assert np.abs(np.subtract(arm.q, before)).max() < DRIFT_RAD
 
 
-def test_a_servo_that_is_reversed_by_its_drive_mode_floats_too() -> None:
+def test_servo_with_reverse_drive_mode_floats() -> None:
     arm = FloatingArm(told_directions=(-1, 1))
     arm.chain.servo(1)["drive_mode"] = 1
     arm.chain.servo(1).reboot(arm.clock.now())
@@ -92,7 +92,7 @@ def test_a_servo_that_is_reversed_by_its_drive_mode_floats_too() -> None:
         assert np.abs(np.subtract(arm.q, before)).max() < DRIFT_RAD
 
 
-def test_servos_of_two_series_on_two_buses_get_their_currents() -> None:
+def test_two_series_on_two_buses_get_their_currents() -> None:
     models, clock = {"left": "XM430-W350", "right": "PH54-200-S500"}, VirtualClock()
     servos = {name: Servo(BY_NAME[model], 1, lambda t: 0.5, return_delay_s=0.0) for name, model in models.items()}
     for servo in servos.values():
@@ -128,7 +128,7 @@ def test_the_currents_grow_within_a_second() -> None:
         assert arm.currents()[0] == pytest.approx(full, abs=0.005)
 
 
-def test_no_current_is_over_its_limit_and_a_joint_that_sinks_is_named() -> None:
+def test_current_limit_holds_and_sinking_joint_is_named() -> None:
     with (arm := FloatingArm((0.0, -1.5), current_limit_a=0.4)).joints:
         arm.switch_on()
         arm.run(2.5)
@@ -156,14 +156,14 @@ def test_readings_are_as_many_as_without() -> None:
 # --- torque on
 
 
-def test_no_torque_before_somebody_asks() -> None:
+def test_torque_stays_off_before_a_request() -> None:
     with (arm := FloatingArm()).joints:
         arm.run(0.5)
         assert arm.force.state == "off"
     assert arm.port.writes() == []
 
 
-def test_the_goal_is_nothing_and_the_watchdog_armed_before_torque_goes_on() -> None:
+def test_zero_goal_and_watchdog_precede_torque() -> None:
     with (arm := FloatingArm()).joints:
         arm.switch_on()
     addresses = [address for address, _ in arm.port.writes()]
@@ -180,7 +180,7 @@ def test_nothing_is_written_to_an_eeprom() -> None:
     assert min(address for address, _ in arm.port.writes()) >= TORQUE
 
 
-def test_another_mode_is_refused_with_the_command_that_changes_it() -> None:
+def test_wrong_mode_error_names_the_fixing_command() -> None:
     with (arm := FloatingArm(mode=POSITION_MODE)).joints:
         with pytest.raises(RequestError, match="bodyschema servos operating_mode=0 --joint joint1"):
             arm.switch_on()
@@ -195,7 +195,7 @@ def test_a_limit_beyond_the_servo_s_own_is_refused() -> None:
     assert arm.torque == [0, 0]
 
 
-def test_torque_that_does_not_go_on_everywhere_goes_off_everywhere() -> None:
+def test_partial_torque_on_is_undone_everywhere() -> None:
     arm = FloatingArm()
     arm.chain.servo(2).fail(0x20)
     with arm.joints:
@@ -207,7 +207,7 @@ def test_torque_that_does_not_go_on_everywhere_goes_off_everywhere() -> None:
         assert arm.torque == [0, 0]
 
 
-def test_a_request_that_nobody_waits_for_any_more_does_nothing() -> None:
+def test_cancelled_request_does_nothing() -> None:
     with (arm := FloatingArm()).joints:
         arm.force.ask(True).cancel()
         arm.run(0.5)
@@ -243,7 +243,7 @@ def test_torque_is_off_after_any_exception() -> None:
     assert arm.torque == [0, 0]
 
 
-def test_a_wrong_direction_makes_the_arm_run_away_and_the_speed_limit_catches_it() -> None:
+def test_speed_limit_stops_arm_with_wrong_direction() -> None:
     with (arm := FloatingArm((-0.5, 0.3), directions=(1, 1), torques=lambda q: -holding(q), rate_hz=250.0)).joints:
         arm.float()
         assert "turned at" in dropped(arm)
@@ -290,7 +290,7 @@ def test_a_servo_that_lost_its_torque_ends_it() -> None:
         assert "lost torque" in dropped(arm)
 
 
-def test_a_current_over_its_limit_for_long_ends_it() -> None:
+def test_sustained_overcurrent_ends_zero_force() -> None:
     with (arm := FloatingArm()).joints:
         arm.float()
         arm.chain.servo(1).excess_a = 2.0
@@ -329,7 +329,7 @@ def test_a_servo_that_takes_no_goals_ends_it() -> None:
         assert "does not take its goal" in dropped(arm)
 
 
-def test_a_lost_bus_ends_it_and_it_stays_off_when_the_bus_is_back(monkeypatch) -> None:
+def test_zero_force_stays_off_after_lost_bus_returns(monkeypatch) -> None:
     arm = FloatingArm()
     write = arm.port.write
 
@@ -353,7 +353,7 @@ def test_a_lost_bus_ends_it_and_it_stays_off_when_the_bus_is_back(monkeypatch) -
         assert not any("switch the supply off" in text for text in arm.force.complaints)
 
 
-def test_a_mute_servo_s_torque_is_off_though_it_cannot_be_verified() -> None:
+def test_torque_of_mute_servo_is_off_but_unverified() -> None:
     with (arm := FloatingArm(heartbeat_ms=500)).joints:
         arm.float()
         arm.faults.add(1, mute)
@@ -363,7 +363,7 @@ def test_a_mute_servo_s_torque_is_off_though_it_cannot_be_verified() -> None:
         assert "joint1 could not be verified off" in arm.force.complaints[0]
 
 
-def test_where_one_drive_lets_go_the_other_lets_go_too() -> None:
+def test_one_dropped_drive_drops_the_other() -> None:
     arm = FloatingArm()
     tables = [msgspec.structs.replace(arm.table, joints={name: arm.table.joints[name]}) for name in arm.names]
     drives = [ZeroForce(arm.config, table, arm.names, holding, arm.clock) for table in tables]
@@ -378,7 +378,7 @@ def test_where_one_drive_lets_go_the_other_lets_go_too() -> None:
         assert (arm.torque, [drive.state for drive in drives]) == ([0, 0], ["dropped"] * 2)
 
 
-def test_it_ends_once_is_told_once_and_begins_again_only_when_asked(caplog) -> None:
+def test_drop_is_logged_once_and_restarts_on_request(caplog) -> None:
     with caplog.at_level(logging.ERROR), (arm := FloatingArm()).joints:
         arm.float()
         arm.chain.servo(1)["temperature"] = 70
@@ -394,7 +394,7 @@ def test_it_ends_once_is_told_once_and_begins_again_only_when_asked(caplog) -> N
         assert (arm.force.state, arm.force.complaints) == ("on", ())
 
 
-def test_after_a_kill_the_watchdogs_stop_the_servos_and_the_next_program_frees_them() -> None:
+def test_watchdogs_stop_killed_arm_and_next_program_recovers() -> None:
     arm = FloatingArm()
     with arm.joints:
         arm.float()

@@ -159,14 +159,14 @@ def test_a_signal_ends_it_with_torque_off(bench, floating, number) -> None:
     assert torque(bench) == [0, 0]
 
 
-def test_a_killed_process_leaves_no_current_after_its_heartbeat(bench, floating) -> None:
+def test_killed_process_leaves_no_current_after_heartbeat(bench, floating) -> None:
     floating.process.kill()
     floating.ended()
     assert not any(currents(bench, HEARTBEAT_S + 0.02))
     assert [bench.arm.servo(joint)["watchdog"] for joint in ANGLES] == [-1, -1]
 
 
-def test_an_unplugged_bus_leaves_no_current_and_torque_is_off_when_it_is_back(bench, floating) -> None:
+def test_unplugged_bus_loses_current_and_torque_stays_off(bench, floating) -> None:
     bench.shells["arm"].unplug()
     assert not any(currents(bench, HEARTBEAT_S + 0.02))
     bench.shells["arm"].plug_in()
@@ -201,7 +201,7 @@ def test_hold_has_to_agree(tmp_path, hold) -> None:
     assert refused.value.line is not None
 
 
-def test_hold_by_nobody_is_refused(tmp_path) -> None:
+def test_zero_force_hold_without_driver_is_refused(tmp_path) -> None:
     with pytest.raises(ConfigError, match="but nothing bears the arm"):
         open_joints(Config.load(write_robot(tmp_path, tables="")), SystemClock())
 
@@ -211,7 +211,7 @@ def test_a_urdf_without_masses_is_refused(tmp_path) -> None:
         open_joints(Config.load(write_robot(tmp_path, inertial="")), SystemClock())
 
 
-def test_the_currents_bear_the_weight_that_the_urdf_states(bench, floating) -> None:
+def test_currents_bear_the_weight_stated_in_urdf(bench, floating) -> None:
     floating.until(lambda _: True)
     g, mass, lever, length = 9.80665, 0.5, 0.15, 0.3
     q1, q2 = ANGLES.values()

@@ -33,7 +33,7 @@ def seen(robot: RobotDescription, file) -> np.ndarray:
     return chain.positions(walk().q)
 
 
-def test_it_is_the_simulation_with_the_geometric_effects_alone(robot, tmp_path) -> None:
+def test_corrected_urdf_equals_simulation_with_geometric_effects_only(robot, tmp_path) -> None:
     effects = [sized(robot, where, 2.0, k) for k, where in enumerate(everywhere(robot))]
     simulation = Simulation(robot, tuple(effects))
     wanted = Simulation(robot, tuple(effect for effect in effects if effect.kind.rigid)).positions(walk())
@@ -49,14 +49,14 @@ def test_effects_at_one_place_add_up(robot, tmp_path, where) -> None:
     np.testing.assert_allclose(seen(robot, file), Simulation(robot, effects).positions(walk()), rtol=0.0, atol=1e-9)
 
 
-def test_the_rigid_chain_is_the_simulation_with_the_geometric_effects_alone(robot) -> None:
+def test_rigid_chain_equals_simulation_with_geometric_effects_only(robot) -> None:
     effects = tuple(sized(robot, where, 2.0, k) for k, where in enumerate(everywhere(robot)))
     wanted = Simulation(robot, tuple(effect for effect in effects if effect.kind.rigid)).positions(walk())
     chain = Simulation(robot, effects).rigid_chain
     np.testing.assert_allclose(chain.positions(walk().q), wanted, rtol=0.0, atol=1e-9)
 
 
-def test_what_has_a_moment_is_as_it_was_after_it(robot) -> None:
+def test_since_matches_full_simulation_after_timed_effects(robot) -> None:
     names = ("encoder_jump", "tool_slip", "camera_moved", "camera_pose", "joint_eccentricity")
     effects = tuple(sized(robot, where, 2.0, k) for k, where in enumerate(everywhere(robot)) if where[0] in names)
     simulation, motion = Simulation(robot, effects), walk()
@@ -66,7 +66,7 @@ def test_what_has_a_moment_is_as_it_was_after_it(robot) -> None:
     )
 
 
-def test_the_rest_of_the_urdf_is_as_it_was_and_meshes_are_found(robot, tmp_path) -> None:
+def test_corrected_urdf_keeps_other_joints_and_finds_meshes(robot, tmp_path) -> None:
     (tmp_path / "arm").mkdir()
     other = arm(tmp_path / "arm")
     mesh = '<visual><geometry><mesh filename="meshes/hand.stl"/></geometry></visual></link>'
@@ -82,7 +82,7 @@ def test_the_rest_of_the_urdf_is_as_it_was_and_meshes_are_found(robot, tmp_path)
     assert tree.masses.keys() >= other.tree.masses.keys()
 
 
-def test_nothing_is_written_where_a_urdf_can_say_nothing_of_it(robot, tmp_path) -> None:
+def test_no_urdf_is_written_for_non_geometric_effects(robot, tmp_path) -> None:
     stale = tmp_path / corrected_file(robot)
     stale.write_text("of an earlier diagnosis")
     simulation = Simulation(robot, (Effect.at(robot, "joint_compliance", "elbow", values=[0.01]),))

@@ -72,13 +72,13 @@ def somewhere(robot, kind, seed):
 
 
 @pytest.mark.parametrize("kind", list(EFFECT_TYPES))
-def test_columns_are_the_derivatives_of_an_effect_alone(robot, kind) -> None:
+def test_jacobian_columns_match_derivatives_of_single_effect(robot, kind) -> None:
     for share, seed in ((0.0, 1), (0.5, 2), (1.0, 3)):
         check_columns(robot, (), sized(robot, somewhere(robot, kind, seed), share, seed))
 
 
 @pytest.mark.parametrize("kind", list(EFFECT_TYPES))
-def test_columns_are_the_derivatives_of_an_effect_among_others(robot, kind) -> None:
+def test_jacobian_columns_match_derivatives_with_other_effects_present(robot, kind) -> None:
     others = tuple(sized(robot, place, 1.0, 4) for place in OTHERS)
     check_columns(robot, others, sized(robot, somewhere(robot, kind, 4), 1.0, 4))
 
@@ -102,7 +102,7 @@ def test_half_the_usual_size_moves_positions(robot, kind) -> None:
             assert np.linalg.norm(moved, axis=1).max() > 1e-6, place
 
 
-def test_where_joints_are_torque_free_the_hand_bears_the_weight(tmp_path) -> None:
+def test_hand_guided_torque_free_arm_shows_no_compliance(tmp_path) -> None:
     robot = arm(tmp_path, hold="torque_free")
     spring = sized(robot, ("joint_compliance", "elbow", None), 1.0)
     run = Simulation(robot, (spring,)).run(MOTION)
@@ -110,7 +110,7 @@ def test_where_joints_are_torque_free_the_hand_bears_the_weight(tmp_path) -> Non
     assert not run.columns(spring).any()
 
 
-def test_an_effect_cannot_be_changed_by_the_residual_nor_the_other_way_round(robot) -> None:
+def test_effect_and_residual_do_not_influence_each_other(robot) -> None:
     class Bump:
         def predict(self, q):
             return 0.01 * np.sin(q[:, :3])
@@ -123,7 +123,7 @@ def test_an_effect_cannot_be_changed_by_the_residual_nor_the_other_way_round(rob
     np.testing.assert_array_equal(both.run(MOTION).columns(effect), alone.run(MOTION).columns(effect))
 
 
-def test_a_residual_is_asked_once_for_a_motion_whatever_the_effects_are(robot) -> None:
+def test_residual_is_evaluated_once_per_motion_across_effects(robot) -> None:
     asked = []
 
     class Bump:

@@ -56,7 +56,7 @@ def kernel() -> KernelLearner:
 
 
 @given(st.data(), st.floats(0.0, 1.0), st.integers(0, 100))
-def test_effects_come_back_from_the_file_to_the_last_bit(robot, tmp_path_factory, data, share, seed) -> None:
+def test_effects_round_trip_through_file_bit_for_bit(robot, tmp_path_factory, data, share, seed) -> None:
     places = data.draw(st.lists(st.sampled_from(everywhere(robot)), max_size=6))
     written = Simulation(robot, tuple(sized(robot, place, share, seed) for place in places))
     read = load_simulation(write_extended(written, tmp_path_factory.mktemp("out"), HEADING))
@@ -66,7 +66,7 @@ def test_effects_come_back_from_the_file_to_the_last_bit(robot, tmp_path_factory
     np.testing.assert_array_equal(read.positions(walk()), written.positions(walk()))
 
 
-def test_the_file_is_a_robot_toml_in_any_folder(robot, tmp_path) -> None:
+def test_extended_file_loads_as_robot_toml_anywhere(robot, tmp_path) -> None:
     effect = Effect.at(robot, "joint_offset", "elbow", values={"offset_rad": 0.02})
     file = write_extended(Simulation(robot, (effect,)), tmp_path / "far" / "away", HEADING)
     described = RobotDescription.load(file)
@@ -75,7 +75,7 @@ def test_the_file_is_a_robot_toml_in_any_folder(robot, tmp_path) -> None:
     assert tomllib.loads(file.read_text())["daemon"] == {"state_dir": "state"}
 
 
-def test_an_extended_robot_is_extended_again_with_what_was_found_then(robot, tmp_path) -> None:
+def test_second_extension_keeps_effects_of_the_first(robot, tmp_path) -> None:
     first = Simulation(robot, (Effect.at(robot, "joint_offset", "elbow", values=[0.02]),))
     once = load_simulation(write_extended(first, tmp_path / "a", HEADING))
     second = once.with_effects((*once.effects, Effect.at(once.robot, "backlash", SLIDE, values=[0.001])))
@@ -83,14 +83,14 @@ def test_an_extended_robot_is_extended_again_with_what_was_found_then(robot, tmp
     assert [effect.name for effect in twice.effects] == ["joint_offset", "backlash"]
 
 
-def test_two_ripples_of_one_joint_are_stored_and_read_back(robot, tmp_path) -> None:
+def test_two_ripples_of_one_joint_round_trip(robot, tmp_path) -> None:
     ripples = [Effect.at(robot, "joint_ripple", "elbow", values=[0.001, 0.0, cycles]) for cycles in (9.0, 14.0)]
     again = load_simulation(write_extended(Simulation(robot, (ripples[0], ripples[1].one_more(1))), tmp_path, HEADING))
     assert [effect.value("cycles_per_turn") for effect in again.effects] == [9.0, 14.0]
     assert len({effect.identity for effect in again.effects}) == 2
 
 
-def test_a_file_that_is_there_is_not_replaced_unasked(robot, tmp_path) -> None:
+def test_existing_file_is_replaced_only_on_request(robot, tmp_path) -> None:
     write_extended(Simulation(robot), tmp_path, HEADING)
     with pytest.raises(ConfigError, match="is there already"):
         write_extended(Simulation(robot), tmp_path, HEADING)
@@ -135,19 +135,19 @@ def test_an_error_names_file_line_and_remedy(tmp_path, entry, said, line) -> Non
     assert error.line == line_with(error, line)
 
 
-def test_the_line_is_that_of_the_wrong_entry_among_several(tmp_path) -> None:
+def test_error_line_points_to_wrong_entry_among_several(tmp_path) -> None:
     good = '[[effects]]\neffect = "joint_offset"\nwhere = "elbow"\noffset_rad = 0.1\n'
     error = refused(tmp_path, f"{good}{good.replace('0.1', '10')}{good}")
     assert error.line == line_with(error, "offset_rad = 10")
     assert "effect 2" in error.what
 
 
-def test_effects_that_are_no_list_of_tables_are_refused(tmp_path) -> None:
+def test_effects_must_be_a_list_of_tables(tmp_path) -> None:
     with pytest.raises(ConfigError, match=r"Write each effect under a heading \[\[effects\]\]"):
         extended(tmp_path, "[effects]\njoint_offset = 0.1\n")
 
 
-def test_an_effect_of_the_lenses_needs_a_stereo_camera(tmp_path) -> None:
+def test_lens_effect_requires_a_stereo_camera(tmp_path) -> None:
     file = arm(tmp_path, tables="").file
     file.write_text(file.read_text() + '[[effects]]\neffect = "lens_distortion"\nk1 = 0.1\n')
     with pytest.raises(RobotError, match="needs a stereo camera"):
@@ -156,7 +156,7 @@ def test_an_effect_of_the_lenses_needs_a_stereo_camera(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("model", [TURN.to_kbmap(BASES), TensorTrain.from_chain(TURN, BASES), kernel()], ids=type)
-def test_what_is_unexplained_comes_back_from_the_file(robot, tmp_path, model) -> None:
+def test_unexplained_residual_round_trips_through_file(robot, tmp_path, model) -> None:
     unexplained = Unexplained.of(robot, model, ("elbow", "neck_tilt"))
     written = Simulation(robot, (), unexplained)
     read = load_simulation(write_extended(written, tmp_path, HEADING))

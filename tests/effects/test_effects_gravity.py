@@ -49,12 +49,12 @@ def body(robot):
 
 
 @given(st.lists(st.floats(-2.0, 2.0), min_size=len(ALL), max_size=len(ALL)).map(np.array))
-def test_torques_are_those_that_pybullet_needs_to_hold_the_arm_turned_round(robot, body, q) -> None:
+def test_gravity_torques_are_the_negatives_of_pybullet_torques(robot, body, q) -> None:
     torques = GravityLoad(robot).torques(q[None])[0]
     np.testing.assert_allclose(torques, -body.gravity_torques(q), rtol=0, atol=1e-6)
 
 
-def test_an_arm_without_masses_weighs_as_rods_between_its_joints(tmp_path) -> None:
+def test_massless_links_are_weighed_as_rods_between_joints(tmp_path) -> None:
     (tmp_path / "arm.urdf").write_text(TWO_RODS)
     (tmp_path / "robot.toml").write_text(HELD)
     load = GravityLoad(RobotDescription.load(tmp_path / "robot.toml"))

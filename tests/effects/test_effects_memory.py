@@ -23,29 +23,29 @@ def robot(tmp_path_factory):
 
 
 @given(PATHS, WIDTHS)
-def test_a_play_never_lags_by_more_than_half_its_width(q, width) -> None:
+def test_backlash_lag_never_exceeds_half_its_width(q, width) -> None:
     assert np.abs(played(q, width)).max() <= 0.5 * width + 1e-12  # of readings around 1
 
 
 @given(PATHS, WIDTHS)
-def test_the_output_of_a_play_moves_only_where_its_input_does_and_the_same_way(q, width) -> None:
+def test_backlash_output_moves_only_with_its_input(q, width) -> None:
     output = q + played(q, width)
     assert (np.diff(output) * np.diff(q) >= -1e-15).all()
 
 
 @given(st.lists(st.floats(0.01, 0.1), min_size=2, max_size=40), WIDTHS)
-def test_a_play_that_is_driven_one_way_lags_by_half_its_width(steps, width) -> None:
+def test_one_way_motion_lags_by_half_backlash_width(steps, width) -> None:
     q = np.cumsum(steps)
     np.testing.assert_allclose(played(q, width), -0.5 * width, atol=1e-12)
 
 
-def test_a_play_rests_until_its_width_is_crossed() -> None:
+def test_backlash_output_rests_until_width_is_crossed() -> None:
     q = np.array([0.0, 0.1, 0.08, 0.05, 0.0])
     output = q + played(q, 0.04)
     np.testing.assert_allclose(output, [-0.02, 0.08, 0.08, 0.07, 0.02], atol=1e-15)
 
 
-def test_a_play_carries_on_from_one_segment_to_the_next(robot) -> None:
+def test_backlash_state_carries_over_between_segments(robot) -> None:
     q = np.zeros((6, len(robot.joints)))
     q[:, 0] = [0.0, 0.1, 0.2, 0.19, 0.195, 0.185]
     play = Simulation(robot, (Effect.at(robot, "backlash", robot.joints[0], values=[0.04]),))
@@ -62,7 +62,7 @@ def reading_by_reading(simulation, motion):
 
 
 @pytest.mark.parametrize("name", EACH)
-def test_reading_by_reading_the_first_stage_is_that_of_the_whole_motion(robot, name) -> None:
+def test_live_encoders_match_whole_motion_reading_by_reading(robot, name) -> None:
     motion = walk(3)
     # Live rows come at constant intervals.
     times = np.linspace(motion.clock[0], motion.clock[-1], len(motion))
@@ -76,7 +76,7 @@ def test_reading_by_reading_the_first_stage_is_that_of_the_whole_motion(robot, n
     np.testing.assert_allclose(reading_by_reading(simulation, motion)[after], expected[after], rtol=0, atol=1e-14)
 
 
-def test_what_is_missing_fades_with_the_time_between_rows(robot) -> None:
+def test_settling_error_decays_with_time_between_rows(robot) -> None:
     q = np.zeros((4, len(robot.joints)))
     q[1:, 0] = 0.1
     settling = Effect.at(robot, "settling", robot.joints[0], values=[0.5, 0.25])

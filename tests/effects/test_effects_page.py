@@ -24,7 +24,7 @@ def block(language: str) -> str:
     return found[1]
 
 
-def test_the_page_has_a_row_for_every_effect_of_the_table() -> None:
+def test_page_has_a_row_for_every_effect_type() -> None:
     assert set(ROWS) == set(EFFECT_TYPES)
 
 

@@ -52,7 +52,7 @@ def test_a_simulation_that_has_run_can_be_pickled(robot) -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in EFFECT_TYPES if name != "camera_latency"])
-def test_an_effect_at_any_joint_shows_in_the_world(robot, name, monkeypatch) -> None:
+def test_simulated_world_shows_each_effect_at_every_joint(robot, name, monkeypatch) -> None:
     postures = walk(2).q[:20]
     for place in everywhere(robot):
         if place[0] == name:
@@ -76,7 +76,7 @@ class Wave:
         return 0.003 * np.cos(q[:, 2:5])
 
 
-def test_the_true_chain_has_geometric_effects_and_drawn_errors_in_it(robot, monkeypatch) -> None:
+def test_true_chain_includes_geometric_effects_and_random_errors(robot, monkeypatch) -> None:
     monkeypatch.setattr("bodyschema.sim_backend.posed.RenderProcess", NoRenderer)
     postures = walk(5).q[:20]
     places = [place for place in everywhere(robot) if EFFECT_TYPES[place[0]].rigid]

@@ -150,7 +150,7 @@ def test_the_three_readers_agree_exactly_with_geometry(commands, robot, tmp_path
         np.testing.assert_allclose(x, found["python"][1], rtol=0, atol=1e-13)
 
 
-def test_a_play_begins_as_in_the_simulated_world(commands, robot, tmp_path) -> None:
+def test_backlash_starts_as_in_the_simulated_world(commands, robot, tmp_path) -> None:
     simulation = Simulation(robot, tuple(Effect.at(robot, "backlash", joint, values=[0.02]) for joint in robot.joints))
     write_correction(simulation, tmp_path / "c.json", "")
     q, live = np.repeat(steady(10).q, 3, axis=0), LiveEncoders(simulation)
@@ -170,7 +170,7 @@ def test_friction_keeps_a_loose_joint_on_its_side(commands, robot, tmp_path) -> 
         np.testing.assert_allclose(corrected(command, tmp_path / "c.json", motion.q)[0], wanted, rtol=0, atol=1e-12)
 
 
-def test_memory_goes_on_from_a_state_in_the_file(commands, robot, tmp_path) -> None:
+def test_readers_resume_memory_from_state_in_file(commands, robot, tmp_path) -> None:
     pairs = [
         ("backlash", "elbow", [0.02]),
         ("settling", "wrist", [0.1, 0.5]),
@@ -191,7 +191,7 @@ def test_memory_goes_on_from_a_state_in_the_file(commands, robot, tmp_path) -> N
         np.testing.assert_allclose(corrected(command, file, q[20:])[0], whole[20:], rtol=0, atol=1e-14)
 
 
-def test_a_joint_whose_settling_remembers_one_move_alone_is_read_too(commands, robot, tmp_path) -> None:
+def test_settling_with_one_move_memory_is_read_correctly(commands, robot, tmp_path) -> None:
     simulation = Simulation(robot, (Effect.at(robot, "settling", "wrist", values=[0.1, 0.0]),))
     write_correction(simulation, tmp_path / "c.json", "")
     motion = steady()
@@ -201,14 +201,14 @@ def test_a_joint_whose_settling_remembers_one_move_alone_is_read_too(commands, r
 
 
 @pytest.mark.parametrize("name", sorted(NOT_OF_THE_ARM))
-def test_what_is_no_error_of_the_arm_is_listed(name, robot, tmp_path) -> None:
+def test_effects_outside_the_arm_are_listed_as_omitted(name, robot, tmp_path) -> None:
     simulation = Simulation(robot, (sized(robot, (name, None, None), 1.0),))
     [told] = write_correction(simulation, tmp_path / "c.json", "")
     assert told.startswith(f"not in the file: {name}")
     assert json.loads((tmp_path / "c.json").read_text())["notes"] == [told]
 
 
-def test_a_file_of_an_older_version_says_what_to_do(commands, robot, tmp_path) -> None:
+def test_older_file_version_error_names_export_command(commands, robot, tmp_path) -> None:
     write_correction(Simulation(robot), tmp_path / "c.json", "")
     old = (tmp_path / "c.json").read_text().replace('correction 3"', 'correction", "version": 2')
     (tmp_path / "c.json").write_text(old)
@@ -238,7 +238,7 @@ def test_a_file_of_an_older_version_says_what_to_do(commands, robot, tmp_path) -
         ("to", "3"),
     ],
 )
-def test_a_number_out_of_bounds_is_refused_in_cpp(place, wrong, commands, robot, tmp_path) -> None:
+def test_cpp_reader_refuses_out_of_bounds_numbers(place, wrong, commands, robot, tmp_path) -> None:
     if "c++" not in commands:
         pytest.skip("no compiler of c++; to run it: apt install g++")
     write_correction(Simulation(robot), tmp_path / "c.json", "")
@@ -251,7 +251,7 @@ def test_a_number_out_of_bounds_is_refused_in_cpp(place, wrong, commands, robot,
 
 
 @pytest.mark.parametrize("numbers", [None, 0.0, [], [8.0], [[0.0]], "[8]"])
-def test_what_is_no_list_of_numbers_is_refused(numbers, commands, robot, tmp_path) -> None:
+def test_cpp_reader_refuses_invalid_numbers_field(numbers, commands, robot, tmp_path) -> None:
     if "c++" not in commands:
         pytest.skip("no compiler of c++; to run it: apt install g++")
     write_correction(Simulation(robot), tmp_path / "c.json", "")
@@ -261,7 +261,7 @@ def test_what_is_no_list_of_numbers_is_refused(numbers, commands, robot, tmp_pat
 
 
 @pytest.mark.parametrize("missing", range(1, 5))
-def test_half_a_step_is_refused_in_cpp(missing, commands, robot, tmp_path) -> None:
+def test_cpp_reader_refuses_incomplete_steps(missing, commands, robot, tmp_path) -> None:
     if "c++" not in commands:
         pytest.skip("no compiler of c++; to run it: apt install g++")
     write_correction(Simulation(robot), tmp_path / "c.json", "")
@@ -324,7 +324,7 @@ def test_words_that_are_no_numbers_are_refused_alike(language, commands, robot, 
     assert dict(zip(WRONG_WORDS, found, strict=True)) == dict.fromkeys(WRONG_WORDS, "refused")
 
 
-def test_settling_is_left_out_where_each_reading_is_an_interruption(robot, tmp_path) -> None:
+def test_settling_is_skipped_when_every_reading_is_interrupted(robot, tmp_path) -> None:
     play, settling = Effect.at(robot, "backlash", "elbow", values=[0.02]), ("settling", "wrist", [0.1, 0.5])
     found = []
     for effects in ((play,), (play, Effect.at(robot, *settling[:2], values=settling[2]))):
@@ -335,7 +335,7 @@ def test_settling_is_left_out_where_each_reading_is_an_interruption(robot, tmp_p
 
 
 @pytest.mark.parametrize("wrong", [np.nan, np.inf, pytest.param(-np.inf, marks=pytest.mark.soak)])
-def test_a_reading_that_is_not_finite_is_not_remembered(wrong, commands, robot, tmp_path) -> None:
+def test_non_finite_reading_leaves_memory_unchanged(wrong, commands, robot, tmp_path) -> None:
     pairs = [
         ("backlash", "elbow", [0.02]),
         ("settling", "wrist", [0.1, 0.5]),
@@ -356,7 +356,7 @@ def test_a_reading_that_is_not_finite_is_not_remembered(wrong, commands, robot, 
         np.testing.assert_array_equal(at[kept], x)
 
 
-def test_one_reading_that_is_not_finite_spares_other_joints(commands, robot, tmp_path) -> None:
+def test_non_finite_reading_of_one_joint_spares_others(commands, robot, tmp_path) -> None:
     names = ("joint_scale", "backlash", "hysteresis")
     effects = [began(sized(robot, where, 0.3, k)) for k, where in enumerate(everywhere(robot)) if where[0] in names]
     write_correction(Simulation(robot, tuple(effects)), tmp_path / "c.json", "")

@@ -134,7 +134,7 @@ def test_a_payload_loads_the_springs(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", list(EFFECT_TYPES))
-def test_what_mjcf_cannot_hold_is_listed(name: str, tmp_path: Path) -> None:
+def test_effects_unsupported_by_mjcf_are_listed(name: str, tmp_path: Path) -> None:
     robot, file = arm(tmp_path), tmp_path / "model.xml"
     where = next(where for where in everywhere(robot) if where[0] == name and where[1] != "rail")
     told = write_mjcf(Simulation(robot, (sized(robot, where, 1.0),)), file, "made by a test")
@@ -189,7 +189,7 @@ def test_springs_that_the_hand_relieved_are_left_out(tmp_path: Path) -> None:
     assert not mujoco.MjModel.from_xml_path(str(file)).jnt_stiffness.any()
 
 
-def test_a_wrong_number_in_the_urdf_has_its_line(tmp_path: Path) -> None:
+def test_wrong_urdf_number_is_reported_with_its_line(tmp_path: Path) -> None:
     robot = arm(tmp_path)
     robot.tree.file.write_text(robot.tree.file.read_text().replace('ixx="0.01"', 'ixx="much"', 1))
     with pytest.raises(RobotError, match=r"everything\.urdf, line 1: link .base.*much"):

@@ -18,7 +18,7 @@ def robot(tmp_path_factory):
     return arm(tmp_path_factory.mktemp("arm"))
 
 
-def test_a_flank_is_left_when_the_load_exceeds_friction() -> None:
+def test_flank_changes_when_load_exceeds_friction() -> None:
     torque = np.array([0.1, -0.1, 2.0, -0.5, -2.0, 0.5, 2.0])
     np.testing.assert_array_equal(flanks(torque, 1.0), [1, 1, 1, 1, -1, -1, 1])
     np.testing.assert_array_equal(flanks(torque, 0.0), np.sign(torque))
@@ -33,14 +33,14 @@ def test_a_flank_is_carried_on_row_by_row() -> None:
     np.testing.assert_array_equal(one_by_one, whole)
 
 
-def test_a_loaded_play_turns_its_joint_by_half_its_width(robot) -> None:
+def test_gravity_backlash_turns_joint_by_half_its_width(robot) -> None:
     play = Simulation(robot, (Effect.at(robot, "gravity_backlash", JOINT, values=[0.02, 0.0]),))
     run, k = play.run(MOTION), robot.joints.index(JOINT)
     torque = Simulation(robot).run(MOTION).torques[:, k]
     np.testing.assert_allclose(run.q[:, k] - MOTION.q[:, k], 0.01 * np.sign(torque), atol=1e-15)
 
 
-def test_a_payload_loads_springs_as_a_mass_of_the_urdf_does(tmp_path) -> None:
+def test_payload_loads_springs_like_a_urdf_mass(tmp_path) -> None:
     robot = arm(tmp_path)
     spring = Effect.at(robot, "joint_compliance", JOINT, values=[0.003])
     payload = Effect.at(robot, "payload", values=[0.4, 0.4 * 0.03, 0.0, 0.4 * 0.02])
@@ -57,7 +57,7 @@ def test_a_payload_without_springs_changes_nothing(robot) -> None:
     np.testing.assert_array_equal(simulation.positions(MOTION), Simulation(robot).positions(MOTION))
 
 
-def test_friction_lags_fully_after_a_long_way(robot) -> None:
+def test_friction_lag_saturates_after_a_long_move(robot) -> None:
     q = np.zeros((400, len(robot.joints)))
     q[:, 0] = np.concatenate([np.linspace(0.0, 1.0, 200), np.linspace(1.0, 0.0, 200)])
     effect = Effect.at(robot, "hysteresis", robot.joints[0], values=[0.01, 0.05])
@@ -67,7 +67,7 @@ def test_friction_lags_fully_after_a_long_way(robot) -> None:
     np.testing.assert_allclose(lag[200:], 0.01 * (2.0 * np.exp(-back / 0.05) - 1.0), atol=1e-12)
 
 
-def test_friction_does_not_depend_on_the_number_of_rows_on_a_way(robot) -> None:
+def test_friction_is_independent_of_rows_along_the_path(robot) -> None:
     effect = Effect.at(robot, "hysteresis", robot.joints[0], values=[0.01, 0.05])
     ends = []
     for rows in (2, 50):

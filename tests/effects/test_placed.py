@@ -40,7 +40,7 @@ def test_the_written_simulation_measures_the_same(tmp_path, flags) -> None:
     np.testing.assert_allclose(after.positions(walk()), before.positions(walk()), rtol=0.0, atol=1e-9)
 
 
-def test_what_is_not_known_is_no_effect_any_more_and_still_not_known(tmp_path) -> None:
+def test_unknown_pose_and_marker_are_stored_outside_effects(tmp_path) -> None:
     robot = roughly_known(tmp_path, "pose", "marker")
     after = load_simulation(write_extended(simulation(robot), tmp_path / "out", "x"))
     assert not {"camera_pose", "tool_offset"} & {effect.name for effect in after.effects}
@@ -48,13 +48,13 @@ def test_what_is_not_known_is_no_effect_any_more_and_still_not_known(tmp_path) -
     np.testing.assert_allclose(after.robot.robot.marker_xyz, np.add(robot.robot.marker_xyz, SHIFT), atol=1e-12)
 
 
-def test_what_is_known_stays_an_effect(tmp_path) -> None:
+def test_known_camera_pose_stays_an_effect(tmp_path) -> None:
     after = load_simulation(write_extended(simulation(roughly_known(tmp_path, "marker")), tmp_path / "out", "x"))
     assert "camera_pose" in {effect.name for effect in after.effects}
     assert "tool_offset" not in {effect.name for effect in after.effects}
 
 
-def test_a_model_over_the_markers_place_means_the_place_that_it_was_learnt_over(tmp_path) -> None:
+def test_place_map_keeps_its_original_marker_positions(tmp_path) -> None:
     robot = roughly_known(tmp_path, "pose", "marker")
     x = robot.chain.positions(walk().q)
     learnt = place_map(robot, lambda x: 0.1 * np.square(x), x, 1e-5)

@@ -25,13 +25,13 @@ def elbows_error(robot: RobotDescription, q: FloatArray) -> FloatArray:
     return Simulation(robot).run(Motion.still(q)).by_joint[:, :, ALL.index("elbow")] * error[:, None]
 
 
-def test_an_error_of_a_joint_that_is_a_series_of_anothers_angle_is_stored_to_within_the_tolerance(robot) -> None:
+def test_joint_error_in_another_angle_meets_tolerance(robot) -> None:
     stored = smooth_map(robot, lambda q: elbows_error(robot, q), walk().q, TOLERANCE_M)
     q = walk(seed=7).q
     assert np.abs(stored.predict(q) - elbows_error(robot, q)).max() < 5.0 * TOLERANCE_M
 
 
-def test_joints_beyond_which_nothing_turns_the_error_are_left_out(robot) -> None:
+def test_joints_that_do_not_affect_error_are_omitted(robot) -> None:
     def shift(q: FloatArray) -> FloatArray:
         return 0.01 * np.sin(2.0 * q[:, [ALL.index("elbow")]]) * np.array([1.0, 0.0, 2.0])
 
@@ -40,7 +40,7 @@ def test_joints_beyond_which_nothing_turns_the_error_are_left_out(robot) -> None
     np.testing.assert_allclose(stored.predict(walk(3).q), shift(walk(3).q), atol=5.0 * TOLERANCE_M)
 
 
-def test_a_function_of_the_markers_place_is_stored_over_its_coordinates(robot) -> None:
+def test_function_of_marker_position_is_stored_over_coordinates(robot) -> None:
     def shift(x: FloatArray) -> FloatArray:
         return 0.02 * np.square(x[:, [2]]) * x
 
@@ -50,12 +50,12 @@ def test_a_function_of_the_markers_place_is_stored_over_its_coordinates(robot) -
     assert np.abs(stored.predict(q) - shift(robot.chain.positions(q))).max() < 20.0 * TOLERANCE_M
 
 
-def test_a_shift_that_is_the_same_everywhere_is_stored(robot) -> None:
+def test_constant_shift_is_stored(robot) -> None:
     stored = smooth_map(robot, lambda q: np.tile([0.01, -0.02, 0.03], (len(q), 1)), walk().q, TOLERANCE_M)
     np.testing.assert_allclose(stored.predict(walk(3).q), np.tile([0.01, -0.02, 0.03], (120, 1)), atol=1e-9)
 
 
-def test_a_stored_map_with_factors_comes_back_from_the_file(robot, tmp_path) -> None:
+def test_stored_map_with_factors_round_trips_through_file(robot, tmp_path) -> None:
     stored = smooth_map(robot, lambda q: elbows_error(robot, q), walk().q, TOLERANCE_M)
     written = Simulation(robot, (Effect.at(robot, "joint_offset", "elbow", values=[0.01]),), stored)
     read = load_simulation(write_extended(written, tmp_path / "out", "x"))

@@ -25,7 +25,7 @@ def main_of(number: int, *arguments: Path) -> Any:
     return runpy.run_path(str(SCRIPTS[number - 1]))["main"](*arguments)
 
 
-def test_the_first_map_is_exact_on_the_whole_circle(capsys) -> None:
+def test_first_map_is_exact_on_full_circle(capsys) -> None:
     assert main_of(1) < 1e-9
     assert "learnt from 27 poses within ±60°: 81 numbers" in capsys.readouterr().out
 
@@ -38,7 +38,7 @@ def test_the_online_learner_gets_below_the_noise(capsys) -> None:
     assert "20 replays:" in capsys.readouterr().out
 
 
-def test_another_tool_is_known_to_the_noise_after_thirty_pairs(capsys) -> None:
+def test_new_tool_reaches_noise_after_thirty_pairs(capsys) -> None:
     errors = main_of(3)
     assert errors["second tool, no pair of it"] > 150.0
     assert errors["second tool, 30 pairs"] < 5.0 < errors["drawing"]
@@ -50,7 +50,7 @@ def calibrated(tmp_path) -> dict[str, Any]:
     return main_of(4, tmp_path)
 
 
-def test_thirty_pairs_calibrate_an_arm_and_the_report_is_a_table(calibrated, capsys) -> None:
+def test_thirty_pairs_calibrate_arm_with_report_table(calibrated, capsys) -> None:
     off = calibrated["learner"].predict(POSES) - calibrated["real"].positions(POSES)
     assert np.linalg.norm(off, axis=1).mean() < 0.002
     assert str(calibrated["report"]).count("±") == 9 + 4
@@ -87,7 +87,7 @@ def test_the_library_page_lists_them_all() -> None:
     assert re.findall(r"\(\.\./examples/([0-9]_\w+\.py)\)", page) == [script.name for script in SCRIPTS]
 
 
-def test_poses_of_a_tool_calibrate_the_camera_on_it(tmp_path, capsys) -> None:
+def test_tool_poses_calibrate_mounted_camera(tmp_path, capsys) -> None:
     """As docs/one_camera.md says, without a joint of the robot."""
     for file in (ROOT / "examples" / "tool_poses").iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())

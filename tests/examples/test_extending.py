@@ -83,7 +83,7 @@ def test_the_driver_reads_what_a_controller_sends(installed, robot_toml: Path) -
         assert "3 datagrams were not 4 numbers" in joints.health[0]
 
 
-def test_the_driver_s_port_can_be_taken_by_somebody_else(installed, robot_toml: Path) -> None:
+def test_driver_reports_port_in_use(installed, robot_toml: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
         config = with_udp(robot_toml, other.getsockname()[1])
@@ -91,7 +91,7 @@ def test_the_driver_s_port_can_be_taken_by_somebody_else(installed, robot_toml: 
             pass
 
 
-def test_a_driver_that_nobody_installed_is_named_with_its_line(installed, robot_toml: Path) -> None:
+def test_uninstalled_driver_error_names_its_line(installed, robot_toml: Path) -> None:
     with pytest.raises(ConfigError, match=r"line \d+: no installed package has a plugin 'upd'.*Did you mean 'udp'"):
         with_udp(robot_toml, 5005, name="upd")
 
@@ -128,7 +128,7 @@ def test_the_tracker_tells_why_there_is_no_dot(tracker: MarkerTracker, eyes, rea
     assert tracker.track(dotted(*eyes)) == MarkerMiss(1.0, reason)
 
 
-def test_the_effect_is_found_where_it_is_hidden_and_told_in_its_words(packages: Path, robot_toml: Path) -> None:
+def test_hidden_effect_is_found_and_described(packages: Path, robot_toml: Path) -> None:
     robot = RobotDescription.load(robot_toml)
     rng = np.random.default_rng(0)
     q = rng.uniform(0.9 * robot.lower, 0.9 * robot.upper, (200, len(robot.joints)))

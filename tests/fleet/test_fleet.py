@@ -95,7 +95,7 @@ def fleet(*words: str) -> None:
     app(["fleet", *words], exit_on_error=False, result_action="return_value")
 
 
-def test_all_robots_at_a_place_are_found_with_both_states(endpoint: str) -> None:
+def test_robots_are_found_with_both_states(endpoint: str) -> None:
     with robots(endpoint, {"left": 0.0, "right": 0.0, "spare": 0.0}), Fleet(places([endpoint], [])) as found:
         members = found.look()
     assert [member.name for member in members] == ["left", "right", "spare"]
@@ -113,7 +113,7 @@ def test_the_list_is_json_when_asked(endpoint: str, capsys: pytest.CaptureFixtur
     ]
 
 
-def test_the_list_has_a_row_a_robot_with_what_is_wrong_below(endpoint: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_list_has_row_per_robot_and_faults(endpoint: str, capsys: pytest.CaptureFixture[str]) -> None:
     with robots(endpoint, {"left": 0.0}, learners=False):
         fleet("--connect", endpoint)
     shown = " ".join(capsys.readouterr().out.split())
@@ -121,7 +121,7 @@ def test_the_list_has_a_row_a_robot_with_what_is_wrong_below(endpoint: str, caps
     assert "! left: its learner is not alive" in shown
 
 
-def test_a_described_robot_that_is_absent_is_in_the_list(tmp_path: Path, free_endpoint: Callable[[], str]) -> None:
+def test_absent_described_robot_is_listed(tmp_path: Path, free_endpoint: Callable[[], str]) -> None:
     here, elsewhere = free_endpoint(), free_endpoint()
     file = write_small_arm(tmp_path, f'[zenoh]\nsampler = "{elsewhere}"\nlearner = "{here}"\n')
     with robots(here, {"left": 0.0}), Fleet(places([], [file])) as found:
@@ -131,7 +131,7 @@ def test_a_described_robot_that_is_absent_is_in_the_list(tmp_path: Path, free_en
     assert members["left"].alive == {"sampler", "learner"}
 
 
-def test_a_place_where_nobody_listens_is_an_error_with_its_address(endpoint: str) -> None:
+def test_silent_endpoint_error_names_address(endpoint: str) -> None:
     with pytest.raises(BusError, match=f"nothing listens on {endpoint}"):
         fleet("--connect", endpoint)
 
@@ -149,7 +149,7 @@ def test_an_endpoint_that_cannot_be_meant_is_refused(endpoint: str, said: str) -
         places([endpoint], [])
 
 
-def test_the_unit_whose_waist_is_off_is_named_over_zenoh(endpoint: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unit_with_waist_offset_is_named(endpoint: str, capsys: pytest.CaptureFixture[str]) -> None:
     with robots(endpoint, {"left": 0.0, "right": 0.0, "spare": 0.05}):
         fleet("--compare", "--connect", endpoint)
     shown = " ".join(capsys.readouterr().out.split())
@@ -157,7 +157,7 @@ def test_the_unit_whose_waist_is_off_is_named_over_zenoh(endpoint: str, capsys: 
     assert f"zero of waist +{math.degrees(0.05):.2f} ± " in shown
 
 
-def test_robots_without_learners_are_not_compared_and_it_is_said_why(endpoint: str) -> None:
+def test_robots_without_learners_are_skipped_with_reason(endpoint: str) -> None:
     with robots(endpoint, {"left": 0.0}, learners=False), pytest.raises(RequestError, match="no learner of it answers"):
         fleet("--compare", "--connect", endpoint)
 
@@ -190,7 +190,7 @@ def test_one_odd_robot_does_not_shift_the_median(q: FloatArray, robots: int) -> 
     assert [unit.robot for unit in found.units if unit.is_off] == ["mm"]
 
 
-def test_of_two_robots_none_is_said_to_be_the_odd_one(q: FloatArray) -> None:
+def test_two_robots_have_no_odd_one(q: FloatArray) -> None:
     found = compared(JOINTS, q, [model("m", q, 0.0), model("mm", q, 0.05)])
     assert [unit.is_off for unit in found.units] == [None, None]
     assert "not possible to say which" in sentences(found)[-1]
@@ -201,13 +201,13 @@ def test_only_the_figure_that_differs_stands_out(q: FloatArray) -> None:
     assert [[odd.figure for odd in unit.odd] for unit in found.units] == [["zero of waist"], [], [], [], []]
 
 
-def test_a_zero_that_is_as_far_off_as_others_are_does_not_stand_out(q: FloatArray) -> None:
+def test_common_joint_offset_does_not_stand_out(q: FloatArray) -> None:
     waists = [-0.05, -0.02, 0.0, 0.03, 0.06]
     found = compared(JOINTS, q, [model("m" * k, q, waist) for k, waist in enumerate(waists, 1)])
     assert [unit.odd for unit in found.units] == [()] * 5
 
 
-def test_a_robot_that_hardly_moved_does_not_narrow_the_poses() -> None:
+def test_barely_moved_robot_does_not_narrow_poses() -> None:
     wide = {joint: JointRange(-1.0, 1.0, -3.0, 3.0) for joint in JOINTS}
     still = {joint: JointRange(0.0, 0.01, -3.0, 3.0) for joint in JOINTS}
     assert np.ptp(common_poses([wide, wide, still], JOINTS), axis=0).min() > 1.9

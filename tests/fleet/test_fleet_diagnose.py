@@ -60,7 +60,7 @@ def rows(told: tuple[object, str, str]) -> dict[str, dict]:
     return {row["name"]: row for row in json.loads(told[1])["rows"]}
 
 
-def test_the_unit_with_the_hidden_fault_is_named_with_its_joint_and_number(rows: dict[str, dict]) -> None:
+def test_hidden_fault_is_named_with_unit_and_joint(rows: dict[str, dict]) -> None:
     assert rows["right"]["verdict"] == "explained"
     (cause,) = rows["right"]["causes"]
     assert cause.startswith("joint_scale at elbow_pitch: scale +")
@@ -71,12 +71,12 @@ def test_a_unit_without_a_fault_has_none(rows: dict[str, dict]) -> None:
     assert rows["left"]["verdict"] == "nothing_found"
 
 
-def test_a_recording_that_fails_is_a_row_and_ends_no_other(rows: dict[str, dict]) -> None:
+def test_failing_recording_is_reported_beside_others(rows: dict[str, dict]) -> None:
     assert "there is no column for the joint" in rows["broken"]["error"]
     assert len(rows) == 3
 
 
-def test_the_unit_that_is_off_is_told_apart_from_its_type(told: tuple[object, str, str]) -> None:
+def test_unit_fault_is_separated_from_type_fault(told: tuple[object, str, str]) -> None:
     (found,) = json.loads(told[1])["types"]
     assert (sorted(found["well"]), list(found["off"])) == (["left"], ["right"])
 
@@ -89,11 +89,11 @@ def test_what_was_found_loads_as_a_robot_s_description(folder: Path, rows: dict[
     assert RobotDescription.load(folder / "out" / "right" / "extended.toml").joints
 
 
-def test_progress_is_a_line_for_each_that_is_done(told: tuple[object, str, str]) -> None:
+def test_progress_prints_line_per_finished_recording(told: tuple[object, str, str]) -> None:
     assert [line.split(":")[0] for line in told[2].splitlines()] == [f"{k} of 3" for k in range(1, 4)]
 
 
-def test_a_scheduler_that_does_not_answer_is_told_with_its_address(folder: Path, endpoint: str) -> None:
+def test_silent_scheduler_error_names_address(folder: Path, endpoint: str) -> None:
     address = endpoint.replace("tcp/", "tcp://")
     with mock.patch("bodyschema.fleet.diagnosing.CONNECT_LIMIT_S", 0.5):
         code, _, err = fleet(folder / "left.csv", "--robot", DESK_ARM, "--scheduler", address)
@@ -111,7 +111,7 @@ def test_a_folder_without_recordings_is_refused(tmp_path: Path) -> None:
         jobs([], tmp_path, None)
 
 
-def test_recordings_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> None:
+def test_equally_named_recordings_are_distinguished_by_folder(tmp_path: Path) -> None:
     files = [tmp_path / name / "pairs.csv" for name in ("left", "right")]
     assert [job.name for job in jobs(files, None, DESK_ARM)] == ["left_pairs", "right_pairs"]
 
@@ -155,7 +155,7 @@ def result(name: str, *effects: str) -> Diagnosed:
     return Diagnosed(Job(name, Path(name), Path()), "arm", ("waist", "elbow"), file)
 
 
-def test_what_most_units_have_is_told_of_their_description() -> None:
+def test_common_fault_is_attributed_to_description() -> None:
     (found,) = summary([result(name, "joint_offset") for name in "abc"] + [result("d")]).types
     assert found.off == {}
     assert "3 of 4 units have joint_offset at elbow (a, b, c)" in " ".join(sentences(found))

@@ -124,7 +124,7 @@ def test_pinocchio_reads_the_learnt_positions(seed, head, arm) -> None:
     np.testing.assert_allclose(x, chain.positions(some_q(robot)), rtol=0, atol=CLOSE_M)
 
 
-def test_a_second_calibration_replaces_the_frames_of_the_first(tmp_path) -> None:
+def test_recalibration_replaces_the_earlier_calibration_frames(tmp_path) -> None:
     _, _, file = written(tmp_path, 3, "R", "RFR")
     robot = RobotDescription.load(file)
     chain, geometry = learnt(robot, np.random.default_rng(4))
@@ -142,7 +142,7 @@ def before_and_after(tmp_path) -> tuple[ElementTree.Element, ElementTree.Element
     return tuple(ElementTree.parse(tmp_path / name).getroot() for name in ("robot.urdf", "out/robot.urdf"))
 
 
-def test_masses_and_limits_stay_and_two_links_are_new(before_and_after) -> None:
+def test_urdf_keeps_masses_and_limits_adding_two_links(before_and_after) -> None:
     before, after = before_and_after
     for tag in ("inertial", "limit"):
         texts = [[ElementTree.tostring(element) for element in root.iter(tag)] for root in before_and_after]
@@ -183,19 +183,19 @@ def test_comments_stay(tmp_path) -> None:
     assert ("<!-- From a test -->" in text, "<!-- kept -->" in text) == (True, True)
 
 
-def test_the_other_tables_of_robot_toml_stay_and_a_recording_is_found_where_it_was(tmp_path) -> None:
+def test_robot_toml_keeps_other_tables_and_recording_path(tmp_path) -> None:
     _, _, file = written(tmp_path, 1, "", "RR")
     before, after = read_toml(tmp_path / "robot.toml")[0], read_toml(file)[0]
     assert after["sim"] == before["sim"]
     assert (file.parent / after["drivers"]["recording"]).resolve() == tmp_path / "pairs.csv"
 
 
-def test_store_and_checkpoint_of_the_nominal_robot_are_left_alone(tmp_path) -> None:
+def test_calibrated_robot_has_its_own_state_directory(tmp_path) -> None:
     _, _, file = written(tmp_path, 1, "", "RR")
     assert (file.parent / read_toml(file)[0]["daemon"]["state_dir"]).resolve() == tmp_path / "out" / "state"
 
 
-def test_what_was_learnt_is_called_known(tmp_path) -> None:
+def test_calibrated_camera_and_marker_are_marked_known(tmp_path) -> None:
     robot = RobotDescription.load(written(tmp_path, 1, "", "RR")[2])
     assert (robot.camera.pose_known, robot.robot.marker_known) == (True, True)
 
@@ -206,7 +206,7 @@ def test_nothing_is_replaced(tmp_path) -> None:
         written(tmp_path, 1, "", "RR")
 
 
-def test_a_folder_that_cannot_be_made_is_told(tmp_path) -> None:
+def test_uncreatable_folder_is_reported(tmp_path) -> None:
     (tmp_path / "out").write_text("a file")
     with pytest.raises(ConfigError, match=r"out: cannot be written: File exists. Give another folder"):
         written(tmp_path, 1, "", "RR")
@@ -216,7 +216,7 @@ def test_a_folder_that_cannot_be_made_is_told(tmp_path) -> None:
 
 
 @given(st.integers(0, 10**6), st.text("RP", max_size=2), st.text("RP", min_size=1, max_size=4))
-def test_a_wrong_zero_turns_no_link_but_the_joint_s_own(seed, head, arm) -> None:
+def test_joint_offset_turns_only_the_joint_s_link(seed, head, arm) -> None:
     rng = np.random.default_rng(seed)
     with tempfile.TemporaryDirectory() as folder:
         robot = random_robot(rng, Path(folder), head=head, arm=arm)

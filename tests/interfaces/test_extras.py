@@ -29,7 +29,7 @@ def test_the_command_installs_into_this_environment(monkeypatch, pip: str | None
 
 
 @pytest.mark.parametrize("extra", [*extras.MODULES, "export", "rerun"])
-def test_the_command_names_an_extra_that_exists_or_a_package(extra: str) -> None:
+def test_install_command_names_an_existing_extra_or_package(extra: str) -> None:
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     named = extras.install_command(extra).rpartition(" ")[2].strip("'")
     assert named.removeprefix("bodyschema[").removesuffix("]") in {
@@ -40,7 +40,7 @@ def test_the_command_names_an_extra_that_exists_or_a_package(extra: str) -> None
 
 
 @pytest.mark.parametrize(("minor", "remedy"), [(11, "bodyschema[sim]"), (13, "no wheel for 3.13")])
-def test_without_a_wheel_of_pybullet_no_command_is_named(monkeypatch, minor: int, remedy: str) -> None:
+def test_missing_pybullet_wheel_yields_no_install_command(monkeypatch, minor: int, remedy: str) -> None:
     monkeypatch.setattr(sys, "version_info", Version(3, minor))
     error = extras.missing("pybullet", "sim", "the simulation")
     assert remedy in str(error)

@@ -60,14 +60,14 @@ def test_all_known_columns_are_kept(write) -> None:
     }
 
 
-def test_a_full_covariance_is_read_as_its_upper_triangle(write) -> None:
+def test_full_covariance_is_read_from_upper_triangle_columns(write) -> None:
     header = "waist,shoulder,x,y,z,cxx,cxy,cxz,cyy,cyz,czz\n"
     recording = Recording.read(write(header + "0,0,0,0,1,2,0.1,0.2,3,0.3,4\n"), JOINTS)
     assert recording.cov is not None
     assert recording.cov.tolist() == [[[2, 0.1, 0.2], [0.1, 3, 0.3], [0.2, 0.3, 4]]]
 
 
-def test_a_byte_order_mark_and_windows_line_ends_are_accepted(write) -> None:
+def test_byte_order_mark_and_crlf_are_accepted(write) -> None:
     text = "\ufeff" + GOOD.replace("\n", "\r\n")
     assert Recording.read(write(text), JOINTS).q.tolist() == [[0.1, 0.2], [0.3, 0.4]]
 
@@ -113,7 +113,7 @@ def test_arrays_of_a_recording_are_read_only(write) -> None:
         (GOOD.encode("utf-16"), None, None, "not UTF-8"),
     ],
 )
-def test_what_is_wrong_is_named_with_line_and_column(write, text, line, column, says) -> None:
+def test_csv_error_states_line_and_column(write, text, line, column, says) -> None:
     error = fault(write(text))
     assert says in str(error)
     assert error.column == column
@@ -122,7 +122,7 @@ def test_what_is_wrong_is_named_with_line_and_column(write, text, line, column, 
         assert f"line {line}" in str(error)
 
 
-def test_a_misspelt_joint_is_shown_beside_the_missing_one(write) -> None:
+def test_missing_joint_error_shows_the_misspelt_column(write) -> None:
     assert "sholder" in fault(write("waist,sholder,x,y,z\n0,0,1,2,3\n")).remedy
 
 
@@ -156,7 +156,7 @@ def test_an_unknown_ending_is_refused(write) -> None:
 
 
 @pytest.mark.parametrize("joint", ["x", "segment", "current_waist", "a,b", " a"])
-def test_a_joint_whose_name_cannot_be_a_column_is_refused(write, joint: str) -> None:
+def test_joint_name_unusable_as_column_is_rejected(write, joint: str) -> None:
     assert "Rename the joint" in fault(write(GOOD), ("waist", joint)).remedy
 
 
@@ -165,12 +165,12 @@ def test_a_recording_made_from_a_nan_is_refused() -> None:
         Recording(JOINTS, np.zeros((2, 2)), np.array([[0, 0, 0], [0, 0, np.nan]]))
 
 
-def test_a_recording_made_from_arrays_of_unequal_length_is_refused() -> None:
+def test_recording_rejects_arrays_of_unequal_length() -> None:
     with pytest.raises(ValueError, match="x has the shape"):
         Recording(JOINTS, np.zeros((2, 2)), np.zeros((3, 3)))
 
 
-def test_twelve_thousand_rows_are_read_in_half_a_second(tmp_path: Path) -> None:
+def test_reading_12000_rows_takes_under_half_a_second(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     joints = tuple(f"q{i}" for i in range(6))
     file = tmp_path / "large.csv"

@@ -131,7 +131,7 @@ def test_positions_in_two_frames_are_refused(tmp_path) -> None:
     assert "in the frames camera, other" in refused(bag)
 
 
-def test_a_torn_bag_is_told(tmp_path) -> None:
+def test_truncated_bag_is_rejected(tmp_path) -> None:
     bag = write_bag(tmp_path / "bag", {"/js": states(), "/p": marker()}, mcap=True)
     file = next(bag.glob("*.mcap"))
     file.write_bytes(file.read_bytes()[:2000])
@@ -139,7 +139,7 @@ def test_a_torn_bag_is_told(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("mcap", [True, False])
-def test_a_pipe_among_the_files_of_a_bag_is_refused(tmp_path, mcap) -> None:
+def test_named_pipe_in_a_bag_is_rejected(tmp_path, mcap) -> None:
     bag = write_bag(tmp_path / "bag", {"/js": states(), "/p": marker()}, mcap=mcap)
     (data,) = (file for file in bag.iterdir() if file.suffix != ".yaml")
     data.unlink()
@@ -155,7 +155,7 @@ def test_a_long_description_of_a_bag_is_refused(tmp_path) -> None:
     assert "larger than 1 MiB" in refused(bag)
 
 
-def test_a_chunk_that_unpacks_to_more_than_memory_is_refused(tmp_path, monkeypatch) -> None:
+def test_chunk_unpacking_beyond_memory_is_rejected(tmp_path, monkeypatch) -> None:
     zstd = pytest.importorskip("backports.zstd")
     monkeypatch.setattr(recording_bag, "MOST_MEMORY_BYTES", 2**26)
     unpacked = 2**28
@@ -185,7 +185,7 @@ def test_joints_too_fast_to_interpolate_are_left_out() -> None:
     assert np.asarray(read.t).max() < 5.0
 
 
-def test_clocks_apart_are_told() -> None:
+def test_disjoint_joint_and_marker_clocks_are_rejected() -> None:
     t, run = np.arange(0, 1, 0.01), np.zeros(100, dtype=np.int64)
     with pytest.raises(RecordingError, match=r"joints are from 0.000 to 0.990 s, the marker from 100.000"):
         joined(("j",), JointTrack(t, t[:, None], run), MarkerTrack(t + 100, np.zeros((100, 3)), run), Path("bag"))

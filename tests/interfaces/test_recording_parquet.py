@@ -43,7 +43,7 @@ def test_parquet_of_another_tool_is_read(tmp_path: Path) -> None:
         ({"t": [2.0, 1.0]}, "t", "row 2: the time"),
     ],
 )
-def test_what_is_wrong_is_named_with_row_and_column(tmp_path: Path, change, column, says) -> None:
+def test_parquet_error_states_row_and_column(tmp_path: Path, change, column, says) -> None:
     error = fault(parquet(tmp_path / "a.parquet", GOOD | change))
     assert says in str(error)
     assert error.column == column

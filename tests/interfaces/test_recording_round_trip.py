@@ -79,7 +79,7 @@ def test_every_bit_survives_a_round_trip(recording: Recording, ending: str) -> N
 
 
 @given(recordings(), st.data())
-def test_a_mutated_csv_is_refused_or_still_a_recording(recording: Recording, data: st.DataObject) -> None:
+def test_mutated_csv_is_rejected_or_still_valid(recording: Recording, data: st.DataObject) -> None:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "recording.csv"
         recording.write_csv(file)
@@ -98,7 +98,7 @@ def test_a_mutated_csv_is_refused_or_still_a_recording(recording: Recording, dat
 
 
 @given(recordings(), st.data())
-def test_a_mutated_parquet_is_refused_or_still_a_recording(recording: Recording, data: st.DataObject) -> None:
+def test_mutated_parquet_is_rejected_or_still_valid(recording: Recording, data: st.DataObject) -> None:
     pytest.importorskip("pyarrow")
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "recording.parquet"

@@ -40,13 +40,13 @@ def load(folder: Path, robot: str = ROBOT, urdf: str | None = URDF) -> RobotDesc
 # --- valid files
 
 
-def test_the_chain_leads_from_the_camera_to_the_marker(tmp_path) -> None:
+def test_chain_runs_from_camera_to_marker(tmp_path) -> None:
     robot = load(tmp_path)
     assert robot.chain.positions(np.zeros(2)) == pytest.approx([0.4, 0.0, 0.1])
     assert robot.chain.positions(np.array([np.pi / 2, -np.pi / 2])) == pytest.approx([0.0, 0.3, 0.2])
 
 
-def test_a_camera_that_rides_on_a_link_sees_the_joints_above_it_backwards(tmp_path) -> None:
+def test_hand_mounted_camera_reverses_the_chain(tmp_path) -> None:
     robot = load(
         tmp_path, ROBOT.replace('parent_link = "base"', 'parent_link = "tip"').replace('"tip"\n[', '"base"\n[')
         .replace('["waist", "shoulder"]', '["shoulder", "waist"]')
@@ -59,7 +59,7 @@ def test_a_joint_without_limits_turns_all_the_way(tmp_path) -> None:
     assert (robot.lower[0], robot.upper[1]) == (-3.0, np.pi)
 
 
-def test_a_joint_that_is_not_learnt_stands_where_held_at_says(tmp_path) -> None:
+def test_fixed_joint_uses_its_held_at_angle(tmp_path) -> None:
     held = ROBOT.replace('["waist", "shoulder"]', '["waist"]\nheld_at = {shoulder = -1.5707963267948966}')
     assert load(tmp_path, held).chain.positions(np.zeros(1)) == pytest.approx([0.3, 0.0, 0.2])
 
@@ -88,14 +88,14 @@ def test_a_joint_that_is_not_learnt_stands_where_held_at_says(tmp_path) -> None:
         ("[camera]", "[camera]\nfocal_px = 700", 6, "the stereo camera is described in part: principal_point_px"),
     ],
 )
-def test_a_wrong_name_is_told_with_its_line_and_the_remedy(tmp_path, right, wrong, line, said) -> None:
+def test_robot_toml_error_states_line_and_remedy(tmp_path, right, wrong, line, said) -> None:
     with pytest.raises(ConfigError) as refusal:
         load(tmp_path, ROBOT.replace(right, wrong))
     assert str(refusal.value).startswith(f"{tmp_path / 'robot.toml'}, line {line}: ")
     assert said in str(refusal.value)
 
 
-def test_a_joint_that_does_not_move_the_marker_is_told_with_those_that_do(tmp_path) -> None:
+def test_joint_not_moving_marker_error_lists_valid_joints(tmp_path) -> None:
     with pytest.raises(
         RobotError, match=r"robot.toml, line 4: joint 'shoulder' does not move the marker.*between them are: waist\)"
     ):
@@ -105,12 +105,12 @@ def test_a_joint_that_does_not_move_the_marker_is_told_with_those_that_do(tmp_pa
 # --- an invalid robot.toml
 
 
-def test_a_folder_in_the_place_of_robot_toml_is_told(tmp_path) -> None:
+def test_folder_given_as_robot_toml_is_rejected(tmp_path) -> None:
     with pytest.raises(ConfigError, match=r"a folder, not a file. Name the robot.toml in it"):
         RobotDescription.load(tmp_path)
 
 
-def test_a_binary_file_in_the_place_of_robot_toml_is_told_with_the_line(tmp_path) -> None:
+def test_binary_robot_toml_is_rejected_with_its_line(tmp_path) -> None:
     (tmp_path / "robot.toml").write_bytes(b"[robot]\nname = \xff\xfe")
     with pytest.raises(ConfigError, match=r"robot.toml, line 2: the byte 0xff is not UTF-8 text"):
         RobotDescription.load(tmp_path / "robot.toml")
@@ -123,12 +123,12 @@ def test_a_byte_order_mark_is_no_mistake(tmp_path) -> None:
 # --- an invalid URDF
 
 
-def test_a_urdf_that_is_not_there_is_told_with_the_key_to_mend(tmp_path) -> None:
+def test_missing_urdf_error_names_the_robot_toml_key(tmp_path) -> None:
     with pytest.raises(RobotError, match=r"arm.urdf: cannot read.*No such file.*by robot.urdf in robot.toml, line 3$"):
         load(tmp_path, urdf=None)
 
 
-def test_a_folder_in_the_place_of_the_urdf_is_told(tmp_path) -> None:
+def test_folder_given_as_urdf_is_rejected(tmp_path) -> None:
     (tmp_path / "arm.urdf").mkdir()
     with pytest.raises(RobotError, match=r"cannot read the URDF: Is a directory.*by robot.urdf in robot.toml, line 3$"):
         load(tmp_path, urdf=None)
@@ -163,7 +163,7 @@ def test_a_folder_in_the_place_of_the_urdf_is_told(tmp_path) -> None:
         ('<axis xyz="0 0 1"/>', '<mimic joint="shoulder"/>', "joint 'waist' mimics another joint. Replace it"),
     ],
 )
-def test_a_wrong_urdf_is_told_with_its_name_and_the_place(tmp_path, right, wrong, said) -> None:
+def test_invalid_urdf_error_states_file_and_place(tmp_path, right, wrong, said) -> None:
     assert right in URDF
     with pytest.raises(RobotError) as refusal:
         load(tmp_path, urdf=URDF.replace(right, wrong))
@@ -171,12 +171,12 @@ def test_a_wrong_urdf_is_told_with_its_name_and_the_place(tmp_path, right, wrong
     assert said in str(refusal.value)
 
 
-def test_an_empty_urdf_is_told(tmp_path) -> None:
+def test_empty_urdf_is_rejected(tmp_path) -> None:
     with pytest.raises(RobotError, match=r"arm.urdf.*: not XML"):
         load(tmp_path, urdf="")
 
 
-def test_xml_that_is_no_urdf_is_told_with_its_root(tmp_path) -> None:
+def test_non_urdf_xml_error_names_its_root_element(tmp_path) -> None:
     (tmp_path / "a.sdf").write_text("<sdf><model/></sdf>")
     with pytest.raises(RobotError, match=r"line 1: the root element is <sdf>, not <robot>"):
         UrdfTree.load(tmp_path / "a.sdf")

@@ -55,7 +55,7 @@ def kernel_scale(prior: KBMap, q: FloatArray) -> float:
     return float(np.square(prior.weights(q)).sum(axis=1).mean())
 
 
-def test_neighbours_in_steps_of_two_degrees_are_a_path() -> None:
+def test_two_degree_steps_count_as_a_path() -> None:
     prior = wrong_prior(random_chain(np.random.default_rng(0), "R" * JOINTS))
     assert follow_a_path(prior, path(np.random.default_rng(0), 100))
 
@@ -67,7 +67,7 @@ def test_poses_chosen_at_random_are_no_path(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_sweep_in_steps_of_25_degrees_is_no_path(seed: int) -> None:
+def test_sweep_in_25_degree_steps_is_no_path(seed: int) -> None:
     prior = wrong_prior(random_chain(np.random.default_rng(seed), "R" * JOINTS))
     assert not follow_a_path(prior, 12.5 * path(np.random.default_rng(seed), 100))
 
@@ -86,7 +86,7 @@ def test_too_few_pairs_for_blocks_trust_the_prior() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 3))])
-def test_the_chosen_precision_is_the_one_that_refits_without_each_block_choose(seed: int) -> None:
+def test_blockwise_precision_matches_refits_without_each_block(seed: int) -> None:
     rng = np.random.default_rng(seed)
     chain = random_chain(rng, "RR")
     prior, q = wrong_prior(chain), path(rng, 120, joints=2)
@@ -112,7 +112,7 @@ def test_the_chosen_precision_is_the_one_that_refits_without_each_block_choose(s
     assert blockwise_precision(prior, q, x) == pytest.approx(largest)
 
 
-def test_where_neighbours_share_their_errors_blocks_choose_better_than_the_evidence() -> None:
+def test_blockwise_precision_beats_evidence_under_correlated_errors() -> None:
     ratios = []
     for seed in SEEDS:
         rng = np.random.default_rng(seed)
@@ -131,7 +131,7 @@ def test_where_neighbours_share_their_errors_blocks_choose_better_than_the_evide
     assert max(ratios) < 1.3, np.round(ratios, 2)
 
 
-def test_positions_that_do_not_go_with_the_angles_are_refused() -> None:
+def test_mismatched_numbers_of_positions_and_angles_are_refused() -> None:
     prior = wrong_prior(random_chain(np.random.default_rng(0), "R" * JOINTS))
     with pytest.raises(ShapeError, match=r"to go with q"):
         blockwise_precision(prior, np.zeros((5, JOINTS)), np.zeros((4, 3)))

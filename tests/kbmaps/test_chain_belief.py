@@ -15,7 +15,7 @@ SLIGHT = ChainTolerances(axes=1e-4, points=1e-4, zeros=1e-4, tool=1e-4, base_rot
 
 
 @given(seed=seeds, first=st.integers(1, 39))
-def test_what_was_believed_before_and_new_pairs_give_what_all_pairs_give(seed, first):
+def test_belief_plus_new_pairs_equals_joint_fit(seed, first):
     rng = np.random.default_rng(seed)
     arm = rough_arm(rng, "RRRR", SLIGHT)
     q, x = arm.pairs(rng, 40, 1e-4)
@@ -31,7 +31,7 @@ def test_what_was_believed_before_and_new_pairs_give_what_all_pairs_give(seed, f
 
 
 @given(seed=seeds)
-def test_another_tool_is_learnt_from_three_exact_pairs_without_losing_the_arm(seed):
+def test_new_tool_is_learnt_from_three_exact_pairs(seed):
     rng = np.random.default_rng(seed)
     arm = rough_arm(rng)
     learner = RigidLearner(arm.nominal, ROUGH)
@@ -42,7 +42,7 @@ def test_another_tool_is_learnt_from_three_exact_pairs_without_losing_the_arm(se
     assert moved.error(after, rng) < 1e-6
 
 
-def test_a_tool_that_was_held_is_set_free_by_its_change():
+def test_tool_change_frees_a_fixed_tool():
     rng = np.random.default_rng(5)
     tolerances = replace(ROUGH, tool=0.0)
     arm = rough_arm(rng, tolerances=tolerances)
@@ -54,7 +54,7 @@ def test_a_tool_that_was_held_is_set_free_by_its_change():
     assert moved.error(after, rng) < 1e-5
 
 
-def test_another_tool_leaves_the_belief_in_the_arm_as_it_was():
+def test_tool_change_widens_only_the_tool_covariance():
     rng = np.random.default_rng(6)
     arm = rough_arm(rng)
     learner = RigidLearner(arm.nominal, ROUGH)
@@ -67,7 +67,7 @@ def test_another_tool_leaves_the_belief_in_the_arm_as_it_was():
     np.testing.assert_allclose(added, expected, rtol=0, atol=1e-12)
 
 
-def test_a_learner_with_a_told_prior_survives_as_bytes():
+def test_learner_with_given_prior_round_trips_through_bytes():
     rng = np.random.default_rng(7)
     arm = rough_arm(rng)
     q, x = arm.pairs(rng, 50, 0.005)
@@ -79,7 +79,7 @@ def test_a_learner_with_a_told_prior_survives_as_bytes():
     np.testing.assert_array_equal(copy.estimate(q).sigma, learner.estimate(q).sigma)
 
 
-def test_without_pairs_the_tolerances_are_what_is_believed():
+def test_belief_without_pairs_equals_the_tolerances():
     arm = rough_arm(np.random.default_rng(8))
     learner = RigidLearner(arm.nominal, ROUGH)
     expected = learner.belief.parameters.standard_deviations(ROUGH)
@@ -107,7 +107,7 @@ def test_a_belief_that_is_not_finite_is_refused():
 
 
 @pytest.mark.parametrize("told", [None, 0.002])
-def test_a_belief_knows_how_far_the_pairs_lay_around_the_chain(told):
+def test_belief_noise_matches_scatter_of_the_pairs(told):
     rng = np.random.default_rng(3)
     arm = rough_arm(rng)
     learner = RigidLearner(arm.nominal, ROUGH)
@@ -115,7 +115,7 @@ def test_a_belief_knows_how_far_the_pairs_lay_around_the_chain(told):
     assert learner.belief.noise == pytest.approx(0.005, rel=0.1)
 
 
-def test_what_a_belief_knows_of_the_noise_survives_as_bytes_and_another_tool():
+def test_belief_noise_survives_bytes_and_tool_change():
     rng = np.random.default_rng(4)
     arm = rough_arm(rng)
     learner = RigidLearner(arm.nominal, ROUGH)
@@ -125,7 +125,7 @@ def test_what_a_belief_knows_of_the_noise_survives_as_bytes_and_another_tool():
     assert learner.belief.with_other_tool(0.2).noise == noise
 
 
-def test_a_chain_that_may_be_another_is_as_unsure_as_both_and_as_far_apart_as_they_are():
+def test_mixed_belief_covariance_includes_distance_between_means():
     parameters = ChainParameters(rough_arm(np.random.default_rng(21), "RRR").nominal)
     rng = np.random.default_rng(22)
     near, far = (

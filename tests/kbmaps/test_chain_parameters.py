@@ -34,7 +34,7 @@ def test_the_jacobian_is_the_derivative_of_the_positions(seed, kinds, size):
 
 
 @given(seed=seeds, kinds=kinds, size=st.sampled_from([0.0, 0.02, 0.5]))
-def test_the_chain_of_a_change_has_the_positions_of_the_change(seed, kinds, size):
+def test_changed_chain_has_positions_of_the_parameter_change(seed, kinds, size):
     rng = np.random.default_rng(seed)
     parameters = ChainParameters(random_chain(rng, kinds))
     change, q = random_change(rng, parameters, size), random_q(rng, kinds, 5, 180)
@@ -49,7 +49,7 @@ def test_no_change_gives_the_reference_back():
 
 
 @given(seed=seeds, joints=st.integers(2, 7))
-def test_four_numbers_a_revolute_joint_and_three_for_the_tool_are_all_that_positions_show(seed, joints):
+def test_positions_identify_four_parameters_per_joint_plus_tool(seed, joints):
     rng = np.random.default_rng(seed)
     parameters = ChainParameters(random_chain(rng, "R" * joints))
     q = random_q(rng, "R" * joints, 100, 170)
@@ -71,13 +71,13 @@ def test_every_parameter_has_a_name_of_its_own():
     assert len(set(parameters.names())) == parameters.size
 
 
-def test_the_shift_of_a_sliding_axis_is_held_whatever_the_tolerance():
+def test_prismatic_axis_shift_is_fixed_at_any_tolerance():
     parameters = ChainParameters(random_chain(np.random.default_rng(0), "RP"))
     std = parameters.standard_deviations(ChainTolerances(points=0.01))
     np.testing.assert_array_equal(std[parameters.shifts], [0.01, 0.01, 0.0, 0.0])
 
 
 @pytest.mark.parametrize("wrong", [-1.0, float("nan")])
-def test_a_tolerance_that_is_none_is_refused_by_its_name(wrong):
+def test_invalid_tolerance_is_refused_by_its_name(wrong):
     with pytest.raises(SettingError, match="tool"):
         ChainTolerances(tool=wrong)

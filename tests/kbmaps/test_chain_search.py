@@ -9,7 +9,7 @@ from kbmaps.chains.search import Descents, ScrewArms
 
 
 @pytest.mark.parametrize("kinds", ["RRRRRRR", "RRRRRR", "RRPRR"])
-def test_a_chain_is_found_from_sixty_exact_pairs_and_nothing_else(kinds):
+def test_chain_is_found_from_sixty_exact_pairs_alone(kinds):
     found = 0
     for seed in range(4):
         rng = np.random.default_rng(seed)
@@ -22,7 +22,7 @@ def test_a_chain_is_found_from_sixty_exact_pairs_and_nothing_else(kinds):
     assert found == 4
 
 
-def test_a_found_chain_is_the_start_of_a_learner_without_a_prior():
+def test_found_chain_initialises_a_learner_without_prior():
     rng = np.random.default_rng(0)
     chain = random_chain(rng, "RRRRRR")
     q = random_q(rng, "RRRRRR", 300, 80)
@@ -36,7 +36,7 @@ def test_a_found_chain_is_the_start_of_a_learner_without_a_prior():
 
 
 @pytest.mark.parametrize("kinds", ["RRRR", "RPRR"])
-def test_a_descent_ends_in_the_same_place_alone_and_among_others(kinds):
+def test_descent_result_is_independent_of_parallel_descents(kinds):
     rng = np.random.default_rng(3)
     chain, slides = random_chain(rng, kinds), np.array([kind == "P" for kind in kinds])
     q = random_q(rng, kinds, 30, 80)
@@ -60,7 +60,7 @@ def test_the_same_generator_finds_the_same_chain():
     np.testing.assert_array_equal(first.fixed, second.fixed)
 
 
-def test_fewer_pairs_than_unknowns_are_refused_with_the_number_needed():
+def test_too_few_pairs_error_states_number_needed():
     with pytest.raises(DegenerateDataError, match="record 11"):
         find_chain(np.zeros((10, 7)), np.zeros((10, 3)), rng=np.random.default_rng(0))
 
@@ -79,6 +79,6 @@ def test_impossible_settings_are_refused(settings, error):
         find_chain(np.zeros((30, 3)), np.ones((30, 3)), rng=np.random.default_rng(0), **settings)
 
 
-def test_a_seed_in_place_of_a_generator_is_refused_with_what_to_write():
+def test_seed_instead_of_generator_error_names_default_rng():
     with pytest.raises(SettingError, match="default_rng"):
         find_chain(np.zeros((20, 2)), np.zeros((20, 3)), rng=0)

@@ -84,7 +84,7 @@ class Arm:
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 3))])
-def test_a_change_ten_times_the_noise_is_noticed_within_ten_pairs_and_dated(seed: int, kind: str) -> None:
+def test_large_change_is_dated_within_ten_pairs(seed: int, kind: str) -> None:
     arm = Arm(seed)
     arm.change(kind, 10.0 * SIGMA)
     detector, pairs = arm.noticed()
@@ -95,7 +95,7 @@ def test_a_change_ten_times_the_noise_is_noticed_within_ten_pairs_and_dated(seed
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 3))])
-def test_a_change_is_named_rightly_by_the_pairs_since(seed: int, kind: str) -> None:
+def test_pairs_since_a_change_identify_its_kind(seed: int, kind: str) -> None:
     arm = Arm(seed)
     arm.change(kind, 10.0 * SIGMA)
     kinds = (*change_kinds(arm.parameters, 0.5), any_change(arm.parameters))
@@ -105,7 +105,7 @@ def test_a_change_is_named_rightly_by_the_pairs_since(seed: int, kind: str) -> N
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 3))])
-def test_the_noise_of_many_pairs_is_not_taken_for_a_change_of_everything(seed: int, kind: str) -> None:
+def test_many_noisy_pairs_still_identify_the_single_change(seed: int, kind: str) -> None:
     arm = Arm(seed, BEFORE + 400)
     arm.change(kind, 5.0 * SIGMA)
     kinds = (*change_kinds(arm.parameters, 0.5), any_change(arm.parameters))
@@ -113,7 +113,7 @@ def test_the_noise_of_many_pairs_is_not_taken_for_a_change_of_everything(seed: i
     assert (best.kind.name, best.kind.joint) == (kind, KINDS[kind])
 
 
-def test_where_the_arm_hardly_moved_since_nothing_is_named() -> None:
+def test_no_kind_is_named_when_arm_hardly_moved() -> None:
     arm = Arm(0)
     arm.change("tool", 10.0 * SIGMA)
     kinds = change_kinds(arm.parameters, 0.5)
@@ -137,7 +137,7 @@ def test_without_a_change_there_is_no_alarm(seed: int) -> None:
         assert not detector.suspicion().alarm
 
 
-def test_without_a_change_the_likelihood_ratio_is_one_on_average() -> None:
+def test_mean_likelihood_ratio_is_one_without_a_change() -> None:
     # Small sizes: of large ones the mean is made of values too rare to draw.
     rng = np.random.default_rng(0)
     information = np.diag([0.2, 0.5, 1.0])
@@ -146,7 +146,7 @@ def test_without_a_change_the_likelihood_ratio_is_one_on_average() -> None:
     assert ratios.mean() == pytest.approx(1.0, abs=0.01)
 
 
-def test_two_wild_outliers_in_a_row_are_no_change() -> None:
+def test_two_consecutive_gross_outliers_raise_no_alarm() -> None:
     arm = Arm(1)
     arm.x[BEFORE : BEFORE + 2] += 1.0
     detector = arm.detector()
@@ -163,7 +163,7 @@ def test_noise_that_has_doubled_is_no_change() -> None:
         assert not detector.suspicion().alarm
 
 
-def test_what_neighbours_share_makes_runs_of_them_say_less() -> None:
+def test_shared_neighbour_errors_raise_the_variance_of_runs() -> None:
     rng = np.random.default_rng(0)
     alone = rng.normal(size=(600, 3))
     shared = alone + np.repeat(rng.normal(size=(60, 3)), 10, axis=0)
@@ -182,7 +182,7 @@ def alarms(arm: Arm, every: int) -> Iterator[tuple[int, bool]]:
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.soak
-def test_an_arm_that_bends_raises_no_alarm_that_stands(seed: int) -> None:
+def test_compliant_arm_raises_no_lasting_alarm(seed: int) -> None:
     arm = Arm(seed, 200)
     arm.bend(3.0 * SIGMA)
     raised = list(alarms(arm, every=40))
@@ -190,7 +190,7 @@ def test_an_arm_that_bends_raises_no_alarm_that_stands(seed: int) -> None:
     assert not any(stands for _, stands in raised)
 
 
-def test_encoders_beside_their_axes_raise_no_alarm_that_stands() -> None:
+def test_eccentric_encoders_raise_no_lasting_alarm() -> None:
     arm = Arm(0, 200)
     arm.err(8.0 * SIGMA)
     raised = list(alarms(arm, every=40))
@@ -199,7 +199,7 @@ def test_encoders_beside_their_axes_raise_no_alarm_that_stands() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 3))])
-def test_that_an_arm_did_not_bend_before_makes_a_change_more_probable(seed: int) -> None:
+def test_earlier_rigid_behaviour_raises_the_odds_of_change(seed: int) -> None:
     arm, earlier = Arm(seed), Arm(seed, 400)
     arm.change("tool", 2.0 * SIGMA)
     unaware, aware = arm.detector(), arm.detector()
@@ -211,7 +211,7 @@ def test_that_an_arm_did_not_bend_before_makes_a_change_more_probable(seed: int)
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 3))])
-def test_a_change_of_an_arm_that_bends_is_noticed_and_dated(seed: int) -> None:
+def test_change_of_compliant_arm_is_detected_and_dated(seed: int) -> None:
     arm = Arm(seed, speed=0.4)
     arm.bend(2.0 * SIGMA)
     arm.change("tool", 10.0 * SIGMA)
@@ -253,7 +253,7 @@ def test_the_number_of_kept_errors_is_bounded(monkeypatch: pytest.MonkeyPatch) -
     assert detector.surprises.shape == (100, 3)
 
 
-def test_pairs_that_come_together_say_what_they_say_one_by_one() -> None:
+def test_batched_pairs_give_same_odds_as_single_pairs() -> None:
     arm, one, all_ = Arm(0), Arm(0).detector(), Arm(0).detector()
     arm.feed(all_, slice(50))
     for k in range(50):
@@ -263,7 +263,7 @@ def test_pairs_that_come_together_say_what_they_say_one_by_one() -> None:
 
 @pytest.mark.parametrize("sigma_m", [1e-3, 1e-6, 1e-9])
 @pytest.mark.soak
-def test_however_exact_thousands_of_pairs_are_what_is_not_known_never_becomes_less_than_nothing(sigma_m) -> None:
+def test_thousands_of_exact_pairs_keep_detector_finite(sigma_m) -> None:
     arm = Arm(0, pairs=3000)
     arm.x = arm.parameters.positions(arm.truth, arm.q)
     detector = ChangeDetector(arm.belief, SharedNoise(np.ones(1), 1.0), sigma_m, 0.5)
@@ -272,13 +272,13 @@ def test_however_exact_thousands_of_pairs_are_what_is_not_known_never_becomes_le
     assert np.isfinite(detector.suspicion().log_odds)
 
 
-def test_residuals_that_are_nothing_have_a_variance_all_the_same() -> None:
+def test_zero_residuals_have_a_positive_finite_variance() -> None:
     noise = SharedNoise.of(np.zeros((200, 3)))
     assert noise.single > 0.0
     assert np.isfinite(noise.variances).all()
 
 
-def test_readings_that_are_rounded_alike_say_no_more_than_one_for_ten_neighbours_and_more_from_then_on() -> None:
+def test_repeated_noise_averages_out_only_beyond_ten_neighbours() -> None:
     noise = SharedNoise.repeated(1.0)
     of_means = noise.of_runs(np.array([1.0, 5.0, 10.0, 40.0])) / np.array([1.0, 5.0, 10.0, 40.0])
     np.testing.assert_allclose(of_means, [1.0, 1.0, 1.0, 0.25])

@@ -29,7 +29,7 @@ def test_the_more_trusted_of_two_equal_models_answers():
     assert contest(0.001, 0.001, 200).best(TRUSTED, "none") == "rigid"
 
 
-def test_a_model_that_is_clearly_better_answers_though_it_is_less_trusted():
+def test_clearly_better_model_answers_despite_less_trust():
     assert contest(0.01, 0.001, 50).best(TRUSTED, "none") == "bent"
 
 
@@ -37,7 +37,7 @@ def test_without_noise_an_exact_model_answers():
     assert contest(0.01, 0.0, 50, noise=0.0).best(TRUSTED, "none") == "bent"
 
 
-def test_a_small_difference_is_seen_below_a_noise_that_both_meet():
+def test_better_model_is_found_below_common_noise():
     chosen = [contest(0.003, 0.001, 400, noise=0.005, seed=seed).best(TRUSTED, "none") for seed in range(20)]
     assert chosen.count("bent") >= 18
 
@@ -53,7 +53,7 @@ def test_noise_alone_seldom_unseats_the_more_trusted_model():
 
 
 @pytest.mark.parametrize("pairs", [0, 2])
-def test_with_too_few_pairs_who_answered_goes_on(pairs):
+def test_answering_model_continues_with_too_few_pairs(pairs):
     assert contest(0.01, 0.001, pairs).best(TRUSTED, "bent") == "bent"
 
 
@@ -64,7 +64,7 @@ def test_a_prediction_that_is_not_finite_is_none():
     assert held.best(TRUSTED, "rigid") == "bent"
 
 
-def test_outliers_that_all_models_meet_do_not_hide_who_is_better():
+def test_common_outliers_do_not_hide_the_better_model():
     rng, held = np.random.default_rng(1), PrequentialComparison()
     for k in range(300):
         measured = 0.002 * rng.normal(size=3) + (0.3 * rng.normal(size=3) if k % 7 == 0 else 0.0)
@@ -72,14 +72,14 @@ def test_outliers_that_all_models_meet_do_not_hide_who_is_better():
     assert held.best(TRUSTED, "none") == "bent"
 
 
-def test_what_was_long_ago_does_not_count():
+def test_old_errors_do_not_count():
     held, rng = contest(0.001, 0.02, 300), np.random.default_rng(1)
     for _ in range(800):
         held.add(squares(0.005 * rng.normal(size=3), (0.02, 0.001)))
     assert held.best(TRUSTED, "none") == "bent"
 
 
-def test_a_model_that_became_another_one_is_judged_anew():
+def test_forgotten_model_is_compared_on_new_pairs_only():
     held = contest(0.02, 0.001, 50)
     held.forget("rigid")
     assert held.best(TRUSTED, "none") == "bent"
@@ -114,14 +114,14 @@ def test_a_model_that_fails_lately_does_not_answer(failing: int):
     assert held.best(TRUSTED, "none") == "rigid"
 
 
-def test_errors_are_told_on_the_same_pairs_for_all():
+def test_recent_errors_use_the_same_pairs_for_all():
     held = PrequentialComparison()
     for k in range(60):
         held.add({"rigid": 0.004**2 if k < 30 else 0.001**2} | ({} if k < 40 else {"bent": 0.002**2}))
     assert held.recent("rigid") == Recent(20, {"rigid": pytest.approx(0.001), "bent": pytest.approx(0.002)})
 
 
-def test_a_model_of_few_pairs_is_not_told_beside_an_older_one():
+def test_recent_errors_omit_models_with_few_pairs():
     held = PrequentialComparison()
     for k in range(60):
         held.add({"rigid": 0.001**2} | ({} if k < 55 else {"bent": 0.002**2}))
@@ -129,7 +129,7 @@ def test_a_model_of_few_pairs_is_not_told_beside_an_older_one():
     assert held.recent("bent") == Recent(5, {"rigid": pytest.approx(0.001), "bent": pytest.approx(0.002)})
 
 
-def test_before_any_pair_no_errors_are_told():
+def test_recent_errors_are_empty_before_any_pair():
     assert PrequentialComparison().recent("rigid") == Recent(0, {})
 
 
@@ -143,7 +143,7 @@ def test_neighbours_that_fare_alike_count_as_one():
     assert held.best(TRUSTED, "none") == "rigid"
 
 
-def test_a_model_that_was_found_late_is_judged_on_pairs_that_it_had_not_learnt():
+def test_late_model_is_compared_on_pairs_not_learnt():
     held = contest(0.01, 0.001, 50)
     for square in held.errors["rigid"]:
         held.add({"rigid": float(square)})
@@ -151,7 +151,7 @@ def test_a_model_that_was_found_late_is_judged_on_pairs_that_it_had_not_learnt()
     assert held.best(TRUSTED, "none") == "bent"
 
 
-def test_pairs_that_come_together_count_as_one_after_the_other():
+def test_batched_errors_count_like_single_errors():
     rng = np.random.default_rng(3)
     values = {name: rng.random(250) for name in TRUSTED}
     together, each = PrequentialComparison(), PrequentialComparison()

@@ -159,7 +159,7 @@ DAMAGE = {
 
 @pytest.mark.parametrize("damage", DAMAGE)
 @pytest.mark.parametrize("name", NAMES)
-def test_arrays_that_are_missing_or_do_not_fit_are_refused(name, damage):
+def test_missing_or_mismatched_arrays_are_refused(name, damage):
     kind, fields, arrays = opened(stored()[name][1])
     for spoilt in arrays:
         if (damage == "not a number" and spoilt in WITH_NAN) or (damage == "shorter" and spoilt == "used"):
@@ -170,13 +170,13 @@ def test_arrays_that_are_missing_or_do_not_fit_are_refused(name, damage):
         assert refused_or_the_same(name, closed(kind, fields, parts)), spoilt
 
 
-def test_no_number_is_written_that_json_does_not_have():
+def test_numbers_invalid_in_json_are_not_written():
     with pytest.raises(ValueError, match="JSON"):
         pack("model", {"tolerance": math.inf}, {})
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_header_of_every_model_is_json_as_its_standard_has_it(name):
+def test_every_model_header_is_standard_json(name):
     data = stored()[name][1]
     _, _, length = PREFIX.unpack_from(data)
     assert json.loads(data[PREFIX.size : PREFIX.size + length], parse_constant=pytest.fail)

@@ -25,20 +25,20 @@ def peaked(at: float, asked: list[float]) -> Callable[[float], float]:
 
 
 @given(at=st.floats(1e-6, 1e6), start=st.floats(1e-6, 1e6))
-def test_a_peak_is_found_to_a_tenth_of_a_step(at, start):
+def test_evidence_peak_is_found_within_tenth_of_step(at, start):
     found = most_evident(peaked(at, []), start, LOW, HIGH)
     assert abs(math.log(found / at)) <= 0.1 * math.log(8.0) + 1e-9
 
 
 @pytest.mark.parametrize("off", [1.0, 1.2, 1 / 1.2])
-def test_a_search_from_its_end_asks_three_times_and_for_the_best_last(off):
+def test_search_started_at_peak_takes_three_evaluations(off):
     asked: list[float] = []
     found = most_evident(peaked(0.3, asked), 0.3 * off, LOW, HIGH)
     assert len(asked) == 3
     assert asked[-1] == found
 
 
-def test_a_peak_beyond_the_limits_is_sought_at_the_limit():
+def test_peak_beyond_the_limits_gives_the_limit():
     assert most_evident(peaked(1e12, []), 1.0, LOW, HIGH) == pytest.approx(HIGH)
 
 

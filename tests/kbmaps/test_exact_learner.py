@@ -26,29 +26,29 @@ def exactness_error(rng: np.random.Generator, joint_kinds: str, *, cluster_deg: 
 
 
 @pytest.mark.parametrize("joints", [1, 2, 3, 4, 5])
-def test_as_many_samples_as_control_points_give_the_chain_back(joints):
+def test_revolute_chain_is_recovered_from_minimum_samples(joints):
     assert exactness_error(np.random.default_rng(joints), "R" * joints, cluster_deg=80, times=1) < 1e-9
 
 
 @pytest.mark.parametrize("joint_kinds", MIXED)
-def test_as_many_samples_as_control_points_give_a_mixed_chain_back(joint_kinds):
+def test_mixed_chain_is_recovered_from_minimum_samples(joint_kinds):
     assert exactness_error(np.random.default_rng(11), joint_kinds, cluster_deg=80, times=1) < 1e-9
 
 
 @pytest.mark.parametrize("joints", [1, 2, 3, 4, 5])
-def test_twice_as_many_samples_from_a_small_cluster_give_the_whole_chain_back(joints):
+def test_small_cluster_of_twice_minimum_samples_recovers_chain(joints):
     assert exactness_error(np.random.default_rng(joints), "R" * joints, cluster_deg=20, times=2) < 1e-7
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("joints", [6, 7])
-def test_six_and_seven_joints_are_given_back_by_as_many_samples_as_control_points(joints):
+def test_six_and_seven_joints_recovered_from_minimum_samples(joints):
     assert exactness_error(np.random.default_rng(joints), "R" * joints, cluster_deg=80, times=1) < 1e-9
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("joints", [6, 7])
-def test_six_and_seven_joints_are_given_back_from_a_small_cluster(joints):
+def test_six_and_seven_joints_recovered_from_small_cluster(joints):
     assert exactness_error(np.random.default_rng(joints), "R" * joints, cluster_deg=20, times=2) < 1e-5
 
 
@@ -60,7 +60,7 @@ def test_exactness_holds_for_fifty_random_chains(joints):
 
 
 @given(seed=seeds, joint_kinds=kinds, share=st.floats(0.1, 1.0))
-def test_too_few_pairs_give_the_solution_nearest_to_the_prior(seed, joint_kinds, share):
+def test_too_few_pairs_give_solution_nearest_to_prior(seed, joint_kinds, share):
     rng = np.random.default_rng(seed)
     prior = random_map(rng, bases_for(joint_kinds))
     n = max(1, int(share * prior.size))
@@ -76,7 +76,7 @@ def test_too_few_pairs_give_the_solution_nearest_to_the_prior(seed, joint_kinds,
 
 
 @given(seed=seeds, copies=st.integers(2, 40))
-def test_repeated_pairs_leave_the_solution_nearest_to_the_prior(seed, copies):
+def test_repeated_pairs_leave_minimum_norm_solution_unchanged(seed, copies):
     rng = np.random.default_rng(seed)
     prior = random_map(rng, bases_for("RR"))
     q, x = random_q(rng, "RR", 4, 80), rng.normal(size=(4, 3))
@@ -127,7 +127,7 @@ def test_pairs_one_at_a_time_equal_a_batch():
 
 
 @given(seed=seeds, precision=st.floats(1e-4, 10.0), pairs=st.sampled_from([5, 27, 200]))
-def test_the_ridge_is_the_posterior_mean_around_the_prior(seed, precision, pairs):
+def test_ridge_solution_is_posterior_mean_around_prior(seed, precision, pairs):
     rng = np.random.default_rng(seed)
     prior = random_map(rng, bases_for("RRR"))
     q, x = random_q(rng, "RRR", pairs, 80), rng.normal(size=(pairs, 3))
@@ -142,7 +142,7 @@ def test_the_ridge_is_the_posterior_mean_around_the_prior(seed, precision, pairs
 
 
 @pytest.mark.parametrize("pairs", [15, 60])
-def test_the_log_evidence_is_the_gaussian_likelihood_at_its_best_noise(pairs):
+def test_log_evidence_is_gaussian_likelihood_at_best_noise(pairs):
     rng = np.random.default_rng(4)
     prior = random_map(rng, bases_for("RRR"))
     q, x = random_q(rng, "RRR", pairs, 80), rng.normal(size=(pairs, 3))
@@ -160,7 +160,7 @@ def test_the_log_evidence_is_the_gaussian_likelihood_at_its_best_noise(pairs):
 
 
 @pytest.mark.parametrize("pairs", [20, 200])
-def test_the_chosen_ridge_has_the_greatest_evidence_of_a_grid(pairs):
+def test_chosen_ridge_has_greatest_evidence_on_grid(pairs):
     rng = np.random.default_rng(6)
     chain, prior = random_chain(rng, "RRR"), random_chain(rng, "RRR").to_kbmap(bases_for("RRR"))
     q = random_q(rng, "RRR", pairs, 80)
@@ -187,19 +187,19 @@ def held_out_ratio(seed: int) -> float:
     return prediction_errors(learner.solve("evidence").map, test, truth).mean() / min(grid)
 
 
-def test_the_evidence_chooses_a_ridge_near_the_best_one():
+def test_evidence_chooses_near_optimal_ridge():
     ratios = [held_out_ratio(seed) for seed in range(8)]
     assert sum(ratio <= 1.3 for ratio in ratios) >= 7
 
 
 @pytest.mark.soak
-def test_the_evidence_chooses_a_ridge_near_the_best_one_in_nineteen_of_twenty_cases():
+def test_evidence_chooses_near_optimal_ridge_in_95_percent():
     ratios = [held_out_ratio(seed) for seed in range(200)]
     assert np.mean([ratio <= 1.3 for ratio in ratios]) >= 0.95
 
 
 @pytest.mark.parametrize("pairs", [12, 100])
-def test_a_rebased_learner_solves_as_if_it_had_started_from_the_new_prior(pairs):
+def test_rebased_learner_equals_fresh_one_with_new_prior(pairs):
     rng = np.random.default_rng(8)
     first, second = (random_map(rng, bases_for("RRR")) for _ in range(2))
     q, x = random_q(rng, "RRR", pairs, 80), rng.normal(size=(pairs, 3))
@@ -210,7 +210,7 @@ def test_a_rebased_learner_solves_as_if_it_had_started_from_the_new_prior(pairs)
     np.testing.assert_allclose(moved.solve(0.1).map.net, fresh.solve(0.1).map.net, rtol=0, atol=1e-10)
 
 
-def test_the_solution_comes_in_the_bases_of_the_prior():
+def test_solution_uses_the_bases_of_the_prior():
     rng = np.random.default_rng(9)
     prior = random_chain(rng, "RR").to_kbmap([JointBasis.bernstein(1.0)] * 2)
     learner = ExactLearner(prior, bases_for("RR"))
@@ -236,7 +236,7 @@ def test_without_pairs_the_solution_is_the_prior(precision):
     assert solution.noise_std is None
 
 
-def test_pairs_that_the_prior_explains_exactly_are_no_trouble():
+def test_exact_prior_is_kept_by_evidence_solution():
     rng = np.random.default_rng(1)
     prior = random_chain(rng, "RR").to_kbmap(bases_for("RR"))
     learner = ExactLearner(prior)

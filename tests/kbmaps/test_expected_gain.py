@@ -37,7 +37,7 @@ def foretold_and_found(seeds, first, first_deg, further, motion, told):
 
 
 @pytest.mark.parametrize(("first", "first_deg", "further", "motion"), [(40, 80, 80, SAME)])
-def test_what_is_foretold_comes(first, first_deg, further, motion):
+def test_forecast_errors_match_observed_errors(first, first_deg, further, motion):
     now, now_found, later, later_found = foretold_and_found(20, first, first_deg, further, motion, 0.01)
     # 20 arms leave a standard error of about 4 % (at 80 degrees) and 8 % (from 20) in a ratio.
     assert now / now_found == pytest.approx(1.0, abs=0.15)
@@ -49,13 +49,13 @@ def test_what_is_foretold_comes(first, first_deg, further, motion):
 @pytest.mark.parametrize("motion", [SAME, ALL])
 @pytest.mark.parametrize(("first", "further"), [(30, 30), (30, 300), (100, 100), (100, 1000)])
 @pytest.mark.parametrize("first_deg", [80, 20])
-def test_over_many_arms_what_is_foretold_comes(first, first_deg, further, motion, told):
+def test_forecast_errors_match_observed_over_many_arms(first, first_deg, further, motion, told):
     now, now_found, later, later_found = foretold_and_found(200, first, first_deg, further, motion, told)
     assert now / now_found == pytest.approx(1.0, abs=0.1)
     assert later / later_found == pytest.approx(1.0, abs=0.1)
 
 
-def test_more_pairs_leave_less_error_and_the_best_motion_comes_first():
+def test_forecast_error_falls_and_best_motion_is_first():
     rng = np.random.default_rng(1)
     arm = rough_arm(rng)
     learner, q = learner_of(arm, rng, 50, 20)
@@ -70,7 +70,7 @@ def test_more_pairs_leave_less_error_and_the_best_motion_comes_first():
 
 
 @pytest.mark.parametrize("held", [1, 3])
-def test_the_joint_that_was_never_moved_is_the_one_to_move(held):
+def test_best_motion_moves_the_joint_never_moved(held):
     rng = np.random.default_rng(2)
     arm = rough_arm(rng)
     q = random_q(rng, arm.kinds, 200, 80)
@@ -85,7 +85,7 @@ def test_the_joint_that_was_never_moved_is_the_one_to_move(held):
     assert forecast.motions[0].motion == f"j{held}"
 
 
-def test_no_pair_mends_what_the_model_cannot_follow():
+def test_further_pairs_do_not_reduce_model_misfit():
     rng = np.random.default_rng(3)
     arm = rough_arm(rng)
     learner, q = learner_of(arm, rng, 200, told=0.006)
@@ -99,7 +99,7 @@ def test_no_pair_mends_what_the_model_cannot_follow():
     assert all(motion.errors[0] == pytest.approx(forecast.least, rel=0.05) for motion in forecast.motions)
 
 
-def test_data_are_enough_when_no_motion_gains_a_tenth():
+def test_data_suffice_when_no_motion_gains_a_tenth():
     rng = np.random.default_rng(4)
     arm = rough_arm(rng)
     limits = np.full(6, LIMIT)
@@ -115,7 +115,7 @@ def test_data_are_enough_when_no_motion_gains_a_tenth():
     assert not forecast(2000).is_enough(share=0.001)
 
 
-def test_going_on_as_so_far_keeps_how_the_joints_are_spread_and_go_together():
+def test_same_motion_keeps_joint_spread_and_correlation():
     rng = np.random.default_rng(5)
     seen = rng.uniform(-1.0, 1.0, (300, 3)) * [0.3, 0.1, 0.0] + [0.5, 0.0, 0.2]
     seen[:, 1] += 0.5 * seen[:, 0]
@@ -128,7 +128,7 @@ def test_going_on_as_so_far_keeps_how_the_joints_are_spread_and_go_together():
     assert (like <= seen.max(axis=0)).all()
 
 
-def test_a_motion_moves_its_joints_over_the_range_and_leaves_the_others():
+def test_motion_moves_only_its_joints_over_full_range():
     rng = np.random.default_rng(6)
     seen = 0.1 * rng.normal(size=(50, 4))
     limits = np.full(4, 2.0)
@@ -139,7 +139,7 @@ def test_a_motion_moves_its_joints_over_the_range_and_leaves_the_others():
     assert (spread[[0, 2]] < 1.0).all()
 
 
-def test_what_does_not_fit_is_refused():
+def test_invalid_arguments_are_refused():
     rng = np.random.default_rng(7)
     arm = rough_arm(rng)
     learner, q = learner_of(arm, rng, 20)

@@ -55,7 +55,7 @@ def planted(seed, floor=0.0):
 
 
 @given(seed=seeds, floor=st.sampled_from([0.0, 0.2]))
-def test_the_error_foretold_is_that_of_the_posterior_with_those_pairs(seed, floor):
+def test_predicted_error_equals_posterior_error_with_those_pairs(seed, floor):
     model, region, q = planted(seed, floor)
     design = ExperimentDesign(model, region)
     wanted = mean_distances(model.covariances_after(q, region)).mean()
@@ -75,7 +75,7 @@ def test_beginning_with_some_pairs_forgets_all_others(seed):
 
 
 @given(seed=seeds, floor=st.sampled_from([0.0, 0.2]))
-def test_the_rms_errors_fall_by_at_least_the_gain(seed, floor):
+def test_rms_error_falls_by_at_least_the_gain(seed, floor):
     model, region, q = planted(seed, floor)
 
     def rms(covariances):
@@ -89,7 +89,7 @@ def test_the_rms_errors_fall_by_at_least_the_gain(seed, floor):
 
 
 @given(seed=seeds)
-def test_gains_are_those_of_the_textbook_to_first_order(seed):
+def test_gains_match_exact_error_reduction_to_first_order(seed):
     """With large noise a pair changes little and the linearisation is exact; with more, rounding dominates."""
     model, region, q = planted(seed)
     model.noise = 1e3
@@ -100,13 +100,13 @@ def test_gains_are_those_of_the_textbook_to_first_order(seed):
     np.testing.assert_allclose(gains, falls, rtol=1e-2, atol=1e-12 * before)
 
 
-def test_the_next_pose_is_the_candidate_with_the_greatest_gain():
+def test_next_pose_is_candidate_with_greatest_gain():
     model, region, q = planted(1)
     gains = ExperimentDesign(model, region).gains(model.roots(q))
     np.testing.assert_array_equal(next_pose(model, region, q), q[gains.argmax()])
 
 
-def test_a_pose_that_was_measured_often_is_not_chosen_again():
+def test_often_measured_pose_is_not_chosen_again():
     rng = np.random.default_rng(2)
     arm = rough_arm(rng)
     often, other = random_q(rng, arm.kinds, 2, 80)
@@ -116,7 +116,7 @@ def test_a_pose_that_was_measured_often_is_not_chosen_again():
     np.testing.assert_array_equal(next_pose(posterior, [other, often], [often, other]), other)
 
 
-def test_a_plan_within_limits_is_made_where_pairs_tell_far_more_than_is_known():
+def test_plan_from_vague_belief_stays_within_limits():
     rng = np.random.default_rng(4)
     arm = rough_arm(rng, "RRRRR", LOST)
     learner = RigidLearner(arm.nominal, LOST)
@@ -134,7 +134,7 @@ def test_no_candidate_is_taken_twice():
 
 
 @given(seed=seeds)
-def test_a_plan_stays_within_the_limits_and_is_no_worse_than_the_candidates(seed):
+def test_plan_stays_within_limits_and_beats_greedy_candidates(seed):
     rng = np.random.default_rng(seed)
     arm = rough_arm(rng)
     limits = np.full(6, np.radians(80.0))
@@ -149,20 +149,20 @@ def test_a_plan_stays_within_the_limits_and_is_no_worse_than_the_candidates(seed
 
 
 @given(seed=seeds)
-def test_mean_distances_are_within_a_few_percent_of_sampled_ones(seed):
+def test_mean_distances_match_sampling_within_four_percent(seed):
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(3, 3)) * 10.0 ** rng.uniform(-2, 2, 3)
     lengths = np.linalg.norm(rng.normal(size=(200_000, 3)) @ root.T, axis=1)
     assert mean_distances((root @ root.T)[None])[0] == pytest.approx(lengths.mean(), rel=0.035)
 
 
-def test_mean_distances_are_exact_along_one_axis_and_in_a_ball():
+def test_mean_distances_are_exact_for_line_and_ball():
     one, ball = np.diag([0.0, 4.0, 0.0]), 4.0 * np.eye(3)
     wanted = [2.0 * np.sqrt(2.0 / np.pi), 4.0 * np.sqrt(2.0 / np.pi), 0.0]
     np.testing.assert_allclose(mean_distances(np.stack([one, ball, 0.0 * one])), wanted, rtol=1e-12)
 
 
-def test_what_does_not_fit_is_refused():
+def test_invalid_arguments_are_refused():
     model, region, q = planted(6)
     with pytest.raises(ShapeError):
         ExperimentDesign(model, region[:, :1])

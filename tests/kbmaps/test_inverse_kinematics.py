@@ -65,14 +65,14 @@ def share_converged(joint_kinds: str, *, arms: int, targets: int, pose: bool, de
     return float(np.mean(found))
 
 
-def test_99_percent_of_reachable_positions_of_seven_joint_arms_are_reached():
+def test_seven_joint_arms_reach_99_percent_of_positions():
     assert share_converged("RRRRRRR", arms=20, targets=15, pose=False) >= 0.99
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("deg", [30.0, 80.0, 170.0])
 @pytest.mark.parametrize("joint_kinds", ["RRR", "RRPR", "RRRRRRR"])
-def test_99_percent_of_reachable_positions_are_reached_whatever_arm_and_range(joint_kinds, deg):
+def test_99_percent_of_positions_reached_for_all_ranges(joint_kinds, deg):
     assert share_converged(joint_kinds, arms=100, targets=20, pose=False, deg=deg) >= 0.99
 
 
@@ -87,7 +87,7 @@ def test_99_percent_of_reachable_poses_are_reached(joint_kinds):
 
 
 @given(seed=seeds, joint_kinds=st.text("RP", min_size=1, max_size=5))
-def test_targets_out_of_reach_are_always_told(seed, joint_kinds):
+def test_far_targets_are_always_reported_out_of_reach(seed, joint_kinds):
     rng = np.random.default_rng(seed)
     kbmap, half = planted(rng, joint_kinds)
     corners = np.abs(kbmap.predict(random_q(rng, joint_kinds, 200, RANGE_DEG))).max() + 1.0
@@ -100,7 +100,7 @@ def test_targets_out_of_reach_are_always_told(seed, joint_kinds):
 
 
 @given(seed=seeds, beyond_m=st.floats(1e-4, 5.0))
-def test_the_nearest_reachable_position_is_returned_for_a_target_out_of_reach(seed, beyond_m):
+def test_unreachable_target_returns_nearest_reachable_position(seed, beyond_m):
     bearing = np.random.default_rng(seed).uniform(-math.pi, math.pi)
     target = (0.5 + beyond_m) * np.array([math.cos(bearing), math.sin(bearing), 0.0])
     arm = InverseKinematics(planar_map(0.3, 0.2), [-4.0, -2.0], [4.0, 2.0], samples=500)
@@ -109,22 +109,22 @@ def test_the_nearest_reachable_position_is_returned_for_a_target_out_of_reach(se
     assert solution.distance == pytest.approx(beyond_m, abs=1e-6)
 
 
-def test_a_target_in_the_hole_around_the_base_is_told_with_its_distance():
+def test_target_in_inner_workspace_hole_reports_its_distance():
     solution = InverseKinematics(planar_map(0.3, 0.1), [-4.0, -4.0], [4.0, 4.0]).solve([0.05, 0.0, 0.0])
     assert (solution.reason, round(solution.distance, 6)) == ("out_of_reach", 0.15)
 
 
-def test_a_target_on_the_edge_of_the_workspace_is_reached():
+def test_target_on_workspace_boundary_is_reached():
     assert InverseKinematics(planar_map(0.3, 0.2), [-4.0, -2.0], [4.0, 2.0]).solve([0.0, 0.5, 0.0]).distance < 1e-6
 
 
-def test_a_stretched_arm_as_the_start_does_not_hold_the_search():
+def test_search_escapes_a_singular_stretched_start():
     solver = InverseKinematics(planar_map(0.3, 0.2), [-4.0, -2.0], [4.0, 2.0])
     assert solver.solve([0.3, 0.0, 0.0], start=[0.0, 0.0]).converged
 
 
 @given(seed=seeds, joint_kinds=st.text("RP", min_size=1, max_size=5), pose=st.booleans())
-def test_answers_are_within_the_limits_and_say_what_is_missing(seed, joint_kinds, pose):
+def test_solutions_respect_limits_and_report_remaining_error(seed, joint_kinds, pose):
     rng = np.random.default_rng(seed)
     kbmap, half = planted(rng, joint_kinds)
     lower, upper = -half * rng.uniform(0, 1, len(half)), half * rng.uniform(0, 1, len(half))
@@ -141,7 +141,7 @@ def test_answers_are_within_the_limits_and_say_what_is_missing(seed, joint_kinds
         assert solution.angle is None
 
 
-def test_a_pose_given_as_a_quaternion_is_reached_as_the_same_as_a_matrix():
+def test_quaternion_and_matrix_targets_give_the_same_solution():
     rng = np.random.default_rng(5)
     kbmap, half = planted(rng, "RRRRRRR")
     truth = random_q(rng, "RRRRRRR", 1, RANGE_DEG)[0]
@@ -152,13 +152,13 @@ def test_a_pose_given_as_a_quaternion_is_reached_as_the_same_as_a_matrix():
     np.testing.assert_allclose(from_quaternion.q, from_matrix.q, atol=1e-6)
 
 
-def test_the_same_seed_gives_the_same_answer_bit_by_bit():
+def test_same_seed_gives_bit_identical_solutions():
     kbmap, half = planted(np.random.default_rng(2), "RRRRR")
     answers = [InverseKinematics(kbmap, -half, half, seed=3).solve([0.3, 0.2, 0.1]).q.tobytes() for _ in range(2)]
     assert answers[0] == answers[1]
 
 
-def test_a_start_near_the_target_gives_an_answer_near_the_start():
+def test_solution_stays_near_a_start_near_target():
     rng = np.random.default_rng(8)
     kbmap, half = planted(rng, "RRRRRRR")
     solver = InverseKinematics(kbmap, -half, half)
@@ -169,7 +169,7 @@ def test_a_start_near_the_target_gives_an_answer_near_the_start():
 
 
 @pytest.mark.parametrize("pose", [False, True])
-def test_the_posture_is_followed_as_far_as_the_target_leaves_a_choice(pose):
+def test_posture_is_optimised_within_the_null_space(pose):
     """Compare the objective with that of an independent solver started at our answer."""
     for seed in range(4):
         rng = np.random.default_rng(seed)
@@ -199,7 +199,7 @@ def test_the_posture_is_followed_as_far_as_the_target_leaves_a_choice(pose):
         assert far(solution.q) <= 1.0001 * best.fun
 
 
-def test_a_model_of_positions_alone_is_enough_for_positions():
+def test_positions_only_model_solves_position_targets_only():
     rng = np.random.default_rng(4)
     chain, half = random_chain(rng, "RRRRR"), half_ranges("RRRRR", RANGE_DEG)
     solver, target = InverseKinematics(PositionsOnly(chain), -half, half), chain.positions(0.3 * half)
@@ -208,7 +208,7 @@ def test_a_model_of_positions_alone_is_enough_for_positions():
         solver.solve(target, np.eye(3))
 
 
-def test_the_reaching_error_of_the_true_arm_is_that_of_the_model():
+def test_true_reaching_error_equals_the_model_error():
     """A map that is wrong by some millimetres misplaces the true arm by as much, and no more."""
     rng = np.random.default_rng(6)
     chain, half = random_chain(rng, "RRRRRRR"), half_ranges("RRRRRRR", RANGE_DEG)
@@ -223,18 +223,18 @@ def test_the_reaching_error_of_the_true_arm_is_that_of_the_model():
     np.testing.assert_allclose(reaching_error, model_error, atol=1e-6)
 
 
-def test_steps_are_limited_and_running_out_of_them_is_told():
+def test_step_limit_is_respected_and_reported():
     kbmap, half = planted(np.random.default_rng(3), "RRRRRRR")
     solution = InverseKinematics(kbmap, -half, half, max_steps=5).solve([9.0, 0.0, 0.0])
     assert (solution.steps <= 5, solution.reason) == (True, "steps_ran_out")
 
 
-def test_a_joint_without_limits_turns_as_far_as_it_has_to():
+def test_joint_without_limits_solves_from_any_start_angle():
     solver = InverseKinematics(planar_map(0.3, 0.2), [-math.inf, -2.0], [math.inf, 2.0])
     assert solver.solve([-0.4, 0.1, 0.0], start=[9.0, 1.0]).converged
 
 
-def test_a_joint_that_is_locked_stays_where_it_is():
+def test_locked_joint_keeps_its_value():
     solution = InverseKinematics(planar_map(0.3, 0.2, 0.1), [-3.0, 0.5, -3.0], [3.0, 0.5, 3.0]).solve([0.3, 0.3, 0.0])
     assert (solution.converged, solution.q[1]) == (True, 0.5)
 
@@ -265,7 +265,7 @@ def humanoid() -> RigidChain:
 
 
 @pytest.mark.parametrize("kind", ["rigid", "train"])
-def test_learnt_arms_of_twenty_joints_reach_within_what_they_are_sure_of(kind):
+def test_learnt_twenty_joint_arms_reach_within_five_sigma(kind):
     rng = np.random.default_rng(0)
     drawing, reach = humanoid(), np.full(20, np.radians(40.0))
     real = drawing.with_tool([0.02, -0.01, 0.03])
@@ -292,7 +292,7 @@ def test_a_chain_reaches_a_pose():
     np.testing.assert_allclose(chain.poses(solution.q), chain.poses(truth), rtol=0, atol=1e-6)
 
 
-def test_what_is_no_model_is_refused_with_what_it_lacks():
+def test_non_model_error_lists_missing_attributes():
     class Guess:
         joints = 2
         predict = staticmethod(np.zeros)

@@ -24,7 +24,7 @@ prismatic = st.one_of(
 
 
 @given(theta=st.floats(-3.1, 3.1), alpha=alphas)
-def test_the_singularity_free_weights_are_those_of_equations_9_and_10(theta, alpha):
+def test_singularity_free_weights_match_equations_9_and_10(theta, alpha):
     weights = JointBasis.bernstein(alpha).weights(theta)
     literal = literal_joint_weights(theta, alpha)
     np.testing.assert_allclose(weights, literal, rtol=1e-9, atol=1e-9 * np.abs(literal).max())
@@ -48,7 +48,7 @@ def test_nothing_happens_at_half_a_turn(alpha):
 
 
 @given(alpha=alphas, centre=st.floats(-3.0, 3.0))
-def test_the_outer_control_points_are_the_points_at_plus_and_minus_alpha(alpha, centre):
+def test_outer_control_points_lie_at_plus_minus_alpha(alpha, centre):
     basis = JointBasis.bernstein(alpha, centre)
     ends = basis.weights(np.array([centre - alpha, centre + alpha]))
     np.testing.assert_allclose(ends, [[1, 0, 0], [0, 0, 1]], atol=1e-9)

@@ -75,14 +75,14 @@ def test_isoparametric_curves_are_ellipses_with_the_papers_weights(seed, joint, 
 
 
 @given(seed=seeds)
-def test_prediction_at_plus_and_minus_half_a_turn_is_the_same(seed):
+def test_predictions_at_plus_and_minus_pi_agree(seed):
     rng = np.random.default_rng(seed)
     kbmap = random_chain(rng, "RRRRR").to_kbmap(bernstein_bases("RRRRR"))
     q = rng.choice([-math.pi, math.pi], 5)
     np.testing.assert_allclose(kbmap.predict(q), kbmap.predict(-q), rtol=0, atol=1e-12)
 
 
-def test_ten_joints_at_half_a_turn_do_not_overflow():
+def test_ten_joints_at_pi_do_not_overflow():
     kbmap = KBMap((JointBasis.bernstein(1.0),) * 10, np.ones((3, *[3] * 10)))
     np.testing.assert_allclose(kbmap.predict(np.full(10, math.pi)), 1.0, rtol=1e-9)
 
@@ -108,7 +108,7 @@ def test_a_change_of_basis_leaves_predictions(joint_kinds, seed, alpha):
     np.testing.assert_allclose(changed.predict(q), kbmap.predict(q), rtol=0, atol=1e-11)
 
 
-def test_control_points_are_where_the_curve_starts_and_ends():
+def test_outer_control_points_are_the_curve_ends():
     chain = random_chain(np.random.default_rng(3), "R")
     kbmap = chain.to_kbmap(bases_for("R", 80))
     alpha = kbmap.bases[0].to_bernstein().parameters[0]

@@ -28,7 +28,7 @@ texts = st.text(st.sampled_from('aZ9 "\\\n\0\x7fé\u0301漢\ufeff🤖'), max_siz
 
 
 @given(kinds=st.text("RP", min_size=1, max_size=5), seed=st.integers(0, 1000), text=texts)
-def test_a_map_survives_the_round_trip_bit_by_bit(kinds, seed, text):
+def test_map_round_trips_through_bytes_bit_for_bit(kinds, seed, text):
     kbmap = random_map(np.random.default_rng(seed), bases_for(kinds)).with_metadata({"note": text})
     back = KBMap.from_bytes(kbmap.to_bytes())
     assert back.bases == kbmap.bases
@@ -63,7 +63,7 @@ def test_arbitrary_bytes_are_refused(data):
 
 
 @given(st.binary(max_size=300))
-def test_an_arbitrary_header_under_a_right_checksum_is_refused(header):
+def test_arbitrary_header_with_valid_checksum_is_refused(header):
     with pytest.raises(ModelFormatError):
         KBMap.from_bytes(forged(header))
 
@@ -94,7 +94,7 @@ def test_a_header_of_arbitrary_values_is_refused(bases, outputs, metadata, net):
         ([{"kind": "pickle", "parameters": {}}], 3),
     ],
 )
-def test_an_impossible_or_huge_description_is_refused_without_allocating(bases, outputs):
+def test_impossible_or_huge_map_description_is_refused(bases, outputs):
     header = json.dumps({"bases": bases, "outputs": outputs, "metadata": {}}).encode()
     with pytest.raises(ModelFormatError):
         KBMap.from_bytes(forged(header, bytes(72)))

@@ -33,7 +33,7 @@ def noisy_pairs(rng: np.random.Generator, joint_kinds: str, n: int) -> tuple[np.
 
 
 @given(seed=seeds, joint_kinds=kinds)
-def test_the_kernel_is_the_inner_product_of_the_weight_vectors(seed, joint_kinds):
+def test_kernel_is_inner_product_of_weight_vectors(seed, joint_kinds):
     rng = np.random.default_rng(seed)
     bases = bases_for(joint_kinds)
     kernel, kbmap = ProductKernel(bases), random_map(rng, bases)
@@ -45,7 +45,7 @@ def test_the_kernel_is_the_inner_product_of_the_weight_vectors(seed, joint_kinds
 
 
 @given(seed=seeds, joint_kinds=kinds, pairs=st.integers(1, 120), precision=st.floats(1e-6, 1e3))
-def test_it_equals_the_exact_learner_at_the_same_precision(seed, joint_kinds, pairs, precision):
+def test_kernel_learner_equals_exact_learner_at_same_precision(seed, joint_kinds, pairs, precision):
     rng = np.random.default_rng(seed)
     q, x = noisy_pairs(rng, joint_kinds, pairs)
     sigma = rng.uniform(0.5, 2.0, pairs)
@@ -60,7 +60,7 @@ def test_it_equals_the_exact_learner_at_the_same_precision(seed, joint_kinds, pa
 
 
 @given(seed=seeds, joint_kinds=kinds, pairs=st.integers(2, 120), precision=st.floats(1e-3, 1e3))
-def test_noise_and_evidence_are_those_of_the_exact_learner(seed, joint_kinds, pairs, precision):
+def test_noise_and_evidence_match_the_exact_learner(seed, joint_kinds, pairs, precision):
     rng = np.random.default_rng(seed)
     q, x = noisy_pairs(rng, joint_kinds, pairs)
     prior = random_map(rng, bases_for(joint_kinds))
@@ -74,7 +74,7 @@ def test_noise_and_evidence_are_those_of_the_exact_learner(seed, joint_kinds, pa
 
 
 @given(seed=seeds, joint_kinds=kinds, pairs=st.integers(1, 60), precision=st.floats(1e-3, 10.0))
-def test_the_claimed_variance_is_that_of_the_control_points_posterior(seed, joint_kinds, pairs, precision):
+def test_predicted_variance_matches_control_point_posterior(seed, joint_kinds, pairs, precision):
     rng = np.random.default_rng(seed)
     q, x = noisy_pairs(rng, joint_kinds, pairs)
     prior = random_map(rng, bases_for(joint_kinds))
@@ -88,7 +88,7 @@ def test_the_claimed_variance_is_that_of_the_control_points_posterior(seed, join
 
 
 @pytest.mark.parametrize("joint_kinds", ["R", "RR", "RRR", "RRRR", "RRRRR", "RRPRR", "PPRR"])
-def test_as_many_noise_free_pairs_as_control_points_give_the_chain_back(joint_kinds):
+def test_chain_is_recovered_from_minimum_noise_free_pairs(joint_kinds):
     rng = np.random.default_rng(len(joint_kinds))
     chain, prior = random_chain(rng, joint_kinds), random_chain(rng, joint_kinds)
     q = random_q(rng, joint_kinds, control_points_needed(joint_kinds), 80)
@@ -99,7 +99,7 @@ def test_as_many_noise_free_pairs_as_control_points_give_the_chain_back(joint_ki
 
 
 @given(seed=seeds, joint_kinds=st.text("RP", min_size=2, max_size=4), share=st.floats(0.1, 0.5))
-def test_without_precision_it_is_the_solution_nearest_to_the_prior(seed, joint_kinds, share):
+def test_without_precision_solution_is_nearest_to_prior(seed, joint_kinds, share):
     rng = np.random.default_rng(seed)
     prior = random_map(rng, bases_for(joint_kinds))
     n = max(1, int(share * prior.size))
@@ -126,7 +126,7 @@ def test_the_order_of_the_pairs_does_not_matter(seed, joint_kinds, precision):
     np.testing.assert_allclose(straight.predict(test), shuffled.predict(test), rtol=0, atol=1e-6)
 
 
-def test_thirty_joints_take_memory_by_pairs_not_by_control_points():
+def test_memory_for_thirty_joints_scales_with_pairs():
     rng = np.random.default_rng(1)
     arm = rough_arm(rng, "R" * 30)
     n = 500
@@ -140,7 +140,7 @@ def test_thirty_joints_take_memory_by_pairs_not_by_control_points():
     assert peak < 3.0 * 8 * n**2 + 8 * 3 * 30 * n * 8
 
 
-def test_it_is_nearer_to_the_truth_than_the_prior_with_thirty_joints():
+def test_thirty_joint_learner_beats_its_prior():
     rng = np.random.default_rng(2)
     arm = rough_arm(rng, "R" * 30)
     q, x = arm.pairs(rng, 300, 0.01, reach_deg=10.0)
@@ -180,7 +180,7 @@ def test_support_is_where_pairs_were():
     assert learner.estimate(far).in_support.mean() < 0.2
 
 
-def test_before_the_first_pair_the_prior_is_predicted_and_nothing_claimed():
+def test_untrained_learner_predicts_prior_with_infinite_sigma():
     rng = np.random.default_rng(6)
     chain = random_chain(rng, "RRR")
     learner = KernelLearner(bases_for("RRR"), chain)
@@ -231,7 +231,7 @@ def test_its_derivative_is_that_of_its_control_points(joint_kinds):
     precision=st.sampled_from([0.1, "evidence", None]),
     told=st.booleans(),
 )
-def test_its_bytes_predict_the_same_to_the_last_bit(seed, prior, precision, told):
+def test_bytes_restore_predictions_bit_for_bit(seed, prior, precision, told):
     rng = np.random.default_rng(seed)
     behind = {"none": None, "chain": random_chain(rng, "RRP"), "map": random_map(rng, bases_for("RRP"))}[prior]
     learner = KernelLearner(bases_for("RRP"), behind, precision=precision, memory=Memory(12, 0.97))
@@ -245,7 +245,7 @@ def test_its_bytes_predict_the_same_to_the_last_bit(seed, prior, precision, told
     assert again.to_bytes() == learner.to_bytes()
 
 
-def test_a_prior_that_does_not_travel_is_asked_for():
+def test_prior_not_stored_in_bytes_must_be_given():
     rng = np.random.default_rng(9)
     behind, other = KernelLearner(bases_for("RR")), KernelLearner(bases_for("RR"))
     q, x = noisy_pairs(rng, "RR", 6)
@@ -260,7 +260,7 @@ def test_a_prior_that_does_not_travel_is_asked_for():
     np.testing.assert_array_equal(KernelLearner.from_bytes(data, behind).predict(q), learner.predict(q))
 
 
-def test_a_prior_that_is_off_by_a_micrometre_is_another_one():
+def test_prior_off_by_a_micrometre_is_refused():
     class Placed:
         joints = 2
 

@@ -88,7 +88,7 @@ def test_recursive_rigid_learners_agree_to_rounding(seed, joint_kinds, sigma, ju
 
 @needs_both
 @given(seed=seeds, joint_kinds=kinds, size=st.sampled_from([0.0, 1e-4, 0.5]), rows=st.sampled_from([0, 1, 7]))
-def test_positions_and_derivatives_of_a_changed_chain_agree_to_rounding(seed, joint_kinds, size, rows):
+def test_changed_chain_positions_and_derivatives_agree_to_rounding(seed, joint_kinds, size, rows):
     rng = np.random.default_rng(seed)
     chain, q = random_chain(rng, joint_kinds), random_q(rng, joint_kinds, rows, 170)
     one, other = on_both_paths(lambda: ChainParameters(chain))
@@ -187,7 +187,7 @@ BAD_PAIRS = {
 
 @needs_both
 @pytest.mark.parametrize("bad", BAD_PAIRS.values(), ids=BAD_PAIRS)
-def test_a_bad_pair_of_a_rigid_chain_is_refused_in_the_same_words(bad):
+def test_rigid_learners_refuse_bad_pairs_with_same_message(bad):
     arm = rough_arm(np.random.default_rng(3), "RR")
 
     def call(path: str) -> tuple[type[Exception], str]:
@@ -211,7 +211,7 @@ CONVERSIONS = pytest.mark.parametrize(
 
 @pytest.mark.usefixtures("kernel_path")
 @CONVERSIONS
-def test_a_rigid_chain_takes_whatever_numpy_understands(convert):
+def test_rigid_learner_accepts_all_numpy_inputs(convert):
     arm = rough_arm(np.random.default_rng(4), "RRR")
     one, other = (RecursiveRigidLearner(arm.nominal, ROUGH) for _ in range(2))
     q, x = np.array([1.0, -2.0, 0.0]), np.array([1.0, 0.0, -1.0])
@@ -222,7 +222,7 @@ def test_a_rigid_chain_takes_whatever_numpy_understands(convert):
 
 @pytest.mark.usefixtures("kernel_path")
 @CONVERSIONS
-def test_whatever_numpy_understands_is_taken(convert):
+def test_map_accepts_all_numpy_inputs(convert):
     kbmap = random_map(np.random.default_rng(2), bases_for("RRR"))
     q = np.array([1.0, -2.0, 0.0])
     fresh = KBMap(kbmap.bases, kbmap.net)

@@ -20,7 +20,7 @@ def stream(rng: np.random.Generator, n: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @given(seed=seeds, window=st.integers(1, 40), pieces=st.lists(st.integers(1, 25), min_size=1, max_size=6))
-def test_a_window_is_a_fresh_learner_on_the_last_pairs(seed, window, pieces):
+def test_windowed_kernel_learner_equals_fresh_on_last_pairs(seed, window, pieces):
     rng = np.random.default_rng(seed)
     q, x = stream(rng, sum(pieces))
     windowed, fresh = KernelLearner(bases_for(KINDS), memory=Memory(window)), KernelLearner(bases_for(KINDS))
@@ -35,7 +35,7 @@ def test_a_window_is_a_fresh_learner_on_the_last_pairs(seed, window, pieces):
 
 
 @given(seed=seeds, window=st.integers(1, 40), pieces=st.lists(st.integers(1, 60), min_size=1, max_size=8))
-def test_a_window_of_the_exact_learner_is_a_fresh_one_on_the_last_pairs(seed, window, pieces):
+def test_windowed_exact_learner_equals_fresh_on_last_pairs(seed, window, pieces):
     rng = np.random.default_rng(seed)
     prior = random_map(rng, bases_for(KINDS))
     q, x = stream(rng, sum(pieces))
@@ -49,7 +49,7 @@ def test_a_window_of_the_exact_learner_is_a_fresh_one_on_the_last_pairs(seed, wi
     assert found.log_evidence == pytest.approx(expected.log_evidence, rel=1e-9, abs=1e-6)
 
 
-def test_what_leaves_a_window_leaves_the_sums_too():
+def test_pairs_leaving_the_window_leave_the_sums():
     rng = np.random.default_rng(6)
     prior = random_map(rng, bases_for(KINDS))
     q, x = stream(rng, 1700)
@@ -90,7 +90,7 @@ def test_forgetting_is_least_squares_weighted_by_age(seed, forgetting, n, precis
 
 
 @given(seed=seeds, forgetting=st.floats(0.9, 1.0))
-def test_both_learners_see_the_same_noise_and_evidence_in_pairs_half_forgotten(seed, forgetting):
+def test_learners_agree_on_noise_and_evidence_with_forgetting(seed, forgetting):
     rng = np.random.default_rng(seed)
     prior = random_map(rng, bases_for(KINDS))
     q, x = stream(rng, 100)
@@ -103,7 +103,7 @@ def test_both_learners_see_the_same_noise_and_evidence_in_pairs_half_forgotten(s
     assert kernel.log_evidence == pytest.approx(solution.log_evidence, rel=1e-7, abs=1e-6)
 
 
-def test_noise_is_not_taken_for_smaller_because_pairs_were_forgotten():
+def test_noise_estimate_is_unbiased_under_forgetting():
     rng = np.random.default_rng(1)
     chain = random_chain(rng, KINDS)
     q = random_q(rng, KINDS, 3000, 80)
@@ -138,7 +138,7 @@ def test_forgetting_stays_exact_over_a_long_run():
     np.testing.assert_allclose(long.solve(0.1).map.net, weighted.solve(0.1).map.net, rtol=0, atol=1e-12)
 
 
-def test_a_direction_no_longer_seen_fades_to_the_prior_without_trouble():
+def test_unseen_direction_is_forgotten_while_seen_stays_accurate():
     rng = np.random.default_rng(4)
     chain, prior = random_chain(rng, "RR"), random_chain(rng, "RR").to_kbmap(bases_for("RR"))
     learner = ExactLearner(prior, memory=Memory(forgetting=0.5))

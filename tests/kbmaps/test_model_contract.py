@@ -112,7 +112,7 @@ def q(arm: Arm) -> np.ndarray:
     return arm.pairs(np.random.default_rng(3), 7)[0]
 
 
-def test_pairs_are_counted_one_by_one_or_in_one_go(model, arm):
+def test_pairs_are_counted_singly_and_in_batches(model, arm):
     q, x = arm.pairs(np.random.default_rng(4), 6, 0.01)
     assert (model.joints, model.pairs) == (3, 0)
     model.learn(q[0], x[0])
@@ -120,14 +120,14 @@ def test_pairs_are_counted_one_by_one_or_in_one_go(model, arm):
     assert model.pairs == 6
 
 
-def test_a_row_of_a_batch_is_what_is_predicted_for_it_alone(taught, q):
+def test_batch_predictions_equal_single_predictions(taught, q):
     batch = taught.predict(q)
     assert batch.shape == (7, 3)
     for k in range(7):
         np.testing.assert_allclose(taught.predict(q[k]), batch[k], rtol=0, atol=1e-12)
 
 
-def test_the_jacobian_is_the_derivative_of_what_is_predicted(taught, q):
+def test_jacobian_is_derivative_of_predictions(taught, q):
     step = 1e-4
     jacobian = taught.jacobian(q)
     assert jacobian.shape == (7, 3, 3)
@@ -143,7 +143,7 @@ def test_inverse_kinematics_solves_on_it(taught, q):
     assert solution.converged
 
 
-def test_the_estimate_for_one_configuration_is_its_row_of_a_batch(taught, q):
+def test_single_estimate_equals_its_row_of_a_batch(taught, q):
     one, batch = taught.estimate(q[2]), taught.estimate(q)
     assert (one.x.shape, one.sigma.shape, one.in_support.shape) == ((3,), (3,), ())
     np.testing.assert_allclose(one.x, batch.x[2], rtol=0, atol=1e-12)
@@ -159,7 +159,7 @@ def test_all_learnt_pairs_are_in_support(model, arm):
 
 
 @pytest.mark.parametrize("name", LAWFUL)
-def test_far_from_a_small_zone_nothing_is_in_support(model, arm):
+def test_poses_far_from_data_are_not_in_support(model, arm):
     rng = np.random.default_rng(9)
     model.learn(*arm.pairs(rng, 40, 0.001, reach_deg=10.0))
     q = arm.pairs(rng, 200)[0]
@@ -167,7 +167,7 @@ def test_far_from_a_small_zone_nothing_is_in_support(model, arm):
     assert model.estimate(q[far]).in_support.mean() < 0.05
 
 
-def test_learners_of_the_same_chain_agree_on_where_data_was():
+def test_chain_learners_agree_on_share_in_support():
     rng = np.random.default_rng(10)
     arm = rough_arm(rng)
     q, x = arm.pairs(rng, 100, 0.002, reach_deg=30.0)
@@ -180,7 +180,7 @@ def test_learners_of_the_same_chain_agree_on_where_data_was():
     assert 0.02 < min(shares) <= max(shares) < min(shares) + 0.03 < 0.2
 
 
-def test_an_estimate_is_of_what_is_predicted_and_says_how_sure_it_is(taught, q):
+def test_estimate_matches_prediction_with_sigma_and_support_flags(taught, q):
     estimate = taught.estimate(q)
     np.testing.assert_allclose(estimate.x, taught.predict(q), rtol=0, atol=1e-12)
     assert estimate.sigma.shape == (7, 3)
@@ -236,7 +236,7 @@ def test_the_lesson_of_a_short_window_folds_it(arm):
     assert learner.kept < learner.pairs
 
 
-def test_bytes_give_the_same_estimate_to_the_last_bit_and_learn_on(name, arm, q):
+def test_restored_model_estimates_and_learns_bit_for_bit(name, arm, q):
     taught = taught_apart(name)
     again = type(taught).from_bytes(taught.to_bytes())
     more = arm.pairs(np.random.default_rng(5), 3, 0.01)
@@ -276,7 +276,7 @@ def test_refused_pairs_change_nothing(taught, error, q, x, sigma):
     assert taught.to_bytes() == before
 
 
-def test_what_is_no_bytes_is_refused(model):
+def test_non_bytes_input_is_refused(model):
     with pytest.raises(ModelFormatError, match="bytes, as to_bytes gives them"):
         type(model).from_bytes("x")
 

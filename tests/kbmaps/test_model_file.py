@@ -92,7 +92,7 @@ DAMAGE = pytest.mark.parametrize(
 
 
 @DAMAGE
-def test_the_reader_in_cpp_refuses_what_is_no_such_file(tmp_path, compiled_reader, damage, said):
+def test_cpp_reader_refuses_damaged_files(tmp_path, compiled_reader, damage, said):
     kbmap = random_chain(np.random.default_rng(1), "R").to_kbmap([JointBasis.trigonometric()])
     file = tmp_path / "model"
     file.write_bytes(damage(kbmap.to_bytes()))
@@ -102,7 +102,7 @@ def test_the_reader_in_cpp_refuses_what_is_no_such_file(tmp_path, compiled_reade
 
 
 @DAMAGE
-def test_the_reader_refuses_what_is_no_such_file(tmp_path, damage, said):
+def test_javascript_reader_refuses_damaged_files(tmp_path, damage, said):
     kbmap = random_chain(np.random.default_rng(1), "R").to_kbmap([JointBasis.trigonometric()])
     file = tmp_path / "model"
     file.write_bytes(damage(kbmap.to_bytes()))
@@ -116,7 +116,7 @@ def test_the_page_links_to_the_reader_in_javascript():
     assert len(READER.read_text(encoding="utf-8").splitlines()) <= 40
 
 
-def test_the_page_links_to_the_reader_in_cpp_which_is_short():
+def test_page_links_to_short_cpp_reader():
     lines = COMPILED_READER.read_text(encoding="utf-8").splitlines()
     assert len([line for line in lines if line and not line.startswith("//")]) <= 60
     assert "(../examples/read_model.cpp)" in PAGE

@@ -42,7 +42,7 @@ def test_a_step_is_that_of_equation_20(seed, joints, mu0):
 
 
 @given(seed=seeds, mu0=st.floats(0.05, 1.95), kinds=st.text("RP", min_size=1, max_size=4))
-def test_a_step_mends_the_share_mu0_of_the_error(seed, mu0, kinds):
+def test_step_reduces_error_by_the_share_mu0(seed, mu0, kinds):
     rng = np.random.default_rng(seed)
     kbmap = random_map(rng, bases_for(kinds))
     q, x = random_q(rng, kinds, 1, 80)[0], rng.normal(size=3)
@@ -77,7 +77,7 @@ def test_replaying_noise_free_pairs_approaches_the_chain():
     assert prediction_errors(learner.map, test, chain.positions(test)).mean() < 1e-4
 
 
-def test_it_predicts_what_its_map_predicts():
+def test_learner_and_its_map_predict_the_same():
     rng = np.random.default_rng(6)
     kbmap = random_map(rng, bases_for("RPR"))
     learner = NLMS(kbmap)
@@ -135,7 +135,7 @@ def test_an_unstable_rate_is_refused(mu0):
 
 
 @given(seed=seeds, decay=st.floats(0.5, 100.0), floor=st.floats(0.0, 0.5), pairs=st.integers(1, 150))
-def test_replay_goes_through_a_schedule_as_single_steps_do(seed, decay, floor, pairs):
+def test_replay_follows_step_schedule_like_single_steps(seed, decay, floor, pairs):
     rng = np.random.default_rng(seed)
     kbmap = random_map(rng, bases_for("RRP"))
     q, x = random_q(rng, "RRP", pairs, 80), rng.normal(size=(pairs, 3))
@@ -157,7 +157,7 @@ def test_a_schedule_falls_from_mu0_to_its_floor(mu0, decay, share, pairs):
     np.testing.assert_array_equal(schedule.run(pairs, 3), [schedule.at(pairs + k) for k in range(3)])
 
 
-def test_a_step_of_one_over_the_pairs_is_their_mean():
+def test_step_of_one_over_n_gives_the_mean():
     rng = np.random.default_rng(3)
     learner = NLMS(random_map(rng, bases_for("RR")), StepSize(1.0, 1.0))
     x = rng.normal(size=(40, 3))
@@ -166,7 +166,7 @@ def test_a_step_of_one_over_the_pairs_is_their_mean():
     np.testing.assert_allclose(learner.map.predict([0.3, -0.4]), x.mean(axis=0), rtol=0, atol=1e-12)
 
 
-def test_a_falling_step_leaves_less_noise_than_a_constant_one():
+def test_decaying_step_leaves_less_noise_than_constant_step():
     rng = np.random.default_rng(4)
     chain = random_chain(rng, "RRR")
     q = random_q(rng, "RRR", 4000, 80)

@@ -17,7 +17,7 @@ kinds = st.text("RP", min_size=1, max_size=5)
 
 
 @given(joint_kinds=kinds, seed=seeds)
-def test_the_maps_of_a_chain_s_unit_vectors_are_its_orientation(joint_kinds, seed):
+def test_map_orientation_equals_the_chain_orientation(joint_kinds, seed):
     rng = np.random.default_rng(seed)
     chain = random_chain(rng, joint_kinds)
     kbmap = chain.to_kbmap(bases_for(joint_kinds), orientation=True)
@@ -41,7 +41,7 @@ def test_the_orthonormal_orientation_is_a_proper_rotation(joint_kinds, seed):
 
 
 @given(joint_kinds=kinds, seed=seeds)
-def test_the_angular_jacobian_is_how_the_orthonormal_orientation_turns(joint_kinds, seed):
+def test_angular_jacobian_is_derivative_of_orthonormal_orientation(joint_kinds, seed):
     rng = np.random.default_rng(seed)
     kbmap = disturbed_map(rng, joint_kinds, 0.02)
     q, step = random_q(rng, joint_kinds, 1, 170)[0], 1e-6
@@ -64,13 +64,13 @@ def test_no_rotation_is_nearer_than_the_nearest(seed):
     assert all(np.linalg.norm(matrix - nearest) <= np.linalg.norm(matrix - other) + 1e-12 for other in others)
 
 
-def test_quaternions_are_in_the_order_x_y_z_w():
+def test_quaternions_are_in_xyzw_order():
     turned = rotation_matrices("R", [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])
     np.testing.assert_allclose(turned, [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-15)
 
 
 @pytest.mark.parametrize("bad", [2 * np.eye(3), np.diag([1.0, 1.0, -1.0]), [0.0, 0.0, 0.0, 2.0]])
-def test_what_is_no_rotation_is_refused(bad):
+def test_invalid_rotations_are_refused(bad):
     with pytest.raises(RotationError):
         rotation_matrices("R", bad)
 
@@ -101,7 +101,7 @@ def rough_prior(rng: np.random.Generator, joint_kinds: str) -> KBMap:
 
 
 @pytest.mark.parametrize("joint_kinds", ["R", "RPR", "RRRR"])
-def test_as_many_poses_as_control_points_give_orientations_everywhere(joint_kinds):
+def test_minimum_number_of_poses_gives_orientations_everywhere(joint_kinds):
     rng = np.random.default_rng(3)
     chain, q, poses = shown(rng, joint_kinds, control_points_needed(joint_kinds))
     learner = ExactLearner(rough_prior(rng, joint_kinds))
@@ -139,7 +139,7 @@ def test_noisy_orientations_have_their_own_noise():
         assert solution.orientation_noise_std == pytest.approx(0.02 * np.sqrt(2 / 3), rel=0.1)
 
 
-def test_re_orthonormalised_orientations_are_nearer_to_the_truth_than_those_learnt():
+def test_orthonormalisation_brings_orientations_nearer_to_truth():
     rng = np.random.default_rng(5)
     chain, q, poses = shown(rng, "RRRR", 200)
     turned = Rotation.from_rotvec(0.05 * rng.normal(size=(200, 3))).as_matrix() @ poses[:, :3, :3]
@@ -152,7 +152,7 @@ def test_re_orthonormalised_orientations_are_nearer_to_the_truth_than_those_lear
 
 
 @given(seed=seeds, joint_kinds=st.text("RP", min_size=1, max_size=4))
-def test_replaying_poses_in_blocks_equals_learning_them_one_by_one(seed, joint_kinds):
+def test_blockwise_replay_of_poses_equals_single_steps(seed, joint_kinds):
     rng = np.random.default_rng(seed)
     _, q, poses = shown(rng, joint_kinds, 80)
     blocks = NLMS(rough_prior(rng, joint_kinds))
@@ -172,7 +172,7 @@ def test_orientations_are_learnt_step_by_step():
     np.testing.assert_allclose(learner.map.orientation(q), poses[:, :3, :3], atol=0.01)
 
 
-def test_a_rotation_too_many_or_too_few_is_refused_and_nothing_learnt():
+def test_missing_or_surplus_rotations_are_refused():
     rng = np.random.default_rng(7)
     _, q, poses = shown(rng, "RR", 5)
     x, rotations, pose_map = poses[:, :3, 3], poses[:, :3, :3], rough_prior(rng, "RR")
@@ -190,7 +190,7 @@ def test_a_rotation_too_many_or_too_few_is_refused_and_nothing_learnt():
         ExactLearner(pose_map).learn(q, x, rotation=rotations[:2])
 
 
-def test_a_new_prior_has_to_have_an_orientation_where_the_old_one_had():
+def test_rebasing_a_pose_learner_requires_oriented_prior():
     prior = rough_prior(np.random.default_rng(8), "RR")
     with pytest.raises(ShapeError):
         ExactLearner(prior).rebase(KBMap(prior.bases, prior.net[:3]))

@@ -53,7 +53,7 @@ class Arm:
         return random_q(self.rng, self.kinds, 300, 60.0)
 
 
-def test_what_a_change_turns_is_the_derivative_of_the_rotation() -> None:
+def test_parameter_rotation_jacobian_matches_finite_differences() -> None:
     arm = Arm(0)
     parameters, q = arm.belief.parameters, random_q(arm.rng, KINDS, 4, 60.0)
     change = 0.1 * arm.rng.normal(size=parameters.size)
@@ -71,7 +71,7 @@ def test_the_turned_frame_is_that_of_the_chain() -> None:
     assert parameters.turned(change, q)[0] == pytest.approx(parameters.chain(change).orientation(q), abs=1e-9)
 
 
-def test_exact_orientations_of_a_known_arm_give_the_markers_turn_exactly() -> None:
+def test_exact_orientations_of_known_arm_recover_marker_rotation() -> None:
     arm = Arm(2)
     known = ChainBelief(arm.belief.parameters, np.zeros(arm.belief.parameters.size), np.zeros_like(arm.belief.root))
     turn = Rotation.random(rng=arm.rng).as_matrix()
@@ -80,14 +80,14 @@ def test_exact_orientations_of_a_known_arm_give_the_markers_turn_exactly() -> No
     assert found.turn == pytest.approx(turn, abs=1e-9)
 
 
-def test_orientations_are_learnt_of_an_arm_that_is_not_as_drawn() -> None:
+def test_orientations_are_learnt_for_non_nominal_arm() -> None:
     arm = Arm(3)
     found = fitted_orientation(arm.belief, *arm.measured(300, 0.005))
     q = arm.held_out()
     assert angles(found.orientation(q), arm.truth(q)).mean() < 0.0015  # the noise is 8 mrad long
 
 
-def test_a_tenth_of_wild_orientations_spoils_nothing() -> None:
+def test_ten_percent_gross_orientation_outliers_are_tolerated() -> None:
     arm = Arm(4)
     q, measured = arm.measured(200, 0.005)
     measured[::10] = Rotation.random(20, rng=arm.rng).as_matrix()
@@ -108,7 +108,7 @@ def test_the_claimed_sigma_covers() -> None:
     assert 0.60 < np.mean(shares) < 0.75
 
 
-def test_what_positions_said_of_the_chain_is_used() -> None:
+def test_chain_belief_from_positions_improves_orientations() -> None:
     arm = Arm(5)
     q = random_q(arm.rng, KINDS, 400, 60.0)
     learner = RigidLearner(arm.drawn, TOLERANCES)
@@ -139,7 +139,7 @@ def test_orientations_of_other_pairs_are_refused() -> None:
         fitted_orientation(arm.belief, q[:3], measured)
 
 
-def test_quaternions_say_the_same() -> None:
+def test_quaternions_give_same_fit_as_matrices() -> None:
     arm = Arm(9)
     q, measured = arm.measured(50, 0.01)
     by_matrix = fitted_orientation(arm.belief, q, measured)
@@ -158,7 +158,7 @@ def test_bytes_give_back_the_same_chain() -> None:
     )
 
 
-def test_its_chain_has_the_markers_frame_as_its_last() -> None:
+def test_fitted_chain_ends_in_the_marker_frame() -> None:
     arm = Arm(11)
     found = fitted_orientation(arm.belief, *arm.measured(30, 0.01))
     q = arm.held_out()

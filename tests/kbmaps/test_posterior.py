@@ -12,7 +12,7 @@ from kbmaps.chains.parameters import ChainParameters
 @pytest.mark.parametrize("kind", [RigidLearner, RecursiveRigidLearner])
 @pytest.mark.parametrize("kinds", ["RRRRRR", "RPRRR"])
 @pytest.mark.parametrize("pairs", [0, 3, 60])
-def test_roots_and_floor_make_the_sigma_that_the_learner_claims(kind, kinds, pairs):
+def test_roots_and_floor_reproduce_the_learner_sigma(kind, kinds, pairs):
     rng = np.random.default_rng(3)
     arm = rough_arm(rng, kinds)
     learner = kind(arm.nominal, ROUGH)
@@ -24,7 +24,7 @@ def test_roots_and_floor_make_the_sigma_that_the_learner_claims(kind, kinds, pai
     np.testing.assert_allclose(np.sqrt(variances), learner.estimate(q).sigma, rtol=1e-6)
 
 
-def test_the_roots_are_as_sure_as_the_learner_where_tolerances_are_infinite():
+def test_roots_reproduce_learner_sigma_with_infinite_tolerances():
     rng = np.random.default_rng(4)
     arm = rough_arm(rng)
     wide = type(ROUGH)(axes=0.05, points=0.015, tool=np.inf, base_rotation=np.inf, base_translation=np.inf)
@@ -35,7 +35,7 @@ def test_the_roots_are_as_sure_as_the_learner_where_tolerances_are_infinite():
     np.testing.assert_allclose(np.sqrt(np.square(roots).sum(axis=2)), learner.estimate(q).sigma, rtol=1e-4)
 
 
-def test_a_recursive_learner_knows_the_covariance_that_the_batch_knows():
+def test_recursive_covariance_matches_batch_covariance():
     rng = np.random.default_rng(5)
     arm = rough_arm(rng)
     pairs = arm.pairs(rng, 200, 0.005)
@@ -46,7 +46,7 @@ def test_a_recursive_learner_knows_the_covariance_that_the_batch_knows():
     np.testing.assert_allclose(np.sqrt(np.diag(recursive.covariance)), std, rtol=0.05)
 
 
-def test_without_pairs_the_recursive_covariance_is_that_of_the_tolerances():
+def test_recursive_covariance_without_pairs_equals_tolerances():
     arm = rough_arm(np.random.default_rng(6))
     std = ChainParameters(arm.nominal).standard_deviations(ROUGH)
     covariance = RecursiveRigidLearner(arm.nominal, ROUGH).covariance
@@ -54,7 +54,7 @@ def test_without_pairs_the_recursive_covariance_is_that_of_the_tolerances():
 
 
 @pytest.mark.parametrize("kind", [RigidLearner, RecursiveRigidLearner])
-def test_the_noise_is_the_one_found_unless_another_is_given(kind):
+def test_noise_is_estimated_unless_given(kind):
     rng = np.random.default_rng(7)
     arm = rough_arm(rng)
     learner = kind(arm.nominal, ROUGH)
@@ -63,7 +63,7 @@ def test_the_noise_is_the_one_found_unless_another_is_given(kind):
     assert ChainPosterior.of(learner, noise=0.001).noise == 0.001
 
 
-def test_what_no_rigid_chain_explains_is_the_floor_and_adds_to_the_noise():
+def test_model_misfit_is_floor_and_adds_to_noise():
     rng = np.random.default_rng(8)
     arm = rough_arm(rng)
     q, x = arm.pairs(rng, 500, 0.005)
@@ -74,13 +74,13 @@ def test_what_no_rigid_chain_explains_is_the_floor_and_adds_to_the_noise():
     assert posterior.noise == pytest.approx(0.005, rel=0.1)
 
 
-def test_a_batch_without_pairs_has_no_noise_to_go_by():
+def test_batch_posterior_without_pairs_is_refused():
     arm = rough_arm(np.random.default_rng(9))
     with pytest.raises(DegenerateDataError):
         ChainPosterior.of(RigidLearner(arm.nominal, ROUGH))
 
 
-def test_what_does_not_fit_is_refused():
+def test_invalid_arguments_are_refused():
     arm = rough_arm(np.random.default_rng(10))
     size = ChainParameters(arm.nominal).size
     change, covariance = np.zeros(size), np.eye(size)

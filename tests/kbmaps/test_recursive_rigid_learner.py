@@ -31,7 +31,7 @@ SLIGHT = ChainTolerances(axes=1e-4, points=1e-4, zeros=1e-4, slide_zeros=1e-4, t
 
 @given(seed=seeds, kinds=st.sampled_from(["RRRR", "RPR", "RRRRRRR"]))
 @settings(max_examples=8)
-def test_pair_by_pair_is_all_at_once_where_the_problem_is_linear(seed, kinds):
+def test_recursive_equals_batch_for_linear_problem(seed, kinds):
     rng = np.random.default_rng(seed)
     arm = rough_arm(rng, kinds, SLIGHT)
     q, x = arm.pairs(rng, 30, 2e-5)
@@ -44,7 +44,7 @@ def test_pair_by_pair_is_all_at_once_where_the_problem_is_linear(seed, kinds):
     np.testing.assert_allclose(other.sigma, one.sigma, rtol=5e-3)
 
 
-def test_thirty_exact_pairs_leave_less_than_a_hundredth_of_a_millimetre_of_a_rough_drawing():
+def test_thirty_exact_pairs_correct_rough_nominal_model():
     errors = []
     for seed in range(2):
         rng = np.random.default_rng(seed)
@@ -55,7 +55,7 @@ def test_thirty_exact_pairs_leave_less_than_a_hundredth_of_a_millimetre_of_a_rou
     assert max(errors) < 1e-5
 
 
-def test_claimed_intervals_cover_as_they_say_at_every_stage():
+def test_one_sigma_coverage_holds_at_every_stage():
     inside: dict[int, list[float]] = {3: [], 30: [], 100: []}
     for seed in range(8):
         rng = np.random.default_rng(seed)
@@ -71,7 +71,7 @@ def test_claimed_intervals_cover_as_they_say_at_every_stage():
 
 
 @pytest.mark.parametrize("sigma", [0.003, 0.02])
-def test_the_noise_is_estimated_when_no_one_tells_it(sigma):
+def test_noise_is_estimated_when_not_given(sigma):
     rng = np.random.default_rng(3)
     arm = rough_arm(rng)
     learner = RecursiveRigidLearner(arm.nominal, ROUGH)
@@ -80,7 +80,7 @@ def test_the_noise_is_estimated_when_no_one_tells_it(sigma):
 
 
 @on_both_paths
-def test_a_new_tool_is_learnt_from_few_pairs_without_losing_the_arm():
+def test_new_tool_is_learnt_from_ten_noisy_pairs():
     rng = np.random.default_rng(4)
     arm = rough_arm(rng, "RRRRRRR")
     learner = RecursiveRigidLearner(arm.nominal, ROUGH)
@@ -93,7 +93,7 @@ def test_a_new_tool_is_learnt_from_few_pairs_without_losing_the_arm():
     assert np.linalg.norm(learner.predict(test) - moved.positions(test), axis=1).mean() < 0.005
 
 
-def test_a_tool_that_was_held_is_set_free_by_its_change():
+def test_tool_change_frees_a_fixed_tool():
     rng = np.random.default_rng(6)
     tolerances = replace(ROUGH, tool=0.0)
     arm = rough_arm(rng, "RRRR", tolerances)
@@ -107,7 +107,7 @@ def test_a_tool_that_was_held_is_set_free_by_its_change():
 
 
 @on_both_paths
-def test_an_outlier_moves_the_chain_no_further_than_a_pair_at_the_gate():
+def test_ten_percent_gross_outliers_are_tolerated():
     rng = np.random.default_rng(7)
     arm = rough_arm(rng)
     q, x = arm.pairs(rng, 100, 0.005)
@@ -119,7 +119,7 @@ def test_an_outlier_moves_the_chain_no_further_than_a_pair_at_the_gate():
 
 @pytest.mark.parametrize(("told", "pairs"), [(True, 30), (False, 100)])
 @pytest.mark.soak
-def test_outliers_from_the_first_pair_on_cost_no_more_than_their_share_of_the_pairs(told, pairs):
+def test_early_outliers_cost_under_ten_percent_accuracy(told, pairs):
     spoilt, clean = [], []
     for seed in range(3):
         rng = np.random.default_rng(seed)
@@ -140,7 +140,7 @@ def test_outliers_from_the_first_pair_on_cost_no_more_than_their_share_of_the_pa
 @pytest.mark.parametrize(
     "noise", [1e-6, 1e-2, *(pytest.param(noise, marks=pytest.mark.soak) for noise in (1e-5, 1e-4))]
 )
-def test_the_noise_it_starts_from_does_not_matter_after_thirty_pairs(noise):
+def test_initial_noise_is_irrelevant_after_thirty_pairs(noise):
     rng = np.random.default_rng(11)
     arm = rough_arm(rng)
     learner = RecursiveRigidLearner(arm.nominal, ROUGH, noise=noise)
@@ -149,7 +149,7 @@ def test_the_noise_it_starts_from_does_not_matter_after_thirty_pairs(noise):
     assert arm.error(learner, rng) < 2e-4
 
 
-def test_along_a_path_from_a_crude_drawing_it_ends_where_a_batch_does():
+def test_path_from_crude_nominal_model_matches_batch():
     rng = np.random.default_rng(12)
     crude = ChainTolerances(axes=0.15, points=0.05, tool=0.1)
     arm = rough_arm(rng, "RRRRRRR", crude)
@@ -184,7 +184,7 @@ def test_between_refits_it_stays_where_a_batch_is():
 
 
 @pytest.mark.soak
-def test_of_many_arms_hardly_one_leaves_the_batch_between_refits():
+def test_many_arms_stay_near_the_batch_between_refits():
     apart = [most_apart_from_a_batch(seed) for seed in range(100)]
     assert np.quantile(apart, 0.95) < 0.3
     assert max(apart) < 1.0
@@ -203,7 +203,7 @@ def test_claims_between_refits_are_those_of_a_batch():
 
 @on_both_paths
 @pytest.mark.parametrize("sigma", [None, 0.004])
-def test_vectors_and_rows_tell_the_same_to_the_last_bit(sigma):
+def test_vectors_and_rows_teach_bit_identically(sigma):
     rng = np.random.default_rng(19)
     arm = rough_arm(rng, "RPR")
     q, x = arm.pairs(rng, 30, 0.004)
@@ -216,7 +216,7 @@ def test_vectors_and_rows_tell_the_same_to_the_last_bit(sigma):
 
 @given(seed=seeds, cuts=st.lists(st.integers(1, 44), max_size=4))
 @settings(max_examples=3)
-def test_pairs_tell_the_same_in_whatever_portions_they_come(seed, cuts):
+def test_batch_boundaries_do_not_change_predictions(seed, cuts):
     rng = np.random.default_rng(seed)
     arm = rough_arm(rng, "RRR")
     q, x = arm.pairs(rng, 45, 0.005)
@@ -255,7 +255,7 @@ def test_folded_pairs_count_as_much_as_kept_ones():
     np.testing.assert_allclose(other.sigma, one.sigma, rtol=0.1)
 
 
-def test_an_arm_that_stands_anywhere_is_found_as_a_batch_finds_it():
+def test_arm_with_unknown_base_pose_is_learnt():
     rng = np.random.default_rng(16)
     planted = ChainTolerances(zeros=0.03, tool=0.1, base_rotation=0.9, base_translation=1.0)
     arm = rough_arm(rng, "RRRRRR", planted)
@@ -265,7 +265,7 @@ def test_an_arm_that_stands_anywhere_is_found_as_a_batch_finds_it():
     assert arm.error(learner, rng) < 0.001
 
 
-def test_an_arm_that_is_not_rigid_widens_sigma_when_the_noise_was_told():
+def test_non_rigid_arm_widens_sigma_with_given_noise():
     rng = np.random.default_rng(17)
     arm = rough_arm(rng)
     q, x = arm.pairs(rng, 100)
@@ -288,7 +288,7 @@ def test_a_wild_pair_leaves_finite_numbers():
 @on_both_paths
 @pytest.mark.parametrize("sigma", [0.004, None])
 @pytest.mark.parametrize("tool_changed", [False, True])
-def test_bytes_give_a_learner_that_goes_on_to_the_last_bit(tool_changed, sigma):
+def test_restored_learner_continues_bit_for_bit(tool_changed, sigma):
     rng = np.random.default_rng(9)
     arm = rough_arm(rng, "RPRR")
     learner = RecursiveRigidLearner(arm.nominal, ROUGH, noise=0.02)
@@ -318,7 +318,7 @@ def test_bytes_of_the_other_learner_are_refused():
         (np.zeros((2, 6)), np.zeros((2, 3)), [0.1, -0.1], SettingError),
     ],
 )
-def test_bad_input_changes_nothing_not_even_by_its_good_rows(q, x, sigma, error):
+def test_batch_with_bad_rows_changes_nothing(q, x, sigma, error):
     learner = RecursiveRigidLearner(rough_arm(np.random.default_rng(14)).nominal, ROUGH)
     before = learner.to_bytes()
     with pytest.raises(error):
@@ -335,6 +335,6 @@ def test_a_tool_change_of_no_size_is_refused(wrong):
         RecursiveRigidLearner(learner.nominal, ROUGH, noise=wrong)
 
 
-def test_a_window_too_short_to_look_back_is_refused():
+def test_window_below_sixteen_pairs_is_refused():
     with pytest.raises(SettingError, match="16 pairs"):
         RecursiveRigidLearner(rough_arm(np.random.default_rng(14)).nominal, ROUGH, window=15)

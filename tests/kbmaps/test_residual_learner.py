@@ -68,7 +68,7 @@ def bent(arm: Arm, rng: np.random.Generator) -> ResidualLearner:
     return taught(arm, q, arm.real.positions(eccentric(q)) + SIGMA * rng.normal(size=(200, 3)))
 
 
-def test_a_rigid_arm_without_noise_is_learnt_as_a_rigid_chain_to_the_last_bit(arm, rng):
+def test_noise_free_rigid_arm_equals_rigid_learner_exactly(arm, rng):
     q, x = arm.pairs(rng, 40)
     rigid = RigidLearner(arm.nominal, ROUGH)
     rigid.learn(q, x)
@@ -89,7 +89,7 @@ def of_rigid_arms() -> list[tuple[ResidualLearner, float]]:
     return learners
 
 
-def test_where_noise_speaks_for_no_deviation_the_answer_is_the_rigid_chain_s_to_a_fraction_of_its_sigma():
+def test_without_deviations_predictions_stay_near_rigid_chain():
     shares = [share for learner, share in of_rigid_arms() if not learner.deviations]
     assert len(shares) >= 8
     assert max(shares) < 0.5
@@ -103,7 +103,7 @@ def test_deviations_are_those_that_the_pairs_speak_for():
 
 @pytest.mark.parametrize("told", [None, SIGMA])
 @pytest.mark.parametrize("pairs", [1, 4, 40])
-def test_what_is_known_of_a_rigid_chain_is_claimed_as_the_rigid_learner_does(arm, rng, pairs, told):
+def test_rigid_prior_gives_same_estimates_as_rigid_learner(arm, rng, pairs, told):
     before = RigidLearner(arm.nominal, ROUGH)
     before.learn(*arm.pairs(rng, 30), SIGMA)
     belief = before.belief.with_other_tool(0.1)
@@ -118,7 +118,7 @@ def test_what_is_known_of_a_rigid_chain_is_claimed_as_the_rigid_learner_does(arm
     np.testing.assert_array_equal(mine.in_support, theirs.in_support)
 
 
-def test_a_rigid_arm_costs_next_to_nothing_over_the_rigid_chain():
+def test_residual_costs_under_ten_percent_on_rigid_arms():
     ratios = []
     for seed in range(6):
         rng = np.random.default_rng(seed)
@@ -129,7 +129,7 @@ def test_a_rigid_arm_costs_next_to_nothing_over_the_rigid_chain():
     assert np.exp(np.log(ratios).mean()) < 1.1
 
 
-def test_eccentric_encoders_are_learnt_exactly_where_there_is_no_noise(arm, rng):
+def test_eccentric_encoders_are_learnt_exactly_without_noise(arm, rng):
     q, test = random_q(rng, arm.kinds, 100, 80.0), random_q(rng, arm.kinds, 100, 80.0)
     learner = taught(arm, q, arm.real.positions(eccentric(q)))
     assert mean_distance(learner.predict(test), arm.real.positions(eccentric(test))) < 1e-8
@@ -139,14 +139,14 @@ def test_the_cause_of_a_deviation_is_named(bent):
     assert max(bent.deviations, key=lambda group: bent.deviations[group]) == "eccentricity"
 
 
-def test_a_weight_that_bends_the_joints_is_learnt_beyond_the_rigid_chain(arm, rng):
+def test_joint_compliance_is_learnt_beyond_rigid_chain(arm, rng):
     q, test = random_q(rng, arm.kinds, 300, 60.0), random_q(rng, arm.kinds, 300, 60.0)
     learner = taught(arm, q, loaded(arm, q, 0.05) + SIGMA * rng.normal(size=(300, 3)))
     truth = loaded(arm, test, 0.05)
     assert mean_distance(learner.predict(test), truth) < 0.5 * mean_distance(learner.rigid.predict(test), truth)
 
 
-def test_a_camera_that_stretches_space_is_learnt_beyond_the_rigid_chain(arm, rng):
+def test_camera_axis_scaling_is_learnt_beyond_rigid_chain(arm, rng):
     stretch = np.diag([1.03, 0.98, 1.02])
     q, x = arm.pairs(rng, 200)
     test, truth = arm.pairs(rng, 300)
@@ -155,7 +155,7 @@ def test_a_camera_that_stretches_space_is_learnt_beyond_the_rigid_chain(arm, rng
     assert mean_distance(learner.predict(test), truth @ stretch) < 0.5 * rigid
 
 
-def test_the_gain_of_a_prismatic_joint_is_learnt_beyond_the_rigid_chain(rng):
+def test_prismatic_joint_gain_is_learnt_beyond_rigid_chain(rng):
     arm = rough_arm(rng, "RPRRP")
     factor = np.array([1.0, 1.03, 1.0, 1.0, 0.97])
     q, test = random_q(rng, arm.kinds, 200, 80.0), random_q(rng, arm.kinds, 200, 80.0)
@@ -165,7 +165,7 @@ def test_the_gain_of_a_prismatic_joint_is_learnt_beyond_the_rigid_chain(rng):
 
 
 @pytest.mark.soak
-def test_twenty_joints_with_eccentric_encoders_are_learnt_beyond_the_rigid_chain(rng):
+def test_twenty_eccentric_encoders_are_learnt_beyond_rigid_chain(rng):
     arm = rough_arm(rng, "R" * 20)
     q, test = random_q(rng, arm.kinds, 600, 60.0), random_q(rng, arm.kinds, 200, 60.0)
     learner = taught(arm, q, arm.real.positions(eccentric(q)) + SIGMA * rng.normal(size=(600, 3)))
@@ -174,7 +174,7 @@ def test_twenty_joints_with_eccentric_encoders_are_learnt_beyond_the_rigid_chain
 
 
 @pytest.mark.parametrize("told", [None, pytest.param(SIGMA, marks=pytest.mark.soak)])
-def test_sigma_covers_two_thirds_and_nineteen_twentieths_of_a_bent_arm(told):
+def test_sigma_covers_eccentric_arms_at_68_and_95(told):
     ratios = []
     for seed in range(8):
         rng = np.random.default_rng(seed)
@@ -194,7 +194,7 @@ def test_sigma_grows_away_from_the_data(arm, rng):
     assert far > 2.0 * near
 
 
-def test_poses_far_from_the_data_are_not_in_support(arm, rng):
+def test_poses_far_from_data_are_not_in_support(arm, rng):
     q = random_q(rng, arm.kinds, 150, 20.0)
     learner = taught(arm, q, arm.real.positions(eccentric(q)) + SIGMA * rng.normal(size=(150, 3)))
     assert learner.estimate(q).in_support.all()
@@ -222,7 +222,7 @@ def test_an_arm_placed_anywhere_is_learnt(arm, rng):
     assert mean_distance(learner.predict(test), truth @ turn.T + 3.0) < SIGMA
 
 
-def test_errors_shared_by_neighbours_on_a_path_are_not_taken_for_shape(arm, rng):
+def test_correlated_path_errors_are_not_fitted_as_residual(arm, rng):
     steps = np.cumsum(rng.normal(0.0, np.radians(0.7), (250, 6)), axis=0)
     drift = np.cumsum(rng.normal(0.0, 0.0007, (250, 3)), axis=0)
     q = steps - steps.mean(axis=0)
@@ -233,7 +233,7 @@ def test_errors_shared_by_neighbours_on_a_path_are_not_taken_for_shape(arm, rng)
 
 
 @pytest.mark.parametrize("pairs", [0, 1, 5])
-def test_with_hardly_any_pairs_it_answers_as_the_rigid_chain_does(arm, rng, pairs):
+def test_up_to_five_pairs_predictions_equal_rigid_chain(arm, rng, pairs):
     q, x = arm.pairs(rng, pairs, SIGMA)
     learner = taught(arm, q, x)
     assert np.array_equal(learner.predict(q), learner.rigid.predict(q))
@@ -249,7 +249,7 @@ def test_estimate_gives_the_same_positions_as_predict(bent, rng):
     np.testing.assert_allclose(bent.estimate(q).x, bent.predict(q), rtol=0.0, atol=1e-12)
 
 
-def test_the_order_in_which_pairs_came_in_does_not_matter(arm, rng):
+def test_order_of_pairs_does_not_matter(arm, rng):
     q = random_q(rng, arm.kinds, 120, 80.0)
     x = arm.real.positions(eccentric(q)) + SIGMA * rng.normal(size=(120, 3))
     order = rng.permutation(120)
@@ -258,12 +258,12 @@ def test_the_order_in_which_pairs_came_in_does_not_matter(arm, rng):
     )
 
 
-def test_bytes_bring_back_the_same_predictions_to_the_last_bit(bent, rng):
+def test_bytes_restore_predictions_bit_for_bit(bent, rng):
     q = random_q(rng, "RRRRRR", 20, 80.0)
     assert np.array_equal(ResidualLearner.from_bytes(bent.to_bytes()).predict(q), bent.predict(q))
 
 
-def test_bytes_keep_which_sigma_was_not_told(arm, rng):
+def test_bytes_keep_track_of_missing_sigmas(arm, rng):
     q, x = arm.pairs(rng, 60, SIGMA)
     learner = taught(arm, q[:30], x[:30], SIGMA)
     learner.learn(q[30:], x[30:])
@@ -308,7 +308,7 @@ def test_derivatives_of_every_group_agree_with_differences(rng, kinds):
         np.testing.assert_allclose(point.groups[group] @ weights[group], moved, rtol=1e-3, atol=1e-10)
 
 
-def test_a_group_that_explains_the_rows_is_taken_up_and_one_of_noise_is_not(rng):
+def test_selection_keeps_explaining_group_and_drops_noise_group(rng):
     design = rng.normal(size=(300, 12))
     target = design[:, 2:7] @ rng.normal(size=5) + 0.1 * rng.normal(size=300)
     columns = {"": slice(0, 2), "true": slice(2, 7), "idle": slice(7, 12)}
@@ -318,7 +318,7 @@ def test_a_group_that_explains_the_rows_is_taken_up_and_one_of_noise_is_not(rng)
     assert model.noise == pytest.approx(0.1, rel=0.15)
 
 
-def test_the_evidence_is_that_of_the_gaussian_of_all_rows(rng):
+def test_log_evidence_equals_dense_gaussian_likelihood(rng):
     design, target = rng.normal(size=(9, 4)), rng.normal(size=9)
     columns = {"": slice(0, 1), "group": slice(1, 4)}
     model = GroupedModel(Moments.of(design, target), columns, np.array([0.3]), least_noise=1e-9, noise=0.7)
@@ -329,7 +329,7 @@ def test_the_evidence_is_that_of_the_gaussian_of_all_rows(rng):
     assert model.posterior(active={"group": 2.5}).log_evidence == pytest.approx(dense, abs=1e-9)
 
 
-def test_an_average_of_models_is_as_wide_as_they_and_their_distances_are(rng):
+def test_model_average_variance_includes_distance_between_means(rng):
     design = rng.normal(size=(20, 3))
     target = 0.3 * design[:, 1] + rng.normal(size=20)
     columns = {"": slice(0, 1), "first": slice(1, 2), "second": slice(2, 3)}

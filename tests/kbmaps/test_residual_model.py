@@ -62,7 +62,7 @@ def model(learner: ResidualLearner) -> ResidualModel:
     return learner.model
 
 
-def test_it_answers_as_its_learner_to_the_last_bit(learner, model):
+def test_model_predicts_like_its_learner_bit_for_bit(learner, model):
     q = random_q(np.random.default_rng(5), "RRRRRR", 50, 80.0)
     assert model.weights
     assert np.array_equal(model.predict(q), learner.predict(q))
@@ -78,7 +78,7 @@ def test_later_learning_does_not_touch_it(arm):
     assert np.array_equal(model.predict(q), before)
 
 
-def test_where_nothing_speaks_for_deviations_it_is_the_rigid_chain(arm):
+def test_model_without_deviations_equals_rigid_chain(arm):
     q, x = arm.pairs(np.random.default_rng(7), 40)
     learner = taught(arm, q, x)
     assert not learner.model.weights
@@ -110,12 +110,12 @@ def test_without_deviations_the_jacobian_is_the_chain_s(arm):
     assert np.array_equal(model.jacobian(q), model.chain.jacobian(q))
 
 
-def test_one_configuration_has_the_jacobian_that_it_has_in_a_batch(model):
+def test_single_jacobian_equals_its_row_of_a_batch(model):
     q = random_q(np.random.default_rng(11), "RRRRRR", 5, 80.0)
     np.testing.assert_allclose(model.jacobian(q[0]), model.jacobian(q)[0], rtol=0.0, atol=1e-11)
 
 
-def test_bytes_give_the_same_predictions_and_variances_to_the_last_bit(model):
+def test_bytes_restore_predictions_and_variances_bit_for_bit(model):
     again = ResidualModel.from_bytes(model.with_other_tool(0.2).to_bytes())
     q = random_q(np.random.default_rng(12), "RRRRRR", 20, 80.0)
     for one, other in zip(
@@ -146,7 +146,7 @@ def test_bytes_of_another_kind_are_refused(learner):
         ResidualModel.from_bytes(learner.to_bytes())
 
 
-def test_the_digest_tells_models_apart(learner, model):
+def test_digest_distinguishes_models(learner, model):
     assert ResidualModel.from_bytes(model.to_bytes()).digest == model.digest
     assert len(model.digest) == 16
     weights = {group: values * 1.000001 for group, values in model.weights.items()}
@@ -164,7 +164,7 @@ def test_another_tool_needs_a_tolerance(model):
         model.with_other_tool(0.0)
 
 
-def test_inverse_kinematics_reaches_by_it_what_it_predicts(model):
+def test_inverse_kinematics_reaches_positions_predicted_by_model(model):
     reach = np.full(6, np.radians(80.0))
     q = random_q(np.random.default_rng(14), "RRRRRR", 1, 50.0)[0]
     found = InverseKinematics(model, -reach, reach).solve(model.predict(q))
@@ -193,7 +193,7 @@ def test_with_another_tool_a_sagging_arm_stays_known(arm, model, pairs):
     )
 
 
-def test_a_learner_with_a_prior_is_restored_with_it(arm, model):
+def test_restored_learner_keeps_its_prior(arm, model):
     rng = np.random.default_rng(16)
     q = random_q(rng, arm.kinds, 20, 80.0)
     for prior in (model, model.belief):
@@ -230,11 +230,11 @@ def test_the_most_probable_correlation_is_found_uphill():
     assert most_probable(lambda tried: -1000.0 * (tried - 0.8) ** 2, 0.0) == 0.8
 
 
-def test_a_correlation_that_gains_next_to_nothing_is_none():
+def test_correlation_with_negligible_gain_is_set_to_zero():
     assert most_probable(lambda tried: tried, 0.0) == 0.0
 
 
-def test_shared_noise_does_not_make_the_learner_too_sure_on_a_path(arm):
+def test_correlated_noise_on_path_keeps_sigma_honest(arm):
     rng = np.random.default_rng(19)
     steps = np.cumsum(rng.normal(0.0, np.radians(1.5), (500, 6)), axis=0)
     q = steps - steps.mean(axis=0)

@@ -66,7 +66,7 @@ def test_few_exact_pairs_are_all_inliers():
 
 
 @pytest.mark.soak
-def test_small_motions_of_random_arms_are_aligned_in_ninety_nine_of_a_hundred_cases():
+def test_random_arms_are_aligned_in_99_percent():
     aligned = []
     for seed in range(500):
         rng = np.random.default_rng(seed)
@@ -93,7 +93,7 @@ def test_without_outliers_the_fit_is_plain_least_squares():
         assert np.sqrt(np.square(other.positions(q) - x).sum(axis=1).mean()) > fit.rms
 
 
-def test_points_seen_in_a_mirror_are_not_fitted_by_a_mirror():
+def test_mirrored_points_are_fitted_by_proper_rotation():
     rng = np.random.default_rng(4)
     chain = random_chain(rng, "RRRR")
     q = random_q(rng, "RRRR", 50, 80)
@@ -103,7 +103,7 @@ def test_points_seen_in_a_mirror_are_not_fitted_by_a_mirror():
     assert fit.rms > 0.01
 
 
-def test_a_marker_shift_that_the_pose_can_make_up_for_stays_small():
+def test_unidentifiable_marker_shift_stays_small():
     """All joints turn about z, so the heights of instrument and marker are not separately identifiable."""
     rng = np.random.default_rng(5)
     fixed = np.tile(np.eye(4), (3, 1, 1))
@@ -115,7 +115,7 @@ def test_a_marker_shift_that_the_pose_can_make_up_for_stays_small():
     assert abs(fit.marker_shift[2]) <= 0.1 + 1e-9
 
 
-def test_what_is_known_is_not_touched():
+def test_known_pose_and_marker_stay_unchanged():
     rng = np.random.default_rng(6)
     chain = random_chain(rng, "RRR")
     q = random_q(rng, "RRR", 30, 80)
@@ -129,7 +129,7 @@ def test_what_is_known_is_not_touched():
 @pytest.mark.parametrize(
     ("pose_known", "marker_known", "needed"), [(True, False, 1), (False, True, 3), (False, False, 4)]
 )
-def test_too_few_pairs_are_refused_with_the_number_needed(pose_known, marker_known, needed):
+def test_too_few_pairs_error_states_number_needed(pose_known, marker_known, needed):
     chain = random_chain(np.random.default_rng(1), "RRR")
     n = needed - 1
     with pytest.raises(DegenerateDataError, match=f"at least {needed} pairs"):

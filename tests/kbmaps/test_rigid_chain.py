@@ -46,7 +46,7 @@ def test_poses_are_the_product_of_the_transforms(joint_kinds, seed):
 
 
 @given(joint_kinds=kinds, seed=seeds)
-def test_the_frames_of_many_rows_are_those_of_each(joint_kinds, seed):
+def test_batch_frames_equal_single_frames(joint_kinds, seed):
     rng = np.random.default_rng(seed)
     chain = random_chain(rng, joint_kinds)
     q = random_q(rng, joint_kinds, 3, 180)
@@ -66,7 +66,7 @@ def test_the_jacobian_agrees_with_finite_differences(joint_kinds, seed):
 
 
 @given(joint_kinds=kinds, seed=seeds)
-def test_the_net_of_a_chain_is_exact_all_the_way_round(joint_kinds, seed):
+def test_control_net_is_exact_over_the_full_turn(joint_kinds, seed):
     rng = np.random.default_rng(seed)
     chain = random_chain(rng, joint_kinds)
     q = random_q(rng, joint_kinds, 50, 180)
@@ -75,7 +75,7 @@ def test_the_net_of_a_chain_is_exact_all_the_way_round(joint_kinds, seed):
     )
 
 
-def test_the_net_of_seven_joints_is_exact_to_two_picometres_in_the_papers_basis():
+def test_seven_joint_bernstein_net_is_exact_to_picometres():
     rng = np.random.default_rng(5)
     chain = random_chain(rng, "R" * 7)
     q = random_q(rng, "R" * 7, 500, 180)
@@ -94,7 +94,7 @@ def test_the_orientation_planes_give_the_rotation_matrix(joint_kinds, seed):
 
 
 @given(joint_kinds=kinds, seed=seeds)
-def test_moving_the_tool_adds_the_orientation_planes_to_the_net(joint_kinds, seed):
+def test_tool_shift_adds_orientation_planes_to_net(joint_kinds, seed):
     rng = np.random.default_rng(seed)
     chain, shift = random_chain(rng, joint_kinds), rng.normal(size=3)
     bases = bases_for(joint_kinds)
@@ -104,7 +104,7 @@ def test_moving_the_tool_adds_the_orientation_planes_to_the_net(joint_kinds, see
     np.testing.assert_allclose(moved, net + np.tensordot(shift, axes, axes=1), rtol=0, atol=1e-12)
 
 
-def test_a_transformed_chain_sees_the_marker_from_the_new_frame():
+def test_transformed_chain_gives_poses_in_new_frame():
     rng = np.random.default_rng(1)
     chain = random_chain(rng, "RRP")
     T_new_old = np.eye(4)
@@ -119,7 +119,7 @@ def test_a_mirror_is_no_rigid_transform():
         random_chain(np.random.default_rng(1), "R").transformed(np.diag([1.0, 1.0, -1.0, 1.0]))
 
 
-def test_axes_that_are_not_of_unit_length_are_refused():
+def test_non_unit_axes_are_refused():
     with pytest.raises(ChainError, match=r"axes\[1\]"):
         RigidChain(np.tile(np.eye(4), (3, 1, 1)), np.array([[0, 0, 1], [0, 0, 2]]), np.zeros(2, dtype=bool))
 
@@ -136,13 +136,13 @@ def test_a_chain_with_nan_is_refused():
         RigidChain(fixed, np.array([[0.0, 0, 1]]), np.zeros(1, dtype=bool))
 
 
-def test_a_revolute_basis_for_a_prismatic_joint_is_refused():
+def test_revolute_basis_for_prismatic_joint_is_refused():
     with pytest.raises(BasisError, match=r"joint 2 of 2 is prismatic .* learning_bases\(low, high, prismatic="):
         random_chain(np.random.default_rng(1), "RP").to_kbmap([JointBasis.trigonometric()] * 2)
 
 
 @pytest.mark.parametrize("orientation", [False, True])
-def test_a_map_of_twenty_joints_is_refused_with_its_size_and_a_way_out(orientation):
+def test_twenty_joint_map_error_states_size_and_alternative(orientation):
     bases, chain = bases_for("R" * 20), random_chain(np.random.default_rng(0), "R" * 20)
     with pytest.raises(NetSizeError, match=r"3,486,784,401 control points, (77\.9|312) GiB.*InverseKinematics"):
         chain.to_kbmap(bases, orientation=orientation)
@@ -153,7 +153,7 @@ def test_a_map_of_twenty_joints_is_refused_with_its_size_and_a_way_out(orientati
 
 
 @given(seed=seeds, joint_kinds=kinds)
-def test_the_angular_jacobian_is_how_the_marker_frame_turns(seed, joint_kinds):
+def test_angular_jacobian_is_derivative_of_marker_orientation(seed, joint_kinds):
     rng = np.random.default_rng(seed)
     chain, step = random_chain(rng, joint_kinds), 1e-6
     q = random_q(rng, joint_kinds, 1, 180)[0]

@@ -33,7 +33,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 @given(seed=seeds, kinds=st.sampled_from(["RRRRRRR", "RPRRRR", "PPPRRR", "RRP"]))
-def test_fifteen_exact_pairs_make_a_rough_drawing_exact(seed, kinds):
+def test_fifteen_exact_pairs_correct_rough_nominal_model(seed, kinds):
     rng = np.random.default_rng(seed)
     arm = rough_arm(rng, kinds, replace(ROUGH, slide_zeros=0.01))
     learner = RigidLearner(arm.nominal, replace(ROUGH, slide_zeros=0.01))
@@ -55,7 +55,7 @@ def test_the_order_of_the_pairs_does_not_matter(seed):
     np.testing.assert_allclose(one_by_one.predict(q), at_once.predict(q), rtol=0, atol=1e-6)
 
 
-def test_the_posterior_of_a_nearly_linear_problem_is_the_closed_form():
+def test_posterior_matches_closed_form_for_linear_problem():
     """With tiny tolerances the chain is linear in its parameters and textbook formulas hold."""
     rng = np.random.default_rng(11)
     tolerances = ChainTolerances(axes=1e-5, points=1e-5, zeros=1e-5, tool=1e-5, base_rotation=1e-5)
@@ -89,7 +89,7 @@ def test_copies_of_a_taught_learner_predict_the_same(copied: Callable[[RigidLear
     np.testing.assert_allclose(got.sigma, expected.sigma, rtol=1e-9)
 
 
-def test_claimed_intervals_cover_as_they_say():
+def test_claimed_intervals_cover_over_24_arms():
     inside, inside_twice = [], []
     for seed in range(24):
         rng = np.random.default_rng(seed)
@@ -127,7 +127,7 @@ def test_intervals_cover_errors_that_all_pairs_share():
 @pytest.mark.parametrize("learner", [RigidLearner, RecursiveRigidLearner])
 @pytest.mark.parametrize("told", [True, False])
 @pytest.mark.parametrize(("pairs", "reach_deg"), [(30, 80), (300, 80), (300, 20)])
-def test_over_two_hundred_arms_the_claimed_intervals_cover_as_they_say(learner, told, pairs, reach_deg):
+def test_claimed_intervals_cover_over_two_hundred_arms(learner, told, pairs, reach_deg):
     inside, inside_twice = [], []
     for seed in range(200):
         rng = np.random.default_rng(seed)
@@ -159,7 +159,7 @@ def test_gross_outliers_are_left_out(told):
 
 @pytest.mark.parametrize("told", [True, False])
 @pytest.mark.parametrize("pairs", [8, 12])
-def test_no_good_pair_is_taken_for_an_outlier_while_they_are_few(told, pairs):
+def test_few_good_pairs_are_all_kept_as_inliers(told, pairs):
     for seed in range(12):
         rng = np.random.default_rng(seed)
         arm = rough_arm(rng)
@@ -187,7 +187,7 @@ def test_outliers_cost_at_most_a_twentieth(told, pairs):
     assert np.mean(spoilt) <= 1.05 * np.mean(clean)
 
 
-def test_where_an_arm_stands_is_looked_for_only_when_the_pairs_have_doubled(monkeypatch):
+def test_base_pose_alignment_runs_only_on_doubled_pairs(monkeypatch):
     rng = np.random.default_rng(32)
     arm = rough_arm(rng, "RRR", ChainTolerances(tool=0.1, base_rotation=0.9, base_translation=1.0))
     asked = []
@@ -201,7 +201,7 @@ def test_where_an_arm_stands_is_looked_for_only_when_the_pairs_have_doubled(monk
     assert arm.error(learner, rng) < 0.001
 
 
-def test_a_marker_far_off_its_place_is_found_without_noise():
+def test_distant_marker_is_found_from_exact_pairs():
     rng = np.random.default_rng(31)
     arm = rough_arm(rng, "RRRRRRR")
     moved = arm.real.with_tool([0.0, 0.15, -0.2])
@@ -234,7 +234,7 @@ def over_half_widths(arms: int, pairs: int = 200, sigma: float = 0.001) -> dict[
     return {name: np.abs(each) for name, each in off.items()}
 
 
-def test_camera_pose_tool_and_zeros_lie_in_their_intervals():
+def test_camera_pose_tool_and_zeros_lie_in_intervals():
     for off in over_half_widths(12, 60).values():
         # Even if the numbers of an arm were all in or all out: 5 of 12 arms are out in 1 of 6,000 choices of seeds.
         assert (off < 1.0).mean() > 1.0 - 5.0 / 12.0
@@ -244,14 +244,14 @@ def test_camera_pose_tool_and_zeros_lie_in_their_intervals():
 
 @pytest.mark.soak
 @pytest.mark.parametrize(("pairs", "sigma"), [(12, 0.001), (30, 0.001), (200, 0.001), (12, 0.01), (200, 0.01)])
-def test_the_95_percent_intervals_of_camera_pose_tool_and_zeros_cover_95_percent(pairs, sigma):
+def test_camera_tool_and_zero_intervals_cover_95_percent(pairs, sigma):
     for off in over_half_widths(300, pairs, sigma).values():
         # The numbers of an arm go together: were they all in or all out, 1.3 % would be the standard error.
         assert 0.91 < (off < 1.0).mean() < 0.99
 
 
 @pytest.mark.parametrize("turned", [-0.06, 0.06])
-def test_a_tool_off_the_tangent_of_its_arc_lies_in_its_intervals(turned):
+def test_tool_on_curved_arc_lies_in_its_intervals(turned):
     rng = np.random.default_rng(15)
     drawn = random_chain(rng, "RRRRRR")
     fixed, axes = drawn.fixed.copy(), drawn.axes.copy()
@@ -287,7 +287,7 @@ def test_the_reported_noise_is_that_of_the_pairs():
     assert learner.report().noise == pytest.approx(0.001, rel=0.15)
 
 
-def test_what_no_motion_can_show_is_named():
+def test_report_names_parameters_of_an_unmoved_joint():
     rng = np.random.default_rng(5)
     arm = rough_arm(rng, "RRR", ROUGH)
     learner = RigidLearner(arm.nominal, ROUGH)
@@ -310,7 +310,7 @@ def test_moving_every_joint_determines_axes_and_tool():
     assert learner.report().determined == 4 * 4 + 3
 
 
-def test_sigma_grows_and_support_ends_away_from_the_data():
+def test_sigma_grows_and_support_ends_outside_data():
     rng = np.random.default_rng(8)
     arm = rough_arm(rng)
     learner = RigidLearner(arm.nominal, ROUGH)
@@ -322,7 +322,7 @@ def test_sigma_grows_and_support_ends_away_from_the_data():
     assert far.in_support.mean() < 0.05
 
 
-def test_an_arm_that_is_not_rigid_widens_sigma_to_what_is_left():
+def test_non_rigid_arm_widens_sigma_to_the_residual():
     rng = np.random.default_rng(9)
     arm = rough_arm(rng)
     q, x = arm.pairs(rng, 400)
@@ -347,7 +347,7 @@ def test_more_evidence_for_the_right_tolerances():
     assert evidence[1] > max(evidence[0], evidence[2])
 
 
-def test_before_any_pair_the_drawing_and_its_tolerances_speak():
+def test_untrained_learner_predicts_nominal_model_with_tolerance_sigma():
     arm = rough_arm(np.random.default_rng(2), "RRRR")
     learner = RigidLearner(arm.nominal, ROUGH)
     q = random_q(np.random.default_rng(3), "RRRR", 20, 80)
@@ -418,7 +418,7 @@ def test_bad_common_errors_change_nothing(common, error):
     assert learner.pairs == 0
 
 
-def test_one_pair_that_comes_twice_and_no_pair_at_all_are_learnt():
+def test_duplicate_and_empty_batches_are_learnt():
     arm = rough_arm(np.random.default_rng(4), "RRRR")
     learner = RigidLearner(arm.nominal, ROUGH)
     q, x = arm.pairs(np.random.default_rng(5), 1)
@@ -428,7 +428,7 @@ def test_one_pair_that_comes_twice_and_no_pair_at_all_are_learnt():
     assert np.linalg.norm(learner.predict(q[0]) - x[0]) < 0.002
 
 
-def test_a_printed_report_is_a_table_in_millimetres_and_degrees():
+def test_report_prints_zeros_in_millimetres_and_degrees():
     rng = np.random.default_rng(5)
     arm = rough_arm(rng, "RPR", ChainTolerances(axes=0.01, zeros=0.05, slide_zeros=0.02, tool=0.05))
     learner = RigidLearner(arm.nominal, ChainTolerances(axes=0.01, zeros=0.05, slide_zeros=0.02, tool=0.05))

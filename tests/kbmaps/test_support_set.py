@@ -21,7 +21,7 @@ def filled(kinds: str, q: np.ndarray, **settings_) -> SupportSet:
 
 
 @given(seed=seeds, kinds=st.text("RP", min_size=1, max_size=5))
-def test_learnt_configurations_are_explained_up_to_threshold_and_noise(seed, kinds):
+def test_learnt_configurations_are_explained_within_threshold(seed, kinds):
     q = random_q(np.random.default_rng(seed), kinds, 40, 80)
     support = filled(kinds, q)
     assert support.unexplained(q).max() <= support.threshold + 1e-9
@@ -72,7 +72,7 @@ def test_a_full_set_thins_out_and_goes_on():
     assert support.unexplained(q).max() <= support.threshold + 1e-9
 
 
-def test_the_claimed_spread_is_the_posterior_standard_deviation_of_a_fit():
+def test_claimed_spread_matches_errors_of_exact_fits():
     """Errors of maps sampled from the prior, after an exact fit, have the spread that the support set predicts."""
     rng = np.random.default_rng(3)
     kinds, noise_std = "RRR", 0.05

@@ -70,7 +70,7 @@ def test_the_learner_is_a_model():
 
 
 @pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.soak)])
-def test_seven_joints_are_exact_from_nothing_and_110_pairs(seed):
+def test_seven_joints_are_exact_from_110_pairs_alone(seed):
     chain, _, q, x = case("R" * 7, 110, seed)
     learner = TensorLearner(bases_for("R" * 7))
     learner.learn(q, x)
@@ -85,7 +85,7 @@ def test_mixed_chains_are_exact_from_nothing(kinds, n):
     assert largest_error(learner, chain, kinds) < 1e-9
 
 
-def test_twenty_joints_are_exact_from_a_rough_prior_and_200_pairs():
+def test_twenty_joints_exact_from_prior_and_200_pairs():
     chain, prior, q, x = case("R" * 20, 200, 2)
     learner = TensorLearner.around(prior, bases_for("R" * 20))
     learner.learn(q, x)
@@ -93,14 +93,14 @@ def test_twenty_joints_are_exact_from_a_rough_prior_and_200_pairs():
 
 
 @pytest.mark.soak
-def test_a_cluster_of_five_degrees_is_exact_over_eighty():
+def test_five_degree_cluster_is_exact_over_eighty_degrees():
     chain, _, q, x = case("R" * 7, 150, 4, revolute_deg=5.0)
     learner = TensorLearner(bases_for("R" * 7, 5.0))
     learner.learn(q, x)
     assert largest_error(learner, chain, "R" * 7) < 1e-7
 
 
-def test_a_rough_prior_makes_much_of_thirty_noisy_pairs():
+def test_thirty_noisy_pairs_more_than_halve_prior_error():
     chain, prior, q, x = case("R" * 6, 30, 8, SIGMA_M)
     learner = TensorLearner.around(prior, bases_for("R" * 6))
     before = largest_error(learner, chain, "R" * 6)
@@ -118,7 +118,7 @@ def test_gross_outliers_are_the_ones_left_out():
     assert np.flatnonzero(learner.outliers).tolist() == list(range(0, 200, 10))
 
 
-def test_with_outliers_the_train_is_that_of_the_good_pairs():
+def test_outliers_cost_at_most_five_percent_accuracy():
     chain, learner, q, x = noisy_fit()
     _, prior, _, _ = case("RRRR", 200, 5, SIGMA_M)
     clean = TensorLearner.around(prior, bases_for("RRRR"))
@@ -127,7 +127,7 @@ def test_with_outliers_the_train_is_that_of_the_good_pairs():
     assert largest_error(learner, chain, "RRRR") <= 1.05 * largest_error(clean, chain, "RRRR")
 
 
-def test_the_claimed_sigma_holds_two_thirds_of_the_errors():
+def test_claimed_sigma_covers_two_thirds_of_errors():
     inside = []
     for seed in range(8):
         chain, prior, q, x = case("RRRR", 60, seed, SIGMA_M)
@@ -146,7 +146,7 @@ def stretched(q):
 
 @pytest.mark.parametrize("bend", ["lens", "eccentric", "elastic"])
 @pytest.mark.soak
-def test_the_claimed_sigma_holds_where_the_truth_is_no_train(bend):
+def test_claimed_sigma_covers_truths_outside_the_model_class(bend):
     inside, inside_twice = [], []
     for seed in range(4):
         chain, prior, q, _ = case("RRRR", 400, seed)
@@ -186,7 +186,7 @@ def test_a_rigid_arm_is_seldom_taken_for_another():
     assert found <= 5
 
 
-def test_the_pairs_say_how_far_from_rigid_an_arm_is():
+def test_estimated_ellipse_std_beats_fixed_values():
     errors: dict[float | None, list[float]] = {None: [], 0.003: [], 0.03: []}
     for seed in range(3):
         for ellipse_std, found in errors.items():
@@ -199,7 +199,7 @@ def test_the_pairs_say_how_far_from_rigid_an_arm_is():
     assert np.mean(errors[None]) < min(np.mean(errors[0.003]), np.mean(errors[0.03]))
 
 
-def test_what_a_train_does_not_follow_is_carried_over_in_bytes():
+def test_misfit_survives_bytes():
     chain, prior, q, _ = case("RRR", 200, 3)
     learner = TensorLearner.around(prior, bases_for("RRR"), AT_ONCE)
     learner.learn(q, chain.positions(stretched(q)), 0.001)
@@ -223,7 +223,7 @@ def test_support_ends_where_the_data_end():
     assert learner.estimate(np.array([np.full(3, 0.1), np.full(3, 1.4)])).in_support.tolist() == [True, False]
 
 
-def test_before_any_pair_the_prior_is_what_is_predicted():
+def test_untrained_learner_predicts_the_prior():
     _, prior, q, _ = case("RPR", 5, 0)
     assert np.allclose(TensorLearner.around(prior, bases_for("RPR")).predict(q), prior.positions(q), atol=1e-12)
 
@@ -233,7 +233,7 @@ def test_before_any_pair_nothing_is_in_support():
     assert not TensorLearner.around(prior, bases_for("RPR")).estimate(q).in_support.any()
 
 
-def test_without_a_prior_too_few_pairs_are_said_to_be_too_few():
+def test_too_few_pairs_without_prior_are_refused():
     _, _, q, x = case("RRR", 8, 0)
     learner = TensorLearner(bases_for("RRR"), settings=AT_ONCE)
     learner.learn(q, x)
@@ -260,14 +260,14 @@ def changed_tool(settings_: TensorSettings | None = None):
     return learner, changed, q[200:], changed.positions(q[200:]) + x[200:] - chain.positions(q[200:])
 
 
-def test_ten_pairs_show_a_moved_marker_once_it_is_told():
+def test_announced_marker_move_is_learnt_from_ten_pairs():
     learner, changed, q, x = changed_tool()
     learner.tool_changed(0.2)
     learner.learn(q[:10], x[:10])
     assert largest_error(learner, changed, "RRRR") < 0.01
 
 
-def test_a_window_follows_a_change_that_nobody_told():
+def test_window_follows_an_unannounced_change():
     learner, changed, q, x = changed_tool(TensorSettings(window=90))
     learner.learn(q, x)
     assert largest_error(learner, changed, "RRRR") < 0.05
@@ -297,7 +297,7 @@ def test_a_window_keeps_no_more_than_its_pairs():
     assert (learner.kept, learner.pairs) == (40, 60)
 
 
-def test_the_gauge_of_the_prior_does_not_show_in_what_is_learnt():
+def test_gauge_of_prior_does_not_affect_predictions():
     """Turning the frame between two links, mean and covariance alike, gives the same prior."""
     _, prior, q, x = case("RR", 60, 1, SIGMA_M)
     bases = bases_for("RR")
@@ -356,12 +356,12 @@ def test_a_prior_of_other_joints_is_refused():
         TensorLearner(bases_for("RRR"), CorePrior.vague(2, 0.3))
 
 
-def test_a_chain_that_does_not_fit_the_bases_is_refused():
+def test_chain_mismatched_with_bases_is_refused():
     with pytest.raises(BasisError):
         TensorLearner.around(random_chain(np.random.default_rng(0), "RP"), bases_for("RR"))
 
 
-def test_a_learner_goes_on_from_its_bytes_as_if_nothing_had_happened():
+def test_restored_learner_continues_bit_for_bit():
     _, prior, q, x = case("RPR", 120, 2, SIGMA_M)
     learner = TensorLearner.around(prior, bases_for("RPR"))
     learner.learn(q[:70], x[:70])
@@ -399,7 +399,7 @@ def test_a_stored_train_is_no_learner():
         TensorLearner.from_bytes(learner.train.to_bytes())
 
 
-def test_outliers_beside_pairs_that_the_prior_explains_exactly_are_left_out():
+def test_outliers_among_pairs_exact_in_prior_are_rejected():
     rng = np.random.default_rng(12)
     learner = TensorLearner.around(random_chain(rng, "RRR"), bases_for("RRR"), ellipse_std=1e-3)
     q = random_q(rng, "RRR", 60, 80.0)

@@ -40,7 +40,7 @@ def test_its_control_net_gives_the_same_positions(case):
 
 
 @given(small_chains)
-def test_the_net_of_a_chain_by_way_of_its_train_is_the_net_made_directly(case):
+def test_net_via_train_equals_net_of_chain(case):
     kinds, seed = case
     chain, bases = random_chain(np.random.default_rng(seed), kinds), bases_for(kinds)
     assert np.allclose(TensorTrain.from_chain(chain, bases).to_kbmap().net, chain.to_kbmap(bases).net, atol=1e-12)
@@ -56,7 +56,7 @@ def test_the_jacobian_is_that_of_finite_differences(case):
 
 
 @given(small_chains)
-def test_an_affine_change_of_the_frame_between_two_cores_moves_nothing(case):
+def test_affine_gauge_change_between_cores_keeps_predictions(case):
     kinds, seed = case
     kinds += "R"
     rng = np.random.default_rng(seed)
@@ -79,13 +79,13 @@ def test_a_change_of_basis_moves_nothing():
     assert np.allclose(other.predict(q), train.predict(q), atol=1e-12)
 
 
-def test_the_control_net_of_a_train_in_bernstein_bases_gives_the_same_positions():
+def test_control_net_in_bernstein_bases_keeps_predictions():
     train, q = random_train("RPR", 3), random_q(np.random.default_rng(3), "RPR", 20, 150)
     other = train.in_basis([JointBasis.bernstein(1.0), JointBasis.prismatic(-1, 1), JointBasis.trigonometric()])
     assert np.allclose(other.to_kbmap().predict(q), train.predict(q), atol=1e-12)
 
 
-def test_one_configuration_and_a_batch_of_it_give_the_same_position():
+def test_single_prediction_equals_batch_prediction():
     train, q = random_train("RRPR", 1), np.array([0.1, -0.7, 0.2, 1.4])
     assert np.array_equal(train.predict(q), train.predict(q[None])[0])
 
@@ -100,7 +100,7 @@ def test_thirty_joints_need_no_more_than_their_cores():
 
 
 @given(chains)
-def test_a_train_survives_the_round_trip_bit_by_bit(case):
+def test_train_round_trips_through_bytes_bit_for_bit(case):
     train = random_train(*case)
     back = TensorTrain.from_bytes(train.to_bytes())
     assert back.bases == train.bases
@@ -126,12 +126,12 @@ def test_a_stored_map_of_another_kind_is_refused():
         TensorTrain.from_bytes(random_train("RR", 0).to_kbmap().to_bytes())
 
 
-def test_a_third_slice_for_a_prismatic_joint_is_refused():
+def test_third_slice_for_prismatic_joint_is_refused():
     with pytest.raises(BasisError, match="joint 2 is prismatic"):
         TensorTrain(bases_for("RP"), np.ones((2, 3, 3, 4)))
 
 
-def test_a_revolute_basis_for_a_prismatic_joint_is_refused():
+def test_revolute_basis_for_prismatic_joint_is_refused():
     with pytest.raises(BasisError, match="joint 1 of 1 is prismatic"):
         TensorTrain.from_chain(random_chain(np.random.default_rng(0), "P"), bases_for("R"))
 
@@ -146,6 +146,6 @@ def test_cores_that_are_not_finite_are_refused():
         TensorTrain(bases_for("R"), np.full((1, 3, 3, 4), np.nan))
 
 
-def test_the_arrays_of_a_train_cannot_be_written_to():
+def test_arrays_of_a_train_are_read_only():
     with pytest.raises(ValueError, match="read-only"):
         random_train("RR", 0).cores[0, 0, 0, 0] = 1.0

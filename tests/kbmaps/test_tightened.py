@@ -17,7 +17,7 @@ def arm() -> RigidChain:
     return RigidChain(fixed, [[0, 0, 1], [0, 1, 0], [1, 0, 0]], [False] * 3)
 
 
-def test_before_any_pair_it_is_the_narrower_prior_and_no_more_probable() -> None:
+def test_tightened_belief_without_pairs_equals_narrow_prior() -> None:
     parameters = ChainParameters(arm())
     belief, evidence = ChainBelief.from_tolerances(parameters, WIDE).tightened(WIDE, NARROW)
     expected = ChainBelief.from_tolerances(parameters, NARROW).covariance
@@ -25,7 +25,7 @@ def test_before_any_pair_it_is_the_narrower_prior_and_no_more_probable() -> None
     assert evidence == pytest.approx(0.0, abs=1e-9)
 
 
-def test_after_pairs_it_is_what_a_learner_with_the_narrower_tolerances_believes() -> None:
+def test_tightened_belief_with_pairs_matches_narrow_learner() -> None:
     rng = np.random.default_rng(0)
     q = rng.uniform(-1.5, 1.5, (40, 3))
     x = arm().positions(q) + 1e-3 * rng.normal(size=(40, 3))

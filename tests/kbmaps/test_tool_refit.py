@@ -16,7 +16,7 @@ from kbmaps import (
 
 
 @pytest.mark.parametrize("kinds", ["RRRR", "RPRR"])
-def test_one_pair_gives_an_exactly_known_arm_its_new_tool(kinds):
+def test_one_pair_refits_tool_of_exact_arm(kinds):
     rng = np.random.default_rng(1)
     chain = random_chain(rng, kinds)
     changed = chain.with_tool([0.1, -0.2, 0.05])
@@ -25,7 +25,7 @@ def test_one_pair_gives_an_exactly_known_arm_its_new_tool(kinds):
     assert prediction_errors(refitted, test, changed.positions(test)).max() < 1e-10
 
 
-def test_what_was_learnt_before_the_change_is_kept():
+def test_tool_refit_keeps_learnt_geometry():
     rng = np.random.default_rng(2)
     true = random_chain(rng, "RRRR")
     fixed = true.fixed.copy()

@@ -48,7 +48,7 @@ def test_outliers_do_not_change_it() -> None:
 
 
 @pytest.mark.parametrize("one_in", [10, 5, 3])
-def test_many_outliers_of_the_depth_do_not_change_it(one_in: int) -> None:
+def test_many_depth_outliers_do_not_inflate_covariance(one_in: int) -> None:
     errors, whole, camera, readings = drawn(np.random.default_rng(2), 8.0, 0.0)
     errors[::one_in] += 400.0 * np.linalg.eigh(camera)[1][::one_in, :, 2]
     found = error_covariances(errors, camera, readings)
@@ -65,7 +65,7 @@ def test_a_covariance_of_zeros_counts_as_missing() -> None:
 @pytest.mark.parametrize(
     "stated", [np.full((PAIRS, 3, 3), np.nan), np.zeros((PAIRS, 3, 3)), np.tile(np.eye(3), (PAIRS, 1, 1))]
 )
-def test_nothing_stated_or_the_same_in_all_directions_says_nothing(stated: FloatArray) -> None:
+def test_missing_or_isotropic_covariances_tell_no_directions(stated: FloatArray) -> None:
     assert not tells_directions(np.broadcast_to(stated, (PAIRS, 3, 3)))
 
 

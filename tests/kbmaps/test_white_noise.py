@@ -35,7 +35,7 @@ def drawn(covariances: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return np.matvec(np.linalg.cholesky(covariances), rng.normal(size=(PAIRS, 3)))
 
 
-def test_ticks_of_encoders_are_found_at_each_joint_to_a_third(rng, derivatives, covariances) -> None:
+def test_encoder_ticks_are_recovered_within_30_percent(rng, derivatives, covariances) -> None:
     ticks = TICK * np.array([1.0, 2.0, 4.0, 1.0])
     read_wrongly = rng.uniform(-0.5, 0.5, (PAIRS, JOINTS)) * ticks
     errors = drawn(covariances, rng) + np.matvec(derivatives, read_wrongly)
@@ -44,12 +44,12 @@ def test_ticks_of_encoders_are_found_at_each_joint_to_a_third(rng, derivatives, 
 
 
 @pytest.mark.parametrize("claimed", [1.0, 2.0, 5.0])
-def test_a_camera_that_claims_too_little_is_seen_to(claimed, rng, derivatives, covariances) -> None:
+def test_overconfident_camera_covariance_is_scaled_up(claimed, rng, derivatives, covariances) -> None:
     found = WhiteNoise.of(drawn(claimed * covariances, rng), covariances, derivatives)
     assert found.claimed == pytest.approx(claimed, rel=0.15)
 
 
-def test_a_camera_is_not_taken_for_better_than_it_claims_to_be(rng, derivatives, covariances) -> None:
+def test_camera_covariance_is_never_scaled_down(rng, derivatives, covariances) -> None:
     """Check that errors shared by neighbours do not show in their differences."""
     assert WhiteNoise.of(drawn(0.1 * covariances, rng), covariances, derivatives).claimed == 1.0
 
@@ -62,7 +62,7 @@ def test_round_noise_is_not_blamed_on_joints(sigma_m, rng, derivatives) -> None:
     np.testing.assert_array_equal(found.joints, 0.0)
 
 
-def test_what_neighbours_share_is_no_noise(rng, derivatives, covariances) -> None:
+def test_errors_shared_by_neighbours_are_not_noise(rng, derivatives, covariances) -> None:
     errors = drawn(covariances, rng)
     shared = 0.01 * np.sin(np.arange(PAIRS)[:, None] / 200.0 + np.arange(3))
     alone, beside = (WhiteNoise.of(each, covariances, derivatives) for each in (errors, errors + shared))
@@ -85,6 +85,6 @@ def test_of_few_pairs_nothing_is_learnt(rng, derivatives, covariances) -> None:
     np.testing.assert_array_equal(found.covariances(covariances, derivatives), covariances)
 
 
-def test_errors_that_are_nothing_have_a_covariance_all_the_same(derivatives, covariances) -> None:
+def test_zero_errors_have_a_positive_definite_covariance(derivatives, covariances) -> None:
     found = WhiteNoise.of(np.zeros((PAIRS, 3)), covariances, derivatives).covariances(covariances, derivatives)
     assert (np.linalg.eigvalsh(found) > 0.0).all()

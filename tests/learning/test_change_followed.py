@@ -100,7 +100,7 @@ def test_it_is_dated(followed: Followed) -> None:
     assert change.earliest_seq - 2 <= TAUGHT + 1 <= change.latest_seq + 2
 
 
-def test_what_it_was_is_among_the_probable_kinds_and_nothing_else_is_named(followed: Followed) -> None:
+def test_true_kind_is_probable_and_no_other_named(followed: Followed) -> None:
     change = followed.learning.change
     assert change is not None
     named = change.named
@@ -108,11 +108,11 @@ def test_what_it_was_is_among_the_probable_kinds_and_nothing_else_is_named(follo
     assert followed.kind in [kind.name for kind in change.kinds if kind.probability > 0.05]
 
 
-def test_the_learner_answers_for_the_arm_as_it_is_now(followed: Followed) -> None:
+def test_learner_predicts_the_changed_arm(followed: Followed) -> None:
     assert followed.error_m(followed.after) < 0.4 * followed.error_m(followed.before)
 
 
-def test_a_learner_that_was_restored_can_be_rolled_back(followed: Followed) -> None:
+def test_rolled_back_restored_learner_predicts_the_earlier_arm(followed: Followed) -> None:
     restored = new_learning()
     restored.restore(followed.learning.state())
     restored.rollback()
@@ -121,7 +121,7 @@ def test_a_learner_that_was_restored_can_be_rolled_back(followed: Followed) -> N
     assert here.error_m(restored) < 0.5 * there.error_m(restored)
 
 
-def test_rolled_back_it_answers_as_before_the_change_and_learns_no_pair_again(followed: Followed) -> None:
+def test_rollback_keeps_counters_and_drops_later_pairs(followed: Followed) -> None:
     restored = new_learning()
     restored.restore(followed.learning.state())
     restored.rollback()
@@ -133,12 +133,12 @@ def test_rolled_back_it_answers_as_before_the_change_and_learns_no_pair_again(fo
     assert abs(len(restored.state().arrays["q"]) - TAUGHT) <= abs(change.first_seq - 1 - TAUGHT)
 
 
-def test_without_a_change_there_is_nothing_to_roll_back() -> None:
+def test_rollback_without_a_change_is_refused() -> None:
     with pytest.raises(RequestError, match="there was no change"):
         new_learning().rollback()
 
 
-def test_a_told_change_can_be_rolled_back() -> None:
+def test_announced_change_can_be_rolled_back() -> None:
     learning, scene = new_learning(), Scene.draw(0, 30)
     teach(learning, scene.pairs, every=NOW_AND_THEN)
     before = learning.snapshot.predict(scene.q).x
@@ -147,7 +147,7 @@ def test_a_told_change_can_be_rolled_back() -> None:
     np.testing.assert_array_equal(learning.snapshot.predict(scene.q).x, before)
 
 
-def test_a_checkpoint_of_an_older_version_is_gone_on_from() -> None:
+def test_checkpoint_of_older_version_is_restored() -> None:
     learning, restored = new_learning(), new_learning()
     teach(learning, Scene.draw(0, 20).pairs, every=NOW_AND_THEN)
     state = learning.state()
@@ -158,7 +158,7 @@ def test_a_checkpoint_of_an_older_version_is_gone_on_from() -> None:
 
 
 @pytest.mark.parametrize("moved_m", [0.0, 0.02])
-def test_a_model_that_predicts_new_pairs_no_better_does_not_take_the_old_one_s_place(moved_m: float) -> None:
+def test_old_model_is_replaced_only_by_better_one(moved_m: float) -> None:
     rng = np.random.default_rng(0)
     parameters = ChainParameters(built_chain(rng))
     tolerances = chain_tolerances(LearnerConfig())
@@ -176,7 +176,7 @@ def test_a_model_that_predicts_new_pairs_no_better_does_not_take_the_old_one_s_p
     assert origin.is_better(origin.explain(q, x), q, x) == (moved_m > 0.0)
 
 
-def test_of_the_arm_since_a_change_nothing_is_known_before_the_solver_has_its_pairs() -> None:
+def test_changed_arm_is_unknown_until_solver_has_pairs() -> None:
     rng = np.random.default_rng(7)
     chain, q = built_chain(rng), path(rng, 60 + SINCE)
     learning = new_learning()

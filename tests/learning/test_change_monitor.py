@@ -14,7 +14,7 @@ from bodyschema.learning.changes.monitor import MOST_WATCHED, ChangeMonitor
 COARSE_RAD = np.radians(1.0)
 
 
-def test_where_no_model_comes_the_newest_pairs_alone_are_kept() -> None:
+def test_monitor_keeps_bounded_pairs_without_a_model() -> None:
     watch, cov = ChangeMonitor(), frozen_array(np.eye(3))
     for seq in range(1, MOST_WATCHED + 200):
         watch.add(

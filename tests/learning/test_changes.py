@@ -39,7 +39,7 @@ def changes(caplog: pytest.LogCaptureFixture) -> Changes:
     return Changes(JOINTS)
 
 
-def test_a_change_is_one_line_when_it_is_noticed_and_one_when_it_is_named(changes: Changes, caplog) -> None:
+def test_change_is_logged_once_detected_and_once_named(changes: Changes, caplog) -> None:
     for record in (None, UNDECIDED, UNDECIDED, NAMED, NAMED):
         changes.note(record)
     assert logged(caplog) == [
@@ -48,7 +48,7 @@ def test_a_change_is_one_line_when_it_is_noticed_and_one_when_it_is_named(change
     ]
 
 
-def test_a_told_change_is_logged_as_such(changes: Changes, caplog) -> None:
+def test_announced_change_is_logged_as_announced(changes: Changes, caplog) -> None:
     changes.note(ChangeRecord.told(20))
     assert logged(caplog) == ["tool changed before pair 21, as reported by the command tool_changed"]
 
@@ -59,7 +59,7 @@ def test_a_rollback_is_logged(changes: Changes, caplog) -> None:
     assert logged(caplog)[-1] == "rolled back to the model before pair 201"
 
 
-def test_what_was_told_before_a_restart_is_not_told_again(caplog) -> None:
+def test_change_logged_before_restart_is_not_logged_again(caplog) -> None:
     caplog.set_level(logging.INFO)
     Changes(JOINTS, UNDECIDED).note(UNDECIDED)
     assert logged(caplog) == []
@@ -72,9 +72,7 @@ def test_the_status_names_joints_as_the_robot_does(changes: Changes) -> None:
 
 
 @pytest.mark.parametrize(("joint", "alike"), [(0, "camera"), (1, None), (2, "tool")])
-def test_the_zeros_at_both_ends_are_like_another_camera_and_another_tool(
-    changes: Changes, joint: int, alike: str | None
-) -> None:
+def test_end_joint_offsets_resemble_camera_or_tool_change(changes: Changes, joint: int, alike: str | None) -> None:
     others = [KindOfChange("joint", k, 0.0) for k in range(3) if k != joint]
     record = msgspec.structs.replace(NAMED, kinds=[KindOfChange("joint", joint, 0.97), *others])
     status = changes.status(record, can_roll_back=True)
@@ -82,7 +80,7 @@ def test_the_zeros_at_both_ends_are_like_another_camera_and_another_tool(
     assert status.alike == alike
 
 
-def test_what_no_motion_tells_apart_is_named_together() -> None:
+def test_last_joint_is_named_despite_similar_tool() -> None:
     record = msgspec.structs.replace(
         UNDECIDED,
         kinds=[KindOfChange("joint", 2, 0.6), KindOfChange("tool", None, 0.39), KindOfChange("joint", 0, 0.0)],
@@ -90,7 +88,7 @@ def test_what_no_motion_tells_apart_is_named_together() -> None:
     assert record.named == KindOfChange("joint", 2, 0.6)
 
 
-def test_a_tool_that_the_last_zero_is_like_is_named_too() -> None:
+def test_tool_is_named_despite_similar_last_joint_offset() -> None:
     record = msgspec.structs.replace(
         UNDECIDED,
         kinds=[KindOfChange("tool", None, 0.6), KindOfChange("joint", 2, 0.39), KindOfChange("joint", 0, 0.0)],

@@ -125,14 +125,14 @@ def test_isotropic_covariances_change_nothing(missing: float) -> None:
     )
 
 
-def test_pairs_without_a_covariance_are_learnt_with_the_others() -> None:
+def test_pairs_without_covariance_are_learnt_with_the_others() -> None:
     seen = Seen(1, ONE_CAMERA)
     cov = seen.cov.copy()
     cov[::3] = np.nan
     assert seen.error_m(cov) < 0.7 * seen.error_m(None)
 
 
-def test_a_grossly_wrong_pair_is_left_out_where_only_depth_is_unsure() -> None:
+def test_gross_outlier_in_uncertain_depth_is_rejected() -> None:
     seen = Seen(2, ONE_CAMERA)
     good = seen.error_m(seen.cov)
     seen.x[7] += 50.0 * ACROSS_M * np.linalg.svd(seen.cov[7])[0][:, 2]
@@ -149,7 +149,7 @@ def test_the_chain_with_residual_weighs_them_too() -> None:
     assert off[1] < off[0] / 4.0
 
 
-def test_the_solver_weighs_what_it_was_fed() -> None:
+def test_solver_weighs_pairs_by_their_covariances() -> None:
     seen, solver = Seen(4, ONE_CAMERA), DirectSolver()
     solver.start(Task(1, NOMINAL.prior, BELIEF))
     for part in (slice(0, 50), slice(50, None)):

@@ -14,7 +14,7 @@ from bodyschema.learning.changes.outlier_gate import explained
         (30.0, 8.0, 6.0, False),  # a poor model, of which any three numbers explain a part
     ],
 )
-def test_a_run_of_doubted_pairs_is_explained_if_little_is_left_and_little_of_what_there_was(
+def test_outlier_run_is_explained_by_small_remaining_error(
     before_mm: float, after_mm: float, expected_mm: float, answer: bool
 ) -> None:
     before, after = np.full(3, 1e-3 * before_mm), np.full(3, 1e-3 * after_mm)

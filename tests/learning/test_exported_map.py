@@ -59,7 +59,7 @@ def era() -> Regime:
     return era
 
 
-def test_while_a_model_that_is_no_map_answers_the_map_beside_it_is_the_best_one(era: Regime) -> None:
+def test_best_map_is_exported_while_residual_model_answers(era: Regime) -> None:
     assert (era.answering, beside(era)) == (RESIDUAL, RIGID)
 
 
@@ -69,7 +69,7 @@ def test_it_becomes_another_one_when_that_predicts_better(era: Regime) -> None:
     assert (era.answering, beside(era)) == (RESIDUAL, EXACT)
 
 
-def test_it_is_the_map_just_fitted_when_the_pairs_that_compared_them_are_set_aside(era: Regime) -> None:
+def test_fitted_prior_is_exported_after_comparison_pairs_removed(era: Regime) -> None:
     old_tool = make_pair(41, SCENE.q[0], X[0] + 0.2)
     era.begin_with(old_tool.q[None], old_tool.x[None])
     fitted = map_off_by(0.0)

@@ -44,7 +44,7 @@ def error_m(nominal: NominalModel, simulation: Simulation) -> float:
     return float(np.linalg.norm(said - simulation.positions(Motion.still(q)), axis=1).mean())
 
 
-def test_what_a_rigid_chain_can_have_is_known_from_the_start(robot) -> None:
+def test_extended_prior_includes_rigid_effects(robot) -> None:
     simulation = Simulation(robot, tuple(at(robot, name, 2, values) for name, values in RIGID.items()))
     assert error_m(NominalModel.of(robot), simulation) > 5e-3
     assert error_m(NominalModel.extended_by(simulation), simulation) < 1e-9
@@ -54,20 +54,20 @@ def test_what_a_rigid_chain_can_have_is_known_from_the_start(robot) -> None:
     ("name", "joint", "values", "share"),
     [("camera_scale", None, [0.02], 1e-6), ("joint_eccentricity", 1, TURN, 0.7), ("joint_scale", 2, [0.03], 0.7)],
 )
-def test_what_it_cannot_have_is_known_as_far_as_a_map_has_it(robot, name, joint, values, share) -> None:
+def test_extended_prior_approximates_non_rigid_effects(robot, name, joint, values, share) -> None:
     simulation = Simulation(robot, (at(robot, name, joint, values),))
     assert error_m(NominalModel.extended_by(simulation), simulation) < share * error_m(
         NominalModel.of(robot), simulation
     )
 
 
-def test_what_jumped_has_jumped_and_what_comes_of_motion_is_left_out(robot) -> None:
+def test_extended_prior_applies_jumps_and_omits_backlash(robot) -> None:
     jump = Simulation(robot, (at(robot, "encoder_jump", 1, [0.05, 100.0]), at(robot, "backlash", 2, [0.1])))
     offset = Simulation(robot, (at(robot, "joint_offset", 1, [0.05]),))
     assert error_m(NominalModel.extended_by(jump), offset) < 1e-9
 
 
-def test_a_frame_that_is_not_known_keeps_the_geometry_of_the_arm(tmp_path) -> None:
+def test_unknown_frame_keeps_the_extended_arm_geometry(tmp_path) -> None:
     robot = RobotDescription.load(DESK_ARM)
     simulation = Simulation(robot, (at(robot, "link_geometry", 2, LINK), at(robot, "joint_eccentricity", 1, TURN)))
     file = write_extended(simulation, tmp_path / "out", "x")

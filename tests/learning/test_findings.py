@@ -122,7 +122,7 @@ def findings_of(arm: Planted, clock: Ticking | None = None) -> Findings:
 
 
 @pytest.mark.soak
-def test_the_intervals_cover_what_was_planted() -> None:
+def test_intervals_cover_the_planted_values() -> None:
     assert np.mean([inside for seed in range(3) for inside in shared(seed, 60).covered()]) > 0.8
 
 
@@ -151,7 +151,7 @@ def retooled() -> tuple[ChainFigures, Planted]:
     return before, arm
 
 
-def test_freeing_what_nothing_shows_leaves_every_position_where_it_is(retooled) -> None:
+def test_freeing_unidentifiable_parameters_keeps_all_positions(retooled) -> None:
     arm = retooled[1]
     known = arm.known()
     prior = known.nominal.belief(known.belief.parameters.reference, known.tolerances)
@@ -162,18 +162,18 @@ def test_freeing_what_nothing_shows_leaves_every_position_where_it_is(retooled) 
 
 @pytest.mark.soak
 @pytest.mark.timeout(900)
-def test_the_95_percent_intervals_cover_95_percent_after_a_tool_change_too() -> None:
+def test_intervals_cover_95_percent_after_tool_change() -> None:
     assert 0.93 < np.mean([inside for seed in range(30) for inside in covered_after_another_tool(seed)]) < 0.995
 
 
-def test_zeros_that_no_motion_shows_are_null_and_the_others_are_not() -> None:
+def test_only_unidentifiable_joint_offsets_are_null() -> None:
     findings = findings_of(shared(2, 60))
     findings.renew()
     zeros = findings.calibration.zeros
     assert [name for name, zero in zeros.items() if zero is None] == ["base_yaw", "wrist_roll"]
 
 
-def test_the_status_has_the_camera_s_pose_as_ros_takes_it() -> None:
+def test_hand_eye_matrix_and_covariance_match_camera_position() -> None:
     findings = findings_of(shared(2, 60))
     findings.renew()
     found = findings.calibration
@@ -182,7 +182,7 @@ def test_the_status_has_the_camera_s_pose_as_ros_takes_it() -> None:
     assert 1.96 * np.sqrt(variances) == pytest.approx([figure.half_width for figure in found.camera_xyz], rel=1e-3)
 
 
-def test_the_arm_is_found_to_be_better_made_than_the_learner_s_tolerances() -> None:
+def test_estimated_arm_tolerances_are_below_learner_defaults() -> None:
     arm = shared(2, 60)
     _, made = figures(arm.robot, arm.known())
     assert made is not None
@@ -191,7 +191,7 @@ def test_the_arm_is_found_to_be_better_made_than_the_learner_s_tolerances() -> N
     assert points < 0.005
 
 
-def test_what_is_known_of_the_zeros_outlives_a_tool_change(retooled) -> None:
+def test_joint_offset_intervals_survive_a_tool_change(retooled) -> None:
     before, arm = retooled
     after, _ = figures(arm.robot, arm.known())
     assert (after.half_widths[10:12] < 1.2 * before.half_widths[10:12]).all()
@@ -245,7 +245,7 @@ def test_the_expected_error_is_the_claimed_one(after_60) -> None:
 
 
 @pytest.mark.soak  # of the forecast alone: tests/kbmaps/test_expected_gain.py
-def test_what_is_foreseen_of_further_pairs_comes(after_60) -> None:
+def test_forecast_for_further_pairs_matches_true_error(after_60) -> None:
     ratios = []
     for learning, scene, outlook in after_60:
         teach(learning, scene.pairs[60:], every=NOW_AND_THEN)
@@ -254,7 +254,7 @@ def test_what_is_foreseen_of_further_pairs_comes(after_60) -> None:
 
 
 @pytest.mark.soak  # of the forecast alone: tests/kbmaps/test_expected_gain.py
-def test_after_few_pairs_there_is_not_enough_data_and_after_many_there_is() -> None:
+def test_data_suffice_after_many_pairs_only() -> None:
     learning, _ = guided(1, 30)
     assert not outlook_of(learning).enough
     rest = Scene.draw(1, 500)
@@ -265,7 +265,7 @@ def test_after_few_pairs_there_is_not_enough_data_and_after_many_there_is() -> N
     assert outlook_of(learning).enough
 
 
-def test_of_an_arm_that_moved_few_joints_other_motions_gain_more() -> None:
+def test_moving_an_idle_joint_gains_most() -> None:
     scene, learning = Scene.draw(2, 80), new_learning()
     q = scene.q * np.array([1.0, 1.0, 0.05, 1.0])
     rng = np.random.default_rng(0)
@@ -276,7 +276,7 @@ def test_of_an_arm_that_moved_few_joints_other_motions_gain_more() -> None:
     assert outlook.best_motion_m[-1] < outlook.like_so_far_m[-1]
 
 
-def test_the_error_expected_over_the_whole_ranges_is_larger_than_where_the_arm_was() -> None:
+def test_expected_error_is_larger_over_full_joint_ranges() -> None:
     outlook = outlook_of(guided(3, 60)[0])
     assert outlook.anywhere_m > outlook.error_m
 
@@ -284,14 +284,14 @@ def test_the_error_expected_over_the_whole_ranges_is_larger_than_where_the_arm_w
 # --- when they are found
 
 
-def test_before_the_first_solution_nothing_is_told() -> None:
+def test_findings_are_empty_before_the_first_solution() -> None:
     robot = RobotDescription.load(DESK_ARM)
     findings = Findings(OnlineLearner(NominalModel.of(robot), LearnerConfig(), DirectSolver()), robot, Ticking())
     findings.renew()
     assert (findings.calibration, findings.outlook) == (None, None)
 
 
-def test_they_are_found_again_when_a_new_chain_was_found_and_not_too_soon() -> None:
+def test_findings_renew_with_new_chain_after_the_interval() -> None:
     arm, clock = Planted.of(1, FEW), Ticking()
     findings = findings_of(arm, clock)
     rested = [findings.at_rest]
@@ -308,7 +308,7 @@ def test_they_are_found_again_when_a_new_chain_was_found_and_not_too_soon() -> N
     assert rested == [False, True, False]  # they rest only while they are of the present chain
 
 
-def test_waiting_for_a_processor_is_no_reason_to_rest() -> None:
+def test_wall_time_without_cpu_time_delays_no_findings() -> None:
     arm, clock = Planted.of(1, FEW), Slow()
     clock.TICK_S = 60.0  # a minute passes on a busy machine, and the finding takes no time of the processor
     findings = Findings(arm.learning, arm.robot, clock, turns=FindingTurns(lambda: 0.0))
@@ -342,7 +342,7 @@ def test_the_same_chain_is_not_gone_through_twice() -> None:
     assert findings.calibration is first
 
 
-def test_with_another_tool_and_its_first_solution_nothing_is_told_of_the_old_one() -> None:
+def test_tool_change_clears_findings_until_next_renewal() -> None:
     arm = Planted.of(1, FEW)
     findings = findings_of(arm)
     findings.renew()
@@ -354,12 +354,12 @@ def test_with_another_tool_and_its_first_solution_nothing_is_told_of_the_old_one
     assert (findings.calibration, findings.outlook) == (None, None)  # it is not time to find them yet
 
 
-def test_an_arm_that_may_be_ten_times_better_made_than_seems_is_not_said_to_be_made_so() -> None:
+def test_highly_uncertain_tolerance_estimate_is_not_reported() -> None:
     assert is_told([(0.003, 0.001), (0.001, 0.0005)])
     assert not is_told([(0.003, 0.001), (0.0003, 0.0001)])
 
 
-def test_a_failure_to_find_them_does_not_stop_the_learner(monkeypatch, caplog) -> None:
+def test_failed_findings_are_logged_without_stopping_the_learner(monkeypatch, caplog) -> None:
     def failing(*_: object) -> None:
         raise np.linalg.LinAlgError("Eigenvalues did not converge")
 
@@ -370,7 +370,7 @@ def test_a_failure_to_find_them_does_not_stop_the_learner(monkeypatch, caplog) -
     assert "status has no calibration for now: Eigenvalues did not converge" in caplog.text
 
 
-def test_while_no_solution_answers_there_is_a_calibration_but_no_outlook() -> None:
+def test_calibration_is_reported_without_outlook_before_solution_answers() -> None:
     arm = Planted.of(1, FEW)
     arm.learning.tool_changed()
     q = arm.robot.lower / 2.0

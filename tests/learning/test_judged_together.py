@@ -40,7 +40,7 @@ def with_outliers(pairs: list[Pair], places: list[int]) -> list[Pair]:
     return [wild.get(place, pair) for place, pair in enumerate(pairs)]
 
 
-def test_the_instant_learner_knows_a_pair_before_it_is_judged() -> None:
+def test_instant_learner_learns_pairs_before_outlier_test() -> None:
     scene = Scene.draw(0, 20)
     era = Regime(
         NOMINAL.prior,
@@ -57,25 +57,25 @@ def test_the_instant_learner_knows_a_pair_before_it_is_judged() -> None:
     np.testing.assert_allclose(era.models.map(INSTANT).net, reference.map.net, atol=1e-10)
 
 
-def test_together_the_same_pairs_are_doubted_as_one_by_one() -> None:
+def test_batches_find_as_many_outliers_as_single_pairs() -> None:
     pairs = with_outliers(Scene.draw(1, 100).pairs, [60, 70, 81, 95])
     assert taught(pairs, TOGETHER_S).state().header.counters.doubted == taught(pairs, 0.0).counters.doubted == 4
 
 
 @pytest.mark.soak
-def test_together_they_teach_as_much_as_one_by_one() -> None:
+def test_batched_pairs_teach_as_well_as_single_pairs() -> None:
     scene = Scene.draw(2, 60)
     together, each = (scene.error_m(taught(scene.pairs, seconds)) for seconds in (TOGETHER_S, 0.0))
     assert together < 1.1 * each
 
 
-def test_pairs_that_wait_are_a_part_of_the_state() -> None:
+def test_waiting_pairs_are_part_of_the_state() -> None:
     learning = new_learning()
     teach(learning, Scene.draw(3, 57).pairs, background=False)
     assert len(learning.state().arrays["q"]) == 57
 
 
-def test_pairs_are_judged_when_they_have_waited_although_no_more_come() -> None:
+def test_waiting_pairs_are_judged_without_further_pairs() -> None:
     learning, pairs = new_learning(), Scene.draw(3, 43).pairs
     teach(learning, pairs, background=False)
     waiting = learning.curve[-1].pairs
@@ -94,7 +94,7 @@ def test_the_solver_is_given_the_pairs_that_waited() -> None:
 
 @pytest.mark.soak
 @pytest.mark.parametrize("moved_m", [0.025, 0.3])
-def test_a_change_is_followed_as_soon_as_the_pairs_with_it_are_judged(moved_m: float) -> None:
+def test_change_is_detected_within_one_batch(moved_m: float) -> None:
     rng, before = np.random.default_rng(5), 150
     chain, q = built_chain(rng), path(rng, 200)
     pairs = measured(chain, q[:before], rng)
@@ -105,7 +105,7 @@ def test_a_change_is_followed_as_soon_as_the_pairs_with_it_are_judged(moved_m: f
     assert before < together <= at_once + MOST_TOGETHER
 
 
-def test_pairs_judged_after_a_change_are_learnt_in_the_new_era() -> None:
+def test_pairs_after_a_change_join_the_new_regime() -> None:
     rng, before = np.random.default_rng(6), 100
     chain, q = built_chain(rng), path(rng, 150)
     moved = chain.with_tool([0.3, 0.0, 0.0])
@@ -114,7 +114,7 @@ def test_pairs_judged_after_a_change_are_learnt_in_the_new_era() -> None:
     assert (learning.counters.changes, len(learning.state().arrays["q"])) == (1, 50)
 
 
-def test_errors_that_come_together_weigh_as_one_after_the_other() -> None:
+def test_batched_errors_weigh_like_single_errors() -> None:
     rng = np.random.default_rng(7)
     errors, variances, ratios = rng.normal(size=(9, 3)), rng.random((9, 3)), rng.random(9)
     together, each = ErrorMemory(0.1), ErrorMemory(0.1)
@@ -125,7 +125,7 @@ def test_errors_that_come_together_weigh_as_one_after_the_other() -> None:
     np.testing.assert_allclose(*found, rtol=1e-12)
 
 
-def test_where_data_was_is_the_same_however_it_comes() -> None:
+def test_support_set_is_the_same_for_batched_pairs() -> None:
     q = path(np.random.default_rng(8), 120)
     together, each = UncertaintyTracker(NOMINAL.bases, 0.1), UncertaintyTracker(NOMINAL.bases, 0.1)
     together.learnt(q)

@@ -52,7 +52,7 @@ def taught(scene: Scene) -> OnlineLearner:
     return learning
 
 
-def test_how_a_tag_is_turned_is_learnt_better_than_it_is_measured(scene, taught) -> None:
+def test_learnt_tag_orientation_beats_the_measurement_noise(scene, taught) -> None:
     q = near(np.random.default_rng(0), scene.q)
     angle = np.linalg.norm(errors_rad(taught, scene.chain, q), axis=1).mean()
     assert angle < 0.4 * SIGMA_RAD
@@ -67,7 +67,7 @@ def test_the_claimed_angle_is_about_the_true_one(scene, taught) -> None:
     assert 0.4 < status.claimed_rad / angle < 3.0
 
 
-def test_the_status_says_how_well_models_predict_orientations(taught) -> None:
+def test_status_reports_orientation_errors_of_models(taught) -> None:
     status = taught.orientation_status()
     assert status is not None
     assert (status.pairs, status.answering) == (120, "rigid")
@@ -112,14 +112,14 @@ def test_another_tool_has_its_own_turn(scene, taught) -> None:
     assert learning.snapshot.predict(scene.q).R is None
 
 
-def test_orientations_wait_with_their_pairs_for_an_unknown_frame(scene) -> None:
+def test_orientations_are_learnt_with_unknown_camera_pose(scene) -> None:
     learning = new_learning(nominal_model(pose_known=False))
     teach(learning, turned(scene.pairs[:60], scene.chain), every=NOW_AND_THEN)
     q = near(np.random.default_rng(3), scene.q[:60])
     assert np.linalg.norm(errors_rad(learning, scene.chain, q), axis=1).mean() < SIGMA_RAD
 
 
-def test_a_checkpoint_keeps_what_was_learnt_of_orientations(scene, taught, tmp_path: Path) -> None:
+def test_checkpoint_keeps_learnt_orientations(scene, taught, tmp_path: Path) -> None:
     file = tmp_path / "checkpoint"
     write_checkpoint(file, taught.state(), robot="arm", utc="")
     state = read_checkpoint(file, robot="arm")
@@ -141,7 +141,7 @@ def test_orientations_are_learnt_again_after_a_restart(scene, taught) -> None:
     assert np.linalg.norm(errors_rad(restored, scene.chain, q), axis=1).mean() < 0.4 * SIGMA_RAD
 
 
-def test_the_model_file_has_the_maps_of_the_axes(scene, taught) -> None:
+def test_exported_map_contains_the_learnt_orientation(scene, taught) -> None:
     kbmap = taught.snapshot.require_map()
     q = near(np.random.default_rng(5), scene.q)
     answer = taught.snapshot.predict(q)
@@ -154,7 +154,7 @@ def test_the_model_file_has_the_maps_of_the_axes(scene, taught) -> None:
 
 
 @pytest.mark.soak
-def test_the_solver_in_its_own_process_finds_the_same_orientations() -> None:
+def test_solver_process_finds_same_orientations_as_direct_solver() -> None:
     chain, q = built_chain(np.random.default_rng(6)), path(np.random.default_rng(7), 30)
     pairs = turned(measured(chain, q, np.random.default_rng(8)), chain)
     direct = new_learning()
@@ -171,7 +171,7 @@ def test_the_solver_in_its_own_process_finds_the_same_orientations() -> None:
 
 
 @pytest.mark.soak
-def test_where_the_hand_bends_the_maps_of_the_axes_answer() -> None:
+def test_exact_orientation_map_answers_for_compliant_arm() -> None:
     """Check an arm with compliance, whose orientations no rigid chain has."""
     rng = np.random.default_rng(9)
     chain, q = built_chain(rng), rng.uniform(-1.0, 1.0, (200, 4))

@@ -17,13 +17,13 @@ def members() -> ModelBank:
     return members
 
 
-def test_the_instant_learner_predicts_the_same_before_and_after_somebody_takes_its_map(members: ModelBank) -> None:
+def test_taking_the_instant_map_leaves_predictions_unchanged(members: ModelBank) -> None:
     before = members.predict(INSTANT, SCENE.q)
     np.testing.assert_array_equal(members.map(INSTANT).predict(SCENE.q), before)
     np.testing.assert_array_equal(members.predict(INSTANT, SCENE.q), before)
 
 
-def test_a_map_that_was_taken_does_not_follow_later_learning(members: ModelBank) -> None:
+def test_taken_map_is_unaffected_by_later_learning(members: ModelBank) -> None:
     taken = members.map(INSTANT)
     before = taken.predict(SCENE.q)
     members.learn(SCENE.q[0], np.ones(3), np.inf)
@@ -32,7 +32,7 @@ def test_a_map_that_was_taken_does_not_follow_later_learning(members: ModelBank)
 
 
 @pytest.mark.parametrize("asked_for", ["prediction", "map"])
-def test_an_instant_learner_that_overflowed_begins_at_the_prior_again(members: ModelBank, asked_for: str) -> None:
+def test_overflowed_instant_learner_restarts_at_the_prior(members: ModelBank, asked_for: str) -> None:
     here = np.repeat(SCENE.q[:1], 4, axis=0)
     with np.errstate(all="ignore"):
         members.replay(here, 1.7e308 * np.array([1.0, -1.0, 1.0, -1.0])[:, None] * np.ones(3))

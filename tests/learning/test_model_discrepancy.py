@@ -15,7 +15,7 @@ def bent(n: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("claimed", [1e-12, 1e-4])
-def test_on_a_path_the_misfit_is_found_whatever_noise_is_claimed(claimed: float) -> None:
+def test_path_misfit_is_found_for_any_claimed_noise(claimed: float) -> None:
     noise = np.random.default_rng(0).normal(0.0, 0.002, (500, 3))
     found = model_discrepancy(bent(500) + noise, np.full(3, claimed), NONE, neighbours=True)
     np.testing.assert_allclose(found, 0.003, rtol=0.1)
@@ -32,13 +32,13 @@ def test_noise_alone_is_mostly_no_misfit(neighbours: bool) -> None:
     assert (np.array(found) > 0.0).mean() < 0.1
 
 
-def test_poses_far_apart_are_measured_against_the_claimed_noise() -> None:
+def test_misfit_of_distant_poses_excludes_claimed_noise() -> None:
     rng = np.random.default_rng(0)
     errors = rng.normal(0.0, np.hypot(0.003, 0.002), (500, 3))
     np.testing.assert_allclose(model_discrepancy(errors, np.full(3, 0.002**2), NONE, neighbours=False), 0.003, rtol=0.1)
 
 
-def test_while_pairs_are_few_the_misfit_with_the_last_tool_counts() -> None:
+def test_previous_tool_misfit_counts_while_pairs_are_few() -> None:
     before = np.full(3, 0.004)
     few = model_discrepancy(np.zeros((2, 3)), np.full(3, 1e-6), before, neighbours=True)
     many = model_discrepancy(np.zeros((50, 3)), np.full(3, 1e-6), before, neighbours=True)
@@ -46,7 +46,7 @@ def test_while_pairs_are_few_the_misfit_with_the_last_tool_counts() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 5))])
-def test_what_the_solutions_own_numbers_took_from_the_errors_is_given_back(seed: int) -> None:
+def test_misfit_is_corrected_for_fitted_parameters(seed: int) -> None:
     rng = np.random.default_rng(seed)
     rows, numbers = 100, 50
     basis, _ = np.linalg.qr(rng.normal(size=(rows, numbers)))
@@ -58,14 +58,14 @@ def test_what_the_solutions_own_numbers_took_from_the_errors_is_given_back(seed:
 
 
 @pytest.mark.parametrize("neighbours", [True, False])
-def test_an_outlier_that_the_fit_left_out_is_no_misfit(neighbours: bool) -> None:
+def test_outlier_rejected_by_fit_is_no_misfit(neighbours: bool) -> None:
     errors = np.random.default_rng(0).normal(0.0, 0.002, (100, 3))
     errors[50] = 0.05
     found = model_discrepancy(errors, np.full(3, 0.002**2), NONE, neighbours=neighbours, scatter=0.002)
     np.testing.assert_array_equal(found, NONE)
 
 
-def test_a_fit_that_most_pairs_contradict_leaves_none_of_them_out() -> None:
+def test_widely_contradicted_fit_counts_all_pairs_as_misfit() -> None:
     errors = np.random.default_rng(0).normal(0.0, 0.003, (100, 3))
     found = model_discrepancy(errors, np.full(3, 1e-8), NONE, neighbours=False, scatter=1e-5)
     np.testing.assert_allclose(found, 0.003, rtol=0.2)

@@ -42,7 +42,7 @@ def fingerprint(learning: OnlineLearner) -> tuple[object, ...]:
     return (state.header, {name: array.tobytes() for name, array in state.arrays.items()})
 
 
-def test_before_any_pair_the_nominal_model_answers_and_claims_no_support() -> None:
+def test_untrained_learner_predicts_nominal_model_without_support() -> None:
     learning = new_learning()
     q = path(np.random.default_rng(0), 20)
     prediction = learning.snapshot.predict(q)
@@ -50,7 +50,7 @@ def test_before_any_pair_the_nominal_model_answers_and_claims_no_support() -> No
     assert not prediction.in_support.any()
 
 
-def test_the_online_pass_takes_one_step_for_each_pair() -> None:
+def test_online_pass_takes_one_step_per_pair() -> None:
     scene = Scene.draw(0, 60)
     learning = new_learning()
     teach(learning, scene.pairs, background=False)
@@ -60,7 +60,7 @@ def test_the_online_pass_takes_one_step_for_each_pair() -> None:
     np.testing.assert_allclose(learning.state().arrays["net_nlms"], reference.map.net, atol=1e-10)
 
 
-def test_a_pair_that_was_learnt_is_not_learnt_again() -> None:
+def test_duplicate_pair_is_refused_and_changes_nothing() -> None:
     scene = Scene.draw(0, 10)
     learning = new_learning()
     teach(learning, scene.pairs)
@@ -123,7 +123,7 @@ class Taught:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_three_hundred_pairs_take_most_of_the_nominal_error_away(seed: int) -> None:
+def test_three_hundred_pairs_remove_most_nominal_error(seed: int) -> None:
     scene, learning = Taught.draw(seed).scene, Taught.draw(seed).copy()
     nominal_error = scene.error_m(new_learning())
     teach(learning, scene.pairs[HALF:], every=NOW_AND_THEN)
@@ -144,12 +144,12 @@ def taught(sixty) -> list[tuple[Scene, OnlineLearner]]:
     return [(Taught.draw(0).half, Taught.draw(0).learning), sixty]
 
 
-def test_the_claimed_error_is_the_true_one_on_average(taught) -> None:
+def test_claimed_error_matches_true_error_on_average(taught) -> None:
     ratios = [(learning.claimed_error_m() or 0.0) / scene.error_m(learning) for scene, learning in taught]
     assert 0.8 < np.mean(ratios) < 1.5
 
 
-def test_the_claimed_sigma_covers_two_thirds_of_the_coordinates_on_average(taught) -> None:
+def test_claimed_sigma_covers_two_thirds_of_coordinates(taught) -> None:
     covered = []
     for seed, (scene, learning) in enumerate(taught):
         q = near(np.random.default_rng(seed), scene.q)
@@ -164,7 +164,7 @@ def test_the_claimed_sigma_grows_away_from_the_data(sixty) -> None:
     assert here.sigma.mean() < 0.5 * far.sigma.mean()
 
 
-def test_where_data_was_is_in_support_and_far_away_is_not(sixty) -> None:
+def test_only_poses_near_the_data_are_in_support(sixty) -> None:
     scene, learning = sixty
     assert learning.snapshot.predict(scene.q).in_support.all()
     assert not learning.snapshot.predict(scene.q + np.radians(70.0)).in_support.any()
@@ -181,7 +181,7 @@ def test_one_gross_outlier_does_not_spoil_the_map(seed: int) -> None:
     assert scene.error_m(learning) < 1.2 * scene.error_m(without)
 
 
-def test_a_gross_outlier_is_counted_as_doubted_and_as_learnt() -> None:
+def test_gross_outlier_counts_as_doubted_and_learnt() -> None:
     scene, learning = Taught.draw(0).scene, Taught.draw(0).copy()
     doubted = learning.counters.doubted
     wrong = scene.pairs[HALF]
@@ -207,7 +207,7 @@ def test_no_listed_model_beats_the_one_that_answers() -> None:
 
 @pytest.mark.parametrize("told", [True, False], ids=["told", "not told"])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_tool_change_is_followed_within_tens_of_pairs(seed: int, told: bool) -> None:
+def test_tool_change_is_learnt_within_fifty_pairs(seed: int, told: bool) -> None:
     scene, learning = Taught.draw(seed).half, Taught.draw(seed).copy()
     rng = np.random.default_rng(seed)
     changed = scene.chain.with_tool([0.0, 0.15, 0.2])
@@ -220,7 +220,7 @@ def test_a_tool_change_is_followed_within_tens_of_pairs(seed: int, told: bool) -
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_pair_of_the_old_tool_after_a_told_change_is_doubted_and_spoils_nothing(seed: int) -> None:
+def test_old_tool_pair_after_announced_change_is_rejected(seed: int) -> None:
     scene, learning = Taught.draw(seed).scene, Taught.draw(seed).copy()
     rng = np.random.default_rng(seed)
     doubted = learning.counters.doubted
@@ -234,7 +234,7 @@ def test_a_pair_of_the_old_tool_after_a_told_change_is_doubted_and_spoils_nothin
 
 
 @pytest.mark.soak
-def test_a_learner_restored_amid_a_tool_change_fits_the_tool_all_the_same() -> None:
+def test_learner_restored_during_tool_change_fits_the_tool() -> None:
     scene, learning, restored = Taught.draw(0).half, Taught.draw(0).copy(), new_learning()
     rng = np.random.default_rng(0)
     learning.tool_changed()
@@ -248,7 +248,7 @@ def test_a_learner_restored_amid_a_tool_change_fits_the_tool_all_the_same() -> N
 
 
 @pytest.mark.parametrize("end", ["restart", pytest.param("lost solver", marks=pytest.mark.soak)])
-def test_what_was_learnt_from_pairs_that_are_no_longer_kept_is_not_forgotten(end: str) -> None:
+def test_knowledge_from_discarded_pairs_survives_restart(end: str) -> None:
     scene = Scene.draw(0, 120)
     settings = LearnerConfig(replay_capacity=40)
     learning = new_learning(settings=settings)
@@ -272,7 +272,7 @@ def test_what_was_learnt_from_pairs_that_are_no_longer_kept_is_not_forgotten(end
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_an_untold_tool_change_is_found_once(seed: int) -> None:
+def test_unannounced_tool_change_is_found_once(seed: int) -> None:
     scene, learning = Taught.draw(seed).half, Taught.draw(seed).copy()
     rng = np.random.default_rng(seed)
     q = scene.q[-1] + path(rng, 100)
@@ -280,7 +280,7 @@ def test_an_untold_tool_change_is_found_once(seed: int) -> None:
     assert learning.counters.changes == 1
 
 
-def test_a_told_tool_change_keeps_what_was_learnt_and_drops_the_pairs() -> None:
+def test_announced_tool_change_keeps_model_and_drops_pairs() -> None:
     scene, learning = Taught.draw(0).half, Taught.draw(0).copy()
     before = learning.snapshot.predict(scene.q).x
     learning.tool_changed()
@@ -289,7 +289,7 @@ def test_a_told_tool_change_keeps_what_was_learnt_and_drops_the_pairs() -> None:
     assert (len(state.arrays["q"]), state.header.counters.since_change, state.header.counters.pairs) == (0, 0, HALF)
 
 
-def test_a_learner_is_at_rest_when_all_pairs_are_solved_and_replayed_and_not_before() -> None:
+def test_learner_rests_only_after_all_work_is_done() -> None:
     learning = new_learning()
     teach(learning, Scene.draw(0, 40).pairs, background=False)
     rested = []
@@ -301,13 +301,13 @@ def test_a_learner_is_at_rest_when_all_pairs_are_solved_and_replayed_and_not_bef
     assert not learning.work()
 
 
-def test_a_learner_that_waits_for_its_first_alignment_is_at_rest() -> None:
+def test_learner_waiting_for_first_alignment_is_at_rest() -> None:
     learning = new_learning(nominal_model(pose_known=False))
     teach(learning, Scene.draw(0, 3).pairs)
     assert learning.at_rest
 
 
-def test_a_first_fit_under_way_is_not_called_too_few_pairs() -> None:
+def test_first_fit_in_progress_is_reported_as_unfinished() -> None:
     learning = new_learning(nominal_model(pose_known=False))
     teach(learning, Scene.draw(0, 60).pairs, background=False)
     with pytest.raises(NoFrameError, match="the first fit of the 60 pairs so far is not finished"):
@@ -327,7 +327,7 @@ def test_the_prior_answers_while_there_are_few_pairs() -> None:
     assert learning.snapshot.answering == "prior"
 
 
-def test_pairs_that_all_came_before_the_first_solution_can_show_that_it_shall_answer() -> None:
+def test_first_solution_can_answer_without_later_pairs() -> None:
     learning = new_learning()
     teach(learning, Scene.draw(0, 60).pairs, background=False)
     while learning.work():
@@ -339,7 +339,7 @@ def test_a_solution_answers_in_the_end() -> None:
     assert Taught.draw(0).learning.snapshot.answering in SOLVED
 
 
-def test_a_snapshot_does_not_change_when_learning_goes_on() -> None:
+def test_snapshot_is_unaffected_by_later_learning() -> None:
     scene = Scene.draw(0, 30)
     learning = new_learning()
     teach(learning, scene.pairs[:20])
@@ -358,7 +358,7 @@ def test_replay_takes_as_many_steps_as_configured() -> None:
     assert learning.counters.replayed == 60
 
 
-def test_the_same_pairs_and_seed_give_the_same_model() -> None:
+def test_same_pairs_and_seed_give_same_model() -> None:
     scene = Scene.draw(0, 30)
     one, two = new_learning(), new_learning()
     teach(one, scene.pairs, every=NOW_AND_THEN)
@@ -395,7 +395,7 @@ class SlowSolver(DirectSolver):
         return None if self.waiting else super().poll()
 
 
-def test_a_solution_that_comes_after_the_last_pair_answers_if_it_predicts_those_that_it_did_not_know() -> None:
+def test_late_solution_answers_after_predicting_unseen_pairs() -> None:
     scene, solver = Scene.draw(0, 100), SlowSolver()
     learning = OnlineLearner(nominal_model(), LearnerConfig(), solver)
     teach(learning, scene.pairs[:40])

@@ -26,7 +26,7 @@ def run(doubts: OutlierGate) -> list[float]:
     return q[:, 0].tolist()
 
 
-def test_a_run_is_of_the_pairs_that_were_doubted_in_a_row() -> None:
+def test_run_contains_only_consecutive_outliers() -> None:
     doubts = OutlierGate(1)
     for number, distance in enumerate([FAR, FAR, NEAR, FAR, FAR, FAR]):
         meet(doubts, number, distance)
@@ -49,14 +49,14 @@ def test_a_restored_run_goes_on() -> None:
     assert (again.in_a_row, run(again)) == (3, [0.0, 1.0, 2.0])
 
 
-def test_a_run_has_no_more_pairs_than_make_a_change() -> None:
+def test_run_is_limited_to_newest_change_pairs() -> None:
     doubts = OutlierGate(1)
     for number in range(CHANGE + 2):
         meet(doubts, number, FAR)
     assert run(doubts) == [float(number) for number in range(2, CHANGE + 2)]
 
 
-def test_first_pairs_that_the_fitted_tool_contradicts_are_no_part_of_a_run() -> None:
+def test_initial_pairs_contradicting_fitted_tool_join_no_run() -> None:
     nominal, scene = nominal_model(), Scene.draw(0, 8)
     tolerances = ChainTolerances(tool=0.03)
     arm = KnownArm(nominal.belief(nominal.chain, tolerances), tolerances)

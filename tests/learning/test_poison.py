@@ -52,7 +52,7 @@ def scene() -> Scene:
 
 @pytest.mark.parametrize("kind", REFUSED)
 @pytest.mark.parametrize("before", [0, 5])
-def test_a_pair_that_no_sensor_can_mean_is_refused_with_its_reason_and_changes_nothing(scene, kind, before) -> None:
+def test_impossible_pair_is_refused_and_changes_nothing(scene, kind, before) -> None:
     learning, (spoil, why) = new_learning(), REFUSED[kind]
     teach(learning, scene.pairs[:before])
     was = learning.snapshot
@@ -88,7 +88,7 @@ def clean_error_m(scene: Scene) -> float:
         ),
     ],
 )
-def test_after_wild_pairs_that_could_be_true_a_walk_brings_the_learner_back(scene, clean_error_m, spoil, first) -> None:
+def test_learner_recovers_from_plausible_wild_pairs(scene, clean_error_m, spoil, first) -> None:
     learning, pairs = new_learning(), list(scene.pairs)
     pairs[first : first + 2] = map(spoil, pairs[first : first + 2])
     teach(learning, pairs, every=NOW_AND_THEN)
@@ -97,7 +97,7 @@ def test_after_wild_pairs_that_could_be_true_a_walk_brings_the_learner_back(scen
     assert scene.error_m(learning) < 4.0 * clean_error_m
 
 
-def test_a_question_whose_answer_would_be_no_number_is_refused(scene, monkeypatch) -> None:
+def test_query_without_finite_answer_is_refused(scene, monkeypatch) -> None:
     learning = new_learning()
     snapshot = learning.snapshot
     monkeypatch.setattr(type(snapshot.model), "predict", lambda _, q: np.full((len(q), 3), np.nan))
@@ -106,7 +106,7 @@ def test_a_question_whose_answer_would_be_no_number_is_refused(scene, monkeypatc
 
 
 @pytest.mark.parametrize("name", ["net_prior", "net_nlms", "q", "x"])
-def test_a_state_with_a_number_that_is_not_finite_is_not_gone_on_from(scene, name) -> None:
+def test_non_finite_state_is_not_restored(scene, name) -> None:
     learning = new_learning()
     teach(learning, scene.pairs[:5])
     state = learning.state()

@@ -72,14 +72,14 @@ def test_its_claim_holds_near_the_path(arm: SaggingArm, taught: OnlineLearner) -
     assert (ratios < 2.0).mean() > 0.9
 
 
-def test_the_file_to_publish_is_the_best_map_while_it_answers(taught: OnlineLearner) -> None:
+def test_residual_snapshot_also_provides_a_map(taught: OnlineLearner) -> None:
     snapshot = taught.snapshot
     assert isinstance(snapshot.require_model(), ResidualModel)
     assert isinstance(snapshot.require_map(), KBMap)
     assert snapshot.digest == snapshot.require_model().digest != snapshot.require_map().digest
 
 
-def test_a_restored_learner_answers_with_it_bit_by_bit(arm: SaggingArm, taught: OnlineLearner) -> None:
+def test_restored_learner_predicts_with_same_residual_model(arm: SaggingArm, taught: OnlineLearner) -> None:
     restored = new_learning()
     restored.restore(taught.state())
     assert restored.snapshot.digest == taught.snapshot.digest
@@ -95,7 +95,7 @@ def test_a_restored_learner_publishes_the_same_map(taught: OnlineLearner) -> Non
 
 
 @pytest.mark.soak
-def test_what_the_arm_yields_stays_known_with_another_tool(arm: SaggingArm, taught: OnlineLearner) -> None:
+def test_learnt_compliance_survives_a_tool_change(arm: SaggingArm, taught: OnlineLearner) -> None:
     learning = new_learning()
     learning.restore(taught.state())
     learning.tool_changed()
@@ -114,7 +114,7 @@ def test_another_tool_is_found_while_it_answers(arm: SaggingArm, taught: OnlineL
 
 
 @pytest.mark.soak
-def test_the_solver_s_process_gives_the_solution_that_a_direct_one_gives(arm: SaggingArm) -> None:
+def test_solver_process_gives_same_solution_as_direct_solver(arm: SaggingArm) -> None:
     nominal = nominal_model()
     tolerances = ChainTolerances(axes=0.05, points=0.015, tool=0.03)
     task = Task(1, nominal.prior, nominal.belief(nominal.chain, tolerances))

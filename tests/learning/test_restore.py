@@ -86,14 +86,12 @@ def case(request: pytest.FixtureRequest) -> tuple[Saved, list[Pair], FloatArray]
     return scene_with(request.param)
 
 
-def test_a_restored_learner_answers_as_the_one_that_was_saved(case: tuple[Saved, list[Pair], FloatArray]) -> None:
+def test_restored_learner_answers_like_saved_learner(case: tuple[Saved, list[Pair], FloatArray]) -> None:
     saved, _, q = case
     saved.assert_same(q)
 
 
-def test_a_restored_learner_answers_the_same_after_each_further_pair(
-    case: tuple[Saved, list[Pair], FloatArray],
-) -> None:
+def test_restored_learner_stays_identical_over_further_pairs(case: tuple[Saved, list[Pair], FloatArray]) -> None:
     saved, further, q = case
     for pair in further:
         teach(saved.learning, [pair], background=False)
@@ -121,7 +119,7 @@ def test_a_restored_order_goes_on_where_it_was(taken: int) -> None:
 
 
 @pytest.mark.parametrize("tolerance", ["angle_tolerance_deg", "length_tolerance_m", "place_tolerance_m"])
-def test_a_state_that_was_learnt_with_another_tolerance_is_not_gone_on_from(tolerance: str) -> None:
+def test_state_learnt_with_other_tolerances_is_refused(tolerance: str) -> None:
     learning = new_learning()
     teach(learning, Scene.draw(0, 3).pairs)
     other = new_learning(settings=msgspec.structs.replace(LearnerConfig(), **{tolerance: 0.5}))
@@ -129,7 +127,7 @@ def test_a_state_that_was_learnt_with_another_tolerance_is_not_gone_on_from(tole
         other.restore(learning.state())
 
 
-def test_a_state_that_was_learnt_with_fewer_replays_is_gone_on_from() -> None:
+def test_state_learnt_with_other_replay_count_is_restored() -> None:
     learning, other = new_learning(), new_learning(settings=LearnerConfig(replays_per_pair=1.0))
     teach(learning, Scene.draw(0, 3).pairs)
     other.restore(learning.state())

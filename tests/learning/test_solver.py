@@ -19,7 +19,7 @@ SIGMA_M = 0.002
 KEPT, FOLDED = 400, 200
 
 
-def test_a_chain_of_the_first_pairs_is_found_before_that_of_all() -> None:
+def test_first_solution_uses_the_first_thirty_pairs() -> None:
     scene, solver = Scene.draw(0, 40), DirectSolver()
     solver.start(TASK)
     solver.learn(scene.q, scene.chain.positions(scene.q))
@@ -51,7 +51,7 @@ def after_a_long_rest(arm: RigidChain, seen_first: FloatArray) -> dict[str, Lear
 
 
 @pytest.mark.parametrize("name", [RIGID, RESIDUAL])
-def test_what_pairs_that_are_no_longer_kept_said_of_the_arm_is_not_forgotten(
+def test_knowledge_from_discarded_pairs_is_not_forgotten(
     name: str, arm: RigidChain, seen_first: FloatArray, after_a_long_rest: dict[str, LearntModel]
 ) -> None:
     q = near(np.random.default_rng(3), seen_first)
@@ -59,7 +59,7 @@ def test_what_pairs_that_are_no_longer_kept_said_of_the_arm_is_not_forgotten(
     assert np.linalg.norm(miss, axis=1).mean() < SIGMA_M
 
 
-def test_pairs_beyond_the_window_no_longer_bend_the_exact_map(arm: RigidChain, monkeypatch) -> None:
+def test_pairs_outside_window_do_not_affect_exact_map(arm: RigidChain, monkeypatch) -> None:
     window, older = 200, 300
     monkeypatch.setattr(solver_module, "WINDOW", window)
     q, solver = path(np.random.default_rng(5), older + window), DirectSolver()
@@ -72,7 +72,7 @@ def test_pairs_beyond_the_window_no_longer_bend_the_exact_map(arm: RigidChain, m
     np.testing.assert_allclose(exact.predict(q), arm.positions(q), atol=1e-6)
 
 
-def test_neighbours_that_share_their_errors_say_less_than_as_many_that_do_not(arm: RigidChain) -> None:
+def test_shared_neighbour_errors_widen_the_fitted_variance(arm: RigidChain) -> None:
     rng = np.random.default_rng(4)
     q = path(rng, 400)
     own = SIGMA_M * rng.normal(size=(400, 3))
@@ -95,13 +95,13 @@ def rigid_error_m(real: RigidChain, seed: int, tolerances: ChainTolerances | Non
     return float(np.linalg.norm(chain.predict(asked) - real.positions(asked), axis=1).mean())
 
 
-def test_where_the_drawing_is_right_the_pairs_say_so_before_they_show_it_number_by_number() -> None:
+def test_tolerance_selection_helps_on_a_nominal_arm() -> None:
     real = NOMINAL.chain.with_tool([0.02, -0.01, 0.03])
     told, wide = ([rigid_error_m(real, seed, each) for seed in range(8)] for each in (TOLERANCES, None))
     assert np.mean(told) < 0.7 * np.mean(wide)
 
 
-def test_that_an_arm_may_be_made_well_costs_one_that_is_not_nothing() -> None:
+def test_tolerance_selection_costs_nothing_on_inaccurate_arms() -> None:
     real = [built_chain(np.random.default_rng(seed), 3.0, 0.015) for seed in range(8)]
     told, wide = ([rigid_error_m(real[seed], seed, each) for seed in range(8)] for each in (TOLERANCES, None))
     assert np.mean(told) < 1.05 * np.mean(wide)

@@ -27,13 +27,13 @@ def belief_in(tolerances: ChainTolerances):
     return learner.belief
 
 
-def test_the_drawing_is_not_held_to_where_it_is_improbable() -> None:
+def test_improbable_narrow_tolerances_leave_chain_unchanged() -> None:
     wide = belief_in(WIDE)
     found = best_tolerances(wide, WIDE, [Tolerances(WIDE, 0.9), Tolerances(GOOD, 0.1)])
     np.testing.assert_allclose(found.mean, wide.mean)
 
 
-def test_pairs_with_another_tool_are_added_to_what_is_believed_of_any_workmanship() -> None:
+def test_tool_change_continues_from_the_wide_tolerance_belief() -> None:
     eras = Regimes.at_nominal(NOMINAL, LearnerConfig(), itertools.count())
     era, wide = eras.present, belief_in(WIDE)
     assert era is not None
@@ -47,7 +47,7 @@ def test_pairs_with_another_tool_are_added_to_what_is_believed_of_any_workmanshi
     np.testing.assert_allclose(eras.present.arm.chain.covariance[axes, axes], wide.covariance[axes, axes], atol=1e-12)
 
 
-def test_narrow_tolerances_do_not_move_a_chain_that_precise_pairs_determine() -> None:
+def test_narrow_tolerances_do_not_move_well_determined_chain() -> None:
     """Along a tangent, the unknown pose and marker are moved farther than positions are linear in them."""
     nominal = nominal_model(pose_known=False, marker_known=False)
     tolerances = nominal.tolerances(chain_tolerances(LearnerConfig()))

@@ -52,29 +52,27 @@ def walk() -> FloatArray:
 
 
 @pytest.mark.parametrize("name", [PRIOR, INSTANT])
-def test_far_from_all_data_the_claim_is_what_the_tolerances_leave_open(name: str, walk: FloatArray) -> None:
+def test_sigma_far_from_data_is_the_tolerance_spread(name: str, walk: FloatArray) -> None:
     claims = new_claims()
     learnt(claims, walk, prior_error_m=0.001)
     claimed = claims.of(name, MODEL.predict).variance(FAR)
     np.testing.assert_allclose(claimed, DRAWN.predict_with_variance(FAR)[1], rtol=0.05)
 
 
-def test_before_any_pair_the_learner_claims_what_the_tolerances_leave_open() -> None:
+def test_untrained_learner_claims_the_tolerance_spread() -> None:
     q = np.random.default_rng(0).uniform(-REACH, REACH, (50, JOINTS))
     variance = DRAWN.predict_with_variance(q)[1]
     np.testing.assert_allclose(new_learning().snapshot.predict(q).sigma, np.sqrt(variance), rtol=1e-6)
 
 
-def test_where_it_was_shown_data_the_instant_learner_is_believed_against_the_chain(walk: FloatArray) -> None:
+def test_instant_learner_sigma_is_small_near_data_only(walk: FloatArray) -> None:
     claims = new_claims(sure_belief(0.04))
     learnt(claims, walk, prior_error_m=0.04)
     assert sigma(claims, INSTANT, walk) < 0.25 * 0.04
     assert sigma(claims, INSTANT, FAR) == pytest.approx(0.04, rel=0.1)
 
 
-def test_the_prior_is_claimed_to_be_as_far_off_as_it_is_from_the_chain_that_the_pairs_speak_for(
-    walk: FloatArray,
-) -> None:
+def test_prior_sigma_equals_distance_to_the_fitted_chain(walk: FloatArray) -> None:
     claims = new_claims()
     claims.fitted(sure_belief(0.04))
     learnt(claims, walk, prior_error_m=0.04)
@@ -89,7 +87,7 @@ def test_errors_larger_than_claimed_raise_the_claim(walk: FloatArray) -> None:
     assert sigma(surprised, INSTANT, FAR) > 1.5 * sigma(quiet, INSTANT, FAR)
 
 
-def test_residuals_at_learnt_pairs_raise_the_claim_at_the_data(walk: FloatArray) -> None:
+def test_residuals_at_learnt_pairs_raise_sigma_there(walk: FloatArray) -> None:
     claims = new_claims(sure_belief())
     learnt(claims, walk, prior_error_m=0.02)
     claims.replayed(np.full((50, 3), 0.005))
@@ -100,7 +98,7 @@ def test_residuals_at_learnt_pairs_raise_the_claim_at_the_data(walk: FloatArray)
     "known",
     [(True, False), *(pytest.param(known, marks=pytest.mark.soak) for known in ((False, True), (False, False)))],
 )
-def test_away_from_the_first_pairs_the_claim_says_how_wrong_the_drawing_may_be(known: tuple[bool, bool]) -> None:
+def test_sigma_outside_first_pairs_covers_nominal_model_error(known: tuple[bool, bool]) -> None:
     parameters, within, beyond = ChainParameters(NOMINAL.chain), [], []
     for seed in range(3):
         rng = np.random.default_rng(seed)
@@ -119,7 +117,7 @@ def test_away_from_the_first_pairs_the_claim_says_how_wrong_the_drawing_may_be(k
     assert np.mean(beyond) < 0.1
 
 
-def test_away_from_the_pairs_that_a_solution_knows_its_claim_grows_by_what_it_misses_at_them(walk: FloatArray) -> None:
+def test_solution_sigma_grows_by_its_misfit_outside_data(walk: FloatArray) -> None:
     claims = new_claims()
     learnt(claims, walk, prior_error_m=0.04)
     claims.solution_asked()
@@ -128,7 +126,7 @@ def test_away_from_the_pairs_that_a_solution_knows_its_claim_grows_by_what_it_mi
     assert sigma(claims, RIGID, FAR) == pytest.approx(np.sqrt(2.0) * 0.005, rel=0.2)
 
 
-def test_residuals_within_the_noise_add_nothing_to_what_is_left_open_of_the_chain(walk: FloatArray) -> None:
+def test_residuals_within_noise_do_not_raise_sigma(walk: FloatArray) -> None:
     claims = new_claims()
     learnt(claims, walk, prior_error_m=0.04)
     claims.solution_asked()
@@ -138,9 +136,7 @@ def test_residuals_within_the_noise_add_nothing_to_what_is_left_open_of_the_chai
 
 
 @pytest.mark.parametrize("answered", [RIGID, RESIDUAL])
-def test_of_two_solutions_alike_the_one_that_answered_with_the_last_tool_answers_with_this_one(
-    answered: str, walk: FloatArray
-) -> None:
+def test_previously_answering_model_wins_tie_after_tool_change(answered: str, walk: FloatArray) -> None:
     claims = new_claims()
     claims.change_tool(0.1, answered)
     claims.expect(DRAWN)
@@ -173,7 +169,7 @@ def test_claims_are_the_same_after_a_restart(walk: FloatArray) -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.soak
-def test_the_claim_holds_between_poses_of_a_sweep_in_large_steps(seed: int) -> None:
+def test_sigma_covers_errors_between_poses_of_coarse_sweep(seed: int) -> None:
     # The gears ripple nine times per turn: the error at a pose is unrelated to the next one, 25 degrees away.
     rng = np.random.default_rng(seed)
     chain, wave = built_chain(rng), rng.normal(0.0, 0.002, (2, JOINTS))

@@ -56,7 +56,7 @@ def tracked() -> set[str]:
     return {name for file, name in files if file.is_file() and "__pycache__" not in name}
 
 
-def test_the_wheel_has_every_file_of_every_part_and_two_packages(wheel: Path) -> None:
+def test_wheel_has_every_file_in_two_packages(wheel: Path) -> None:
     files = files_of(wheel)
     assert {name.partition("/")[0] for name in files} == {"bodyschema", "kbmaps"}
     assert tracked() <= files
@@ -64,7 +64,7 @@ def test_the_wheel_has_every_file_of_every_part_and_two_packages(wheel: Path) ->
 
 
 @pytest.mark.soak
-def test_the_sdist_has_no_link_and_makes_the_same_wheel(sdist: Path, wheel: Path, tmp_path: Path) -> None:
+def test_sdist_has_no_links_and_same_wheel(sdist: Path, wheel: Path, tmp_path: Path) -> None:
     with tarfile.open(sdist) as archive:
         assert [member.name for member in archive if member.issym() or member.islnk()] == []
         archive.extractall(tmp_path, filter="data")
@@ -72,7 +72,7 @@ def test_the_sdist_has_no_link_and_makes_the_same_wheel(sdist: Path, wheel: Path
     assert files_of(build(source, "wheel", tmp_path / "built")) == files_of(wheel)
 
 
-def test_the_maths_has_a_wheel_of_its_own_with_the_same_files(maths: Path, wheel: Path) -> None:
+def test_kbmaps_wheel_has_same_files(maths: Path, wheel: Path) -> None:
     assert files_of(maths) - {"kbmaps/LICENSE"} == {name for name in files_of(wheel) if name.startswith("kbmaps/")}
     with zipfile.ZipFile(maths) as archive:
         (name,) = [name for name in archive.namelist() if name.endswith("/METADATA")]

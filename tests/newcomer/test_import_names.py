@@ -78,7 +78,7 @@ def plug_in(folder: Path, code: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, capture_output=True, text=True, timeout=LIMIT_S, check=False, cwd=folder)
 
 
-def test_a_plug_in_gets_the_same_module_by_its_old_name(tmp_path: Path) -> None:
+def test_old_import_name_gives_plugin_same_module(tmp_path: Path) -> None:
     code = (
         "from interfaces.errors import ConfigError\nimport bodyschema.interfaces.errors as errors, interfaces.errors\n"
         "print(ConfigError is errors.ConfigError, interfaces.errors is errors, errors.__spec__.name)"
@@ -104,7 +104,7 @@ def test_another_package_keeps_its_name(tmp_path: Path) -> None:
     assert (done.stdout, done.stderr) == ("1\n", "")
 
 
-def test_nothing_answers_to_an_old_name_without_a_plug_in() -> None:
+def test_old_import_name_fails_without_plugin() -> None:
     code = "import sys, bodyschema.cli.main, bodyschema.effects\nfrom bodyschema.interfaces.old_names import OldNames\n"
     code += "print(any(isinstance(finder, OldNames) for finder in sys.meta_path))"
     done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, check=True)

@@ -47,7 +47,7 @@ def built(folder: Path, **environment: str) -> Built:
     return Built(wheel.name, result.stdout + result.stderr, says)
 
 
-def test_without_a_compiler_the_wheel_is_pure_and_the_build_says_why(tmp_path):
+def test_build_without_compiler_explains_pure_wheel(tmp_path):
     failing = shutil.which("false")
     if failing is None:
         pytest.skip("no command `false`; to run it: apt-get install coreutils")
@@ -59,7 +59,7 @@ def test_without_a_compiler_the_wheel_is_pure_and_the_build_says_why(tmp_path):
 
 
 @pytest.mark.soak
-def test_a_compiler_that_is_not_there_does_not_stop_the_build(tmp_path):
+def test_missing_compiler_does_not_stop_build(tmp_path):
     result = built(tmp_path, CC="no-such-compiler")
     assert result.wheel.endswith("-py3-none-any.whl")
     assert "no-such-compiler" in result.log
@@ -73,7 +73,7 @@ def test_a_pure_wheel_can_be_asked_for(tmp_path):
 
 
 @pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler; to run it: apt-get install gcc")
-def test_with_a_compiler_the_wheel_holds_kernels_for_every_python_from_3_11(tmp_path):
+def test_compiled_wheel_serves_python_3_11_and_later(tmp_path):
     result = built(tmp_path, CC="cc", CFLAGS="-O0 -Wall -Wextra -Werror -Wno-cast-function-type")
     assert "-cp311-abi3-" in result.wheel
     assert result.says[1:] == ["compiled", "3"]

@@ -62,7 +62,7 @@ def dataset(folder: Path, config: Config) -> None:
 
 
 @pytest.mark.soak
-def test_a_dataset_with_a_webcams_video_gives_the_joint_offsets(tmp_path: Path, monkeypatch, capsys) -> None:
+def test_webcam_dataset_gives_joint_offsets(tmp_path: Path, monkeypatch, capsys) -> None:
     shutil.copytree(SO101, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     page = TypedPage((DOCS / "lerobot.md").read_text(encoding="utf-8"), capsys)

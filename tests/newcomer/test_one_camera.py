@@ -92,7 +92,7 @@ def tool_poses(rows: int, rng: np.random.Generator) -> str:
     return "\n".join([*lines, ""])
 
 
-def test_poses_of_the_tool_give_the_camera_on_it(tmp_path, monkeypatch, capsys) -> None:
+def test_tool_poses_give_mounted_camera_pose(tmp_path, monkeypatch, capsys) -> None:
     shutil.copytree(EXAMPLES / "tool_poses", tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
     Path("poses.csv").write_text(tool_poses(40, np.random.default_rng(0)), encoding="utf-8")

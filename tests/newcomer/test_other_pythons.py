@@ -51,7 +51,7 @@ def write_recording(robot: Path) -> Path:
 @pytest.mark.soak
 @pytest.mark.timeout(2 * LIMIT_S)
 @pytest.mark.parametrize("version", VERSIONS)
-def test_a_recording_is_learnt_by_both_processes_without_any_extra(tmp_path: Path, version: str) -> None:
+def test_recording_is_learnt_without_extras(tmp_path: Path, version: str) -> None:
     recording = write_recording(write_small_arm(tmp_path))
     run(python(version), "-m", "venv", tmp_path / "venv")
     home = tmp_path / "venv" / "bin"

@@ -103,7 +103,7 @@ def test_every_command_on_the_page_is_understood(command: str) -> None:
     assert command_of(command).startswith("bodyschema.cli.commands.")  # not that of a help page
 
 
-def test_init_writes_what_the_page_says_and_guesses_what_the_example_has(desk) -> None:
+def test_init_writes_documented_example_robot_toml(desk) -> None:
     (desk / "robot.toml").unlink()
     command = "bodyschema init --urdf desk_arm.urdf"
     assert typed(command, desk).stdout == output_of(command)
@@ -179,7 +179,7 @@ def guided_recording(robot: RobotDescription, rows: int) -> str:
 
 
 @pytest.mark.soak
-def test_a_recording_of_one_s_own_is_replayed_as_on_the_page(desk) -> None:
+def test_own_recording_replays_as_documented(desk) -> None:
     recording = guided_recording(RobotDescription.load(desk / "robot.toml"), 60)
     (desk / "guided.csv").write_text(recording, encoding="utf-8")
     done = typed("bodyschema replay guided.csv --speed 1", desk)

@@ -30,7 +30,7 @@ def test_each_top_level_name_is_ours_alone(package: str) -> None:
 
 
 @pytest.mark.parametrize("package", PACKAGES)
-def test_no_package_has_the_name_of_a_standard_module(package: str) -> None:
+def test_no_package_shadows_standard_module(package: str) -> None:
     assert package not in sys.stdlib_module_names
 
 
@@ -79,7 +79,7 @@ def test_type_checkers_see_what_kbmaps_imports_lazily() -> None:
     assert checked == {name: getattr(kbmaps, name) for name in kbmaps.__all__}
 
 
-def test_the_demo_s_lock_file_is_part_of_the_other() -> None:
+def test_demo_lock_file_is_subset() -> None:
     whole, demo = (
         set(re.findall(r"^[a-z][^ ]*==[^ ]*", (ROOT / file).read_text(encoding="utf-8"), re.MULTILINE))
         for file in ("requirements.lock", "requirements-demo.lock")

@@ -48,7 +48,7 @@ def test_every_command_in_the_readme_is_understood(command: str) -> None:
 
 
 @pytest.mark.usefixtures("patient_host")
-def test_the_commands_for_a_real_arm_go_through_on_a_bench(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_real_arm_commands_work_on_emulated_servos(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Run the README's commands on an emulated arm: the port and one baud rate are given, and there are no prompts."""
     with BenchRun(Config.load(ROOT / "examples" / "desk_arm" / "servos.toml", {}), tmp_path / "bus") as run:
         port = ["--port", str(tmp_path / "bus"), "--baud", "1000000"]

@@ -115,14 +115,14 @@ def test_an_unreadable_row_is_left_out(file, damage) -> None:
         assert len(numbers(store)) == PAIRS - 1
 
 
-def test_a_missing_number_is_told_and_passed_over(file) -> None:
+def test_missing_numbers_are_reported_and_skipped(file) -> None:
     alter(file, "DELETE FROM pairs WHERE seq BETWEEN 5 AND 6")
     with PairStore(file, SESSION) as store:
         assert "2 pairs of" in store.complaints[0]
         assert "(numbers 5 to 6)" in store.complaints[0]
 
 
-def test_damage_to_an_open_store_is_told(file) -> None:
+def test_damage_to_an_open_store_is_reported(file) -> None:
     with PairStore(file, SESSION) as store:
         assert store.complaints == []
         alter(file, "UPDATE pairs SET x = replace(x, '2', '3') WHERE seq = 7")
@@ -130,7 +130,7 @@ def test_damage_to_an_open_store_is_told(file) -> None:
         assert "(number 7)" in store.complaints[0]
 
 
-def test_deleted_damage_is_no_longer_told(file) -> None:
+def test_deleted_damage_is_no_longer_reported(file) -> None:
     alter(file, "UPDATE pairs SET x = replace(x, '2', '3') WHERE seq = 7")
     with PairStore(file, SESSION) as store:
         while store.trim(Keep(None, 0.0, 10), "2026-01-02T00:00:00"):
@@ -201,7 +201,7 @@ def test_a_lost_page_costs_its_own_pairs(long) -> None:
         assert store.complaints == [left_out]
 
 
-def test_lost_numbers_are_not_given_again(long) -> None:
+def test_numbers_of_lost_pages_are_not_reused(long) -> None:
     zero(long, leaves(long)[-1])
     with PairStore(long, SESSION) as store:
         newest = numbers(store)[-1]
@@ -460,7 +460,7 @@ def with_a_flip_in_the_log(file: Path, commits_behind: int) -> None:
     log.write_bytes(data)
 
 
-def test_numbers_behind_a_flip_in_the_log_are_not_given_again(tmp_path: Path) -> None:
+def test_numbers_lost_in_damaged_log_are_not_reused(tmp_path: Path) -> None:
     file = left_by_a_killed_sampler(tmp_path)
     with_a_flip_in_the_log(file, 5)
     with PairStore(file, SESSION) as store:

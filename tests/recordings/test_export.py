@@ -68,7 +68,7 @@ def test_mcap_holds_every_number_of_every_row(tmp_path: Path, recording: Recordi
     assert [tuple(row) for _, row in rows] == [table.names] * 4
 
 
-def test_mcap_shows_the_marker_as_a_pose_that_foxglove_knows(tmp_path: Path, recording: Recording) -> None:
+def test_mcap_stores_marker_as_foxglove_pose(tmp_path: Path, recording: Recording) -> None:
     make_reader = pytest.importorskip("mcap.reader").make_reader
     write_mcap(recording, tmp_path / "a.mcap")
     with (tmp_path / "a.mcap").open("rb") as stream:
@@ -80,7 +80,7 @@ def test_mcap_shows_the_marker_as_a_pose_that_foxglove_knows(tmp_path: Path, rec
     assert list(pose["orientation"].values()) == [0, 0, 0, 1]
 
 
-def test_mcap_times_go_on_where_the_clock_was_reset(tmp_path: Path, recording: Recording) -> None:
+def test_mcap_times_increase_across_a_clock_reset(tmp_path: Path, recording: Recording) -> None:
     pytest.importorskip("mcap")
     write_mcap(recording, tmp_path / "a.mcap")
     times = np.array([time for time, _ in messages(tmp_path / "a.mcap", "/pair")])
@@ -88,7 +88,7 @@ def test_mcap_times_go_on_where_the_clock_was_reset(tmp_path: Path, recording: R
     assert times[0] == 10_000_000_000
 
 
-def test_a_time_beyond_nanoseconds_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+def test_mcap_rejects_oversized_time_before_writing(tmp_path: Path) -> None:
     pytest.importorskip("mcap")
     late = Recording(JOINTS, np.zeros((1, 2)), np.zeros((1, 3)), t=np.array([1e12]))
     with pytest.raises(RecordingError, match="nanoseconds"):
@@ -118,7 +118,7 @@ def test_a_recording_becomes_mcap(tmp_path: Path, robot: Path, recording: Record
     assert len(messages(tmp_path / "a.mcap", "/pair")) == len(recording)
 
 
-def test_a_store_in_use_is_exported_without_robot_toml(tmp_path: Path, store: PairStore, capsys) -> None:
+def test_open_store_is_exported_without_robot_toml(tmp_path: Path, store: PairStore, capsys) -> None:
     fix = MarkerFix(1.5, np.array([1.0, 2, 3]), np.eye(3) * 1e-6, (1.0, 2.0, 3.0, 4.0))
     store.append(7, "2026-01-01T00:00:00Z", np.array([0.1, 0.2]), fix)
     export(tmp_path / "pairs.sqlite", tmp_path / "a.csv")
@@ -137,7 +137,7 @@ def test_json_has_the_number_of_pairs(tmp_path: Path, store: PairStore, capsys) 
     assert (told["file"], told["pairs"]) == (str(tmp_path / "a.csv"), 1)
 
 
-def test_an_export_tells_unreadable_pairs(tmp_path: Path, store: PairStore, caplog) -> None:
+def test_export_reports_unreadable_pairs(tmp_path: Path, store: PairStore, caplog) -> None:
     for k in range(4):
         fix = MarkerFix(1.5 + k, np.array([1.0, 2, 3]), np.eye(3) * 1e-6)
         store.append(7, "2026-01-01T00:00:00Z", np.array([0.1, 0.2]), fix)
@@ -150,18 +150,18 @@ def test_an_export_tells_unreadable_pairs(tmp_path: Path, store: PairStore, capl
     assert "(numbers 2, 4)" in caplog.text
 
 
-def test_an_empty_store_is_said_to_be_empty(tmp_path: Path, store: PairStore) -> None:
+def test_empty_store_export_is_rejected(tmp_path: Path, store: PairStore) -> None:
     with pytest.raises(RecordingError, match="the store has no pairs"):
         export(tmp_path / "pairs.sqlite", tmp_path / "a.csv")
 
 
-def test_a_store_that_is_not_there_is_not_made(tmp_path: Path) -> None:
+def test_exporting_a_missing_store_creates_no_file(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="no store"):
         export(tmp_path / "pairs.sqlite", tmp_path / "a.csv")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_file_in_the_way_is_kept_unless_forced(tmp_path: Path, robot: Path, recording: Recording) -> None:
+def test_existing_file_is_kept_unless_forced(tmp_path: Path, robot: Path, recording: Recording) -> None:
     recording.write_csv(tmp_path / "a.csv")
     (tmp_path / "b.csv").write_text("precious")
     with pytest.raises(RecordingError, match="there already"):
@@ -186,7 +186,7 @@ def test_an_unreadable_recording_leaves_nothing_behind(tmp_path: Path, robot: Pa
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_the_command_ends_with_exit_code_1_and_one_line(tmp_path: Path, robot: Path) -> None:
+def test_failing_command_exits_1_with_one_line(tmp_path: Path, robot: Path) -> None:
     source = tmp_path / "a.csv"
     source.write_text("waist,shoulder,x,y,z\n0,0,1,2,3\n0,0,1,two,3\n")
     ended = warm.run("-m", "bodyschema", "export", source, tmp_path / "b.csv", "--robot", robot)

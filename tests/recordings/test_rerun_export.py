@@ -57,7 +57,7 @@ def tool(*words: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
-def test_rerun_s_own_tool_finds_every_row_in_the_file(tmp_path: Path, recording: Recording) -> None:
+def test_rerun_cli_finds_every_exported_row(tmp_path: Path, recording: Recording) -> None:
     pytest.importorskip("rerun")
     file = tmp_path / "a.rrd"
     recordings.write(recording, file)
@@ -71,7 +71,7 @@ def test_each_segment_is_a_path_of_its_own(recording: Recording) -> None:
     assert [len(run) for run in runs(recording)] == [3, 2, 1]
 
 
-def test_without_the_extra_the_error_names_it_and_leaves_no_file(tmp_path, recording, monkeypatch) -> None:
+def test_missing_rerun_extra_is_named_without_partial_file(tmp_path, recording, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(RecordingError, match=r"bodyschema\[rerun\]"):
         recordings.write(recording, tmp_path / "a.rrd")

@@ -64,7 +64,7 @@ def test_without_limits_everything_is_kept(store) -> None:
     assert left(store) == [1, 2]
 
 
-def test_what_is_older_than_its_days_goes(store) -> None:
+def test_pairs_older_than_the_limit_are_deleted(store) -> None:
     fill(store, [40.0, 31.0, 29.0, 1.0])
     assert trim(store, Keep(30.0, None, 1)) == 2
     assert left(store) == [3, 4]
@@ -76,13 +76,13 @@ def test_the_newest_stay_however_old_they_are(store) -> None:
     assert left(store) == [7, 8, 9, 10]
 
 
-def test_a_wall_clock_that_jumps_ten_years_ahead_takes_no_more_than_is_old_anyway(store) -> None:
+def test_forward_clock_jump_keeps_the_newest_pairs(store) -> None:
     fill(store, [0.0] * 10)
     store.trim(Keep(30.0, None, 4), days_ago(-3650))
     assert left(store) == [7, 8, 9, 10]
 
 
-def test_an_old_pair_behind_a_young_one_waits_until_that_is_old(store) -> None:
+def test_old_pair_is_kept_behind_a_newer_one(store) -> None:
     fill(store, [40.0, 1.0, 40.0, 1.0])
     trim(store, Keep(30.0, None, 1))
     assert left(store) == [2, 3, 4]
@@ -93,7 +93,7 @@ def test_no_pair_waits_long_while_others_are_deleted(store) -> None:
     assert store.trim(Keep(30.0, None, 1), NOW) == AT_ONCE
 
 
-def test_a_store_with_a_size_grows_to_it_and_no_farther(store, file) -> None:
+def test_store_size_stays_within_its_limit(store, file) -> None:
     keep = Keep(None, 80_000.0, 50)
     for _ in range(12):
         fill(store, [0.0] * 60)
@@ -119,7 +119,7 @@ def test_a_store_that_let_pairs_go_opens_again(file) -> None:
         assert left(store) == [8, 9, 10, 11]
 
 
-def test_what_the_remaining_pairs_were_read_with_stays(file) -> None:
+def test_device_records_of_remaining_pairs_are_kept(file) -> None:
     for model in ("XM430-W350", "XM540-W270"):
         with PairStore(file, SESSION) as store:
             store.note_devices(NOW, [SERVO | {"model": model}])
@@ -131,7 +131,7 @@ def test_what_the_remaining_pairs_were_read_with_stays(file) -> None:
         ]
 
 
-def test_sessions_that_have_no_pair_left_go_with_their_pairs(file) -> None:
+def test_sessions_without_pairs_are_deleted(file) -> None:
     for _ in range(4):
         with PairStore(file, SESSION) as store:
             fill(store, [40.0] * 5)
@@ -140,7 +140,7 @@ def test_sessions_that_have_no_pair_left_go_with_their_pairs(file) -> None:
         assert store._connection.execute("SELECT count(*) FROM sessions").fetchone()[0] == 2
 
 
-def test_the_history_begins_with_the_oldest_pair_that_is_left(store, file) -> None:
+def test_history_begins_with_the_oldest_remaining_pair(store, file) -> None:
     fill(store, [40.0] * 10)
     trim(store, Keep(30.0, None, 4))
     with PairReader(file) as reader:

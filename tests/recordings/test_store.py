@@ -59,7 +59,7 @@ def test_pairs_are_numbered_from_one_without_gaps(store) -> None:
     assert [pair.seq for pair in fill(store, 5)] == [1, 2, 3, 4, 5]
 
 
-def test_numbering_goes_on_when_the_store_is_opened_again(file) -> None:
+def test_numbering_continues_when_store_is_reopened(file) -> None:
     with PairStore(file, SESSION) as store:
         fill(store, 3)
         identity = store.identity
@@ -67,7 +67,7 @@ def test_numbering_goes_on_when_the_store_is_opened_again(file) -> None:
         assert (store.identity, [pair.seq for pair in fill(store, 2)]) == (identity, [4, 5])
 
 
-def test_what_is_read_is_what_was_appended_bit_by_bit(store) -> None:
+def test_read_pairs_match_appended_pairs_bit_for_bit(store) -> None:
     appended = fill(store, 4)
     assert all(map(same, appended, store.read()))
 
@@ -129,7 +129,7 @@ def before_orientation(file: Path) -> Path:
     return file
 
 
-def test_a_store_from_before_orientations_goes_on_with_them(before_orientation) -> None:
+def test_schema_2_store_accepts_pairs_with_orientation(before_orientation) -> None:
     with PairStore(before_orientation, SESSION) as store:
         store.append(1, "utc", frozen_array([0.2, 0.2]), turned_fix(1.0))
         old, new = store.read()
@@ -138,19 +138,19 @@ def test_a_store_from_before_orientations_goes_on_with_them(before_orientation) 
     assert new.seq == 2
 
 
-def test_a_store_from_before_orientations_is_read_without_changing_it(before_orientation) -> None:
+def test_reading_schema_2_store_leaves_it_unchanged(before_orientation) -> None:
     before = before_orientation.read_bytes()
     with PairReader(before_orientation) as reader:
         assert [pair.R for pair in reader.read()] == [None]
     assert before_orientation.read_bytes() == before
 
 
-def test_a_range_of_pairs_is_read_up_to_the_limit(store) -> None:
+def test_range_read_stops_at_the_limit(store) -> None:
     fill(store, 10)
     assert [pair.seq for pair in store.read(3, 9, limit=4)] == [3, 4, 5, 6]
 
 
-def test_the_last_pair_of_an_empty_store_is_none(store) -> None:
+def test_empty_store_has_no_last_pair(store) -> None:
     assert store.last() is None
 
 
@@ -160,7 +160,7 @@ def test_the_joints_ranges_are_over_all_pairs(store) -> None:
     assert (low.tolist(), high.tolist()) == ([0.0, -0.1], [0.2, -0.1])
 
 
-def test_readers_see_each_pair_as_soon_as_it_is_appended(file, store) -> None:
+def test_readers_see_each_appended_pair_immediately(file, store) -> None:
     with PairReader(file) as reader:
         seen = []
         for _ in range(3):
@@ -178,7 +178,7 @@ def test_many_threads_read_while_pairs_come(file, store) -> None:
             assert [pair.seq for pair in pairs] == list(range(1, len(pairs) + 1))
 
 
-def test_a_reader_says_whose_pairs_they_are(file, store) -> None:
+def test_reader_reports_store_identity_and_joints(file, store) -> None:
     with PairReader(file) as reader:
         assert (reader.identity, reader.joints) == (store.identity, JOINTS)
 
@@ -198,7 +198,7 @@ def test_runs_that_see_no_pair_leave_nothing_behind(file) -> None:
         assert connection.execute("SELECT count(*) FROM sessions").fetchone()[0] == 1
 
 
-def test_each_pair_is_committed_with_a_flush_to_the_disk(store, monkeypatch) -> None:
+def test_store_uses_wal_with_full_synchronous_commits(store, monkeypatch) -> None:
     assert store._connection.execute("PRAGMA synchronous").fetchone()[0] == 2  # FULL
     assert store._connection.execute("PRAGMA journal_mode").fetchone()[0] == b"wal"
 
@@ -213,7 +213,7 @@ def test_a_second_sampler_on_the_store_is_refused(file, store) -> None:
 
 
 @pytest.mark.parametrize("part", ["", "-wal"])
-def test_no_pair_is_accepted_into_a_file_that_is_gone(file, store, part) -> None:
+def test_append_to_missing_file_is_rejected(file, store, part) -> None:
     fill(store, 2)
     there, aside = file.with_name(file.name + part), file.with_name("aside")
     there.rename(aside)
@@ -244,7 +244,7 @@ def closed(file: Path) -> Path:
     return file
 
 
-def test_opening_a_store_tells_that_it_works(closed, monkeypatch) -> None:
+def test_opening_a_store_reports_progress(closed, monkeypatch) -> None:
     monkeypatch.setattr("bodyschema.recordings.store.schema.STEPS_UNTIL_TOLD", 100)
     told: list[int] = []
     with PairStore(closed, SESSION, working=lambda: told.append(1)) as store:
@@ -294,7 +294,7 @@ def test_a_state_dir_below_a_file_is_refused(tmp_path) -> None:
         pass
 
 
-def test_there_is_nothing_to_read_before_a_sampler_ran(file) -> None:
+def test_reading_a_store_never_written_is_rejected(file) -> None:
     with pytest.raises(StoreError, match="there is no store"), PairReader(file):
         pass
 
@@ -305,7 +305,7 @@ def test_a_closed_store_takes_nothing(file) -> None:
         fill(store, 1)
 
 
-def test_a_store_that_was_killed_while_it_was_made_is_made_anew(file) -> None:
+def test_empty_store_file_is_initialized_on_opening(file) -> None:
     file.parent.mkdir()
     file.touch()
     with PairStore(file, SESSION) as store:
@@ -322,7 +322,7 @@ def fill_until_refused(store: PairStore) -> tuple[str, int]:
     raise AssertionError("the disk was never full")
 
 
-def test_a_full_disk_loses_no_pair_that_was_appended(mount_small_disk) -> None:
+def test_full_disk_loses_no_appended_pair(mount_small_disk) -> None:
     file = mount_small_disk("size=512k") / "pairs.sqlite"
     with PairStore(file, SESSION) as store:
         message, appended = fill_until_refused(store)
@@ -331,7 +331,7 @@ def test_a_full_disk_loses_no_pair_that_was_appended(mount_small_disk) -> None:
         assert [pair.seq for pair in reader.read()] == list(range(1, appended + 1))
 
 
-def test_a_full_disk_that_has_room_again_goes_on_without_a_gap(mount_small_disk) -> None:
+def test_numbering_continues_after_a_full_disk_is_freed(mount_small_disk) -> None:
     folder = mount_small_disk("size=512k")
     with PairStore(folder / "pairs.sqlite", SESSION) as store:
         (folder / "ballast").write_bytes(bytes(2**18))
@@ -340,14 +340,14 @@ def test_a_full_disk_that_has_room_again_goes_on_without_a_gap(mount_small_disk)
         assert fill(store, 1)[0].seq == appended + 1
 
 
-def test_a_disk_that_is_full_from_the_start_is_said_to_be_full(mount_small_disk) -> None:
+def test_initially_full_disk_is_reported(mount_small_disk) -> None:
     folder = mount_small_disk("size=16k")
     (folder / "ballast").write_bytes(bytes(2**14 - 4096))
     with pytest.raises(StoreError, match="is full"), PairStore(folder / "pairs.sqlite", SESSION):
         pass
 
 
-def test_a_read_only_disk_is_said_to_be_read_only(mount_small_disk) -> None:
+def test_read_only_disk_is_reported(mount_small_disk) -> None:
     folder = mount_small_disk("ro,size=512k")
     store = PairStore(folder / "pairs.sqlite", SESSION)
     with pytest.raises(StoreError, match=r"the disk is read-only. Give a --state-dir"), store:

@@ -43,7 +43,7 @@ def test_values_replace_or_join_those_of_their_table(tmp_path: Path) -> None:
     assert file.read_text() == edited
 
 
-def test_a_source_among_several_is_edited_in_the_first(tmp_path: Path) -> None:
+def test_edit_targets_first_of_several_sources(tmp_path: Path) -> None:
     file = tmp_path / "robot.toml"
     file.write_text('[[marker_source]]\nkind = "udp"\n\n[[marker_source]]\nkind = "ros2"')
     edited = with_values(file, "marker_source", {"latency_s": 0.01})
@@ -53,7 +53,7 @@ def test_a_source_among_several_is_edited_in_the_first(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "text", ["[robot]\n", "[vision]\ncameras = 1\n", '[vision]\nnote = """\n[vision.cameras]\n"""\n']
 )
-def test_a_missing_table_is_named_with_what_to_write(tmp_path: Path, text: str) -> None:
+def test_missing_table_error_says_what_to_write(tmp_path: Path, text: str) -> None:
     (tmp_path / "robot.toml").write_text(text)
     with pytest.raises(ConfigError, match="no table") as error:
         with_values(tmp_path / "robot.toml", "vision.cameras", VALUES)
@@ -61,7 +61,7 @@ def test_a_missing_table_is_named_with_what_to_write(tmp_path: Path, text: str) 
 
 
 @pytest.mark.parametrize("text", ["[[vision.cameras]] # mine", "[[vision.cameras]]"])
-def test_what_would_not_read_back_as_meant_is_left_to_people(tmp_path: Path, text: str) -> None:
+def test_ambiguous_edit_is_left_to_user(tmp_path: Path, text: str) -> None:
     (tmp_path / "robot.toml").write_text(text)
     with pytest.raises(ConfigError, match=r"\[vision\.cameras\] is written so that it cannot be edited"):
         with_values(tmp_path / "robot.toml", "vision.cameras", VALUES)
@@ -82,7 +82,7 @@ def test_line_ends_and_byte_order_mark_stay(tmp_path: Path, bom: bytes) -> None:
     assert file.read_bytes() == bom + BECOMES
 
 
-def test_a_last_line_without_an_end_gets_that_of_the_others(tmp_path: Path) -> None:
+def test_unterminated_last_line_gets_file_line_ending(tmp_path: Path) -> None:
     file = tmp_path / "robot.toml"
     file.write_bytes(b'[robot]\r\n[vision.cameras]\r\nleft = "a"')
     edited = with_values(file, "vision.cameras", {"latency_s": 0.01})
@@ -102,7 +102,7 @@ def test_a_last_line_without_an_end_gets_that_of_the_others(tmp_path: Path) -> N
         "[vision]\ncameras.left = 1\n",
     ],
 )
-def test_arrays_strings_and_quoted_keys_are_read_as_toml_has_them(tmp_path: Path, text: str) -> None:
+def test_arrays_strings_and_quoted_keys_follow_toml(tmp_path: Path, text: str) -> None:
     (tmp_path / "robot.toml").write_text(text)
     expected = tomllib.loads(text)
     expected["vision"]["cameras"] |= VALUES

@@ -125,7 +125,7 @@ def test_every_effect_of_the_table_is_tried() -> None:
 
 
 @pytest.mark.parametrize("cases", groups(), ids=lambda cases: "-".join(map(named, cases)))
-def test_the_guided_world_shows_what_the_simulation_says(cases) -> None:
+def test_guided_world_matches_the_simulation(cases) -> None:
     simulation = extended(*cases)
     motion, x = guided(simulation)
     at = slice(FRAME_STEPS, None, FRAME_STEPS)
@@ -136,7 +136,7 @@ def test_the_guided_world_shows_what_the_simulation_says(cases) -> None:
     assert np.abs(seen - expected).max() < CLOSE_M
 
 
-def test_a_late_frame_shows_the_joints_of_the_past() -> None:
+def test_late_frame_shows_past_joint_angles() -> None:
     simulation, steps = extended(("camera_latency", None, None, {"latency_s": 3 / 240})), 3
     motion, x = guided(simulation)
     past = simulation.robot.chain.positions(motion.q[FRAME_STEPS - steps :: FRAME_STEPS])
@@ -144,7 +144,7 @@ def test_a_late_frame_shows_the_joints_of_the_past() -> None:
 
 
 @pytest.mark.parametrize("latency_s", [0.0125, 0.031, -0.031])
-def test_on_a_smooth_path_a_late_stamp_is_what_the_simulation_says(latency_s: float) -> None:
+def test_late_stamp_on_smooth_path_matches_simulation(latency_s: float) -> None:
     simulation = extended(("camera_latency", None, None, {"latency_s": latency_s}))
     truth = TrueRobot.draw(simulation.robot, CONFIG, simulation)
     paths = JointPaths(truth, 240, 30, begins=0.0)
@@ -163,7 +163,7 @@ def test_on_a_smooth_path_a_late_stamp_is_what_the_simulation_says(latency_s: fl
 
 
 @pytest.mark.parametrize("case", [case for case in EFFECTS if case[0] != "camera_latency"], ids=named)
-def test_the_posed_world_shows_what_the_simulation_says(case, monkeypatch) -> None:
+def test_posed_world_matches_the_simulation(case, monkeypatch) -> None:
     monkeypatch.setattr("bodyschema.sim_backend.posed.RenderProcess", NoRenderer)
     simulation = extended(case)
     robot = simulation.robot
@@ -192,7 +192,7 @@ def doubled(case):
 @pytest.mark.parametrize(
     "names", [SEEN[0], *(pytest.param(names, marks=pytest.mark.soak) for names in SEEN[1:])], ids="-".join
 )
-def test_the_tracker_measures_what_the_world_says_that_it_shows(names) -> None:
+def test_tracker_measures_the_effects_shown_by_world(names) -> None:
     simulation = extended(*(doubled(case) for case in EFFECTS if case[0] in names))
     plain = SimConfig(seed=4, errors=NO_ERRORS)
     postures = visible_postures(simulation.robot, plain, 6)

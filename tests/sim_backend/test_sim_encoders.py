@@ -29,7 +29,7 @@ def test_an_offset_is_added_to_the_true_angle(true):
     assert np.abs(reading - true - [0.1, -0.2, 0.3]).max() <= TICK / 2 + 1e-12
 
 
-def test_a_slide_is_read_in_ticks_of_its_own():
+def test_prismatic_joint_is_read_in_own_ticks():
     reading = encoders(prismatic=(True, False, False)).read(np.array([0.100026, 0.0, 0.0]))
     assert reading[0] == np.round(0.100026 * 20_000) / 20_000
 

@@ -33,12 +33,12 @@ def free_arm():
         yield let_go
 
 
-def test_an_arm_that_nobody_holds_falls(free_arm):
+def test_unheld_arm_falls(free_arm):
     moved = free_arm(gravity_compensation=False)
     assert moved[2] < -0.3
 
 
-def test_gravity_compensation_keeps_an_arm_where_it_is_left(free_arm):
+def test_gravity_compensation_holds_the_arm_in_place(free_arm):
     moved = free_arm(gravity_compensation=True)
     assert np.abs(moved[2:]).max() < 1e-3
 
@@ -51,18 +51,18 @@ def test_the_guided_joints_motors_apply_nothing(free_arm):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_nine_frames_in_ten_are_one_to_three_degrees_after_their_predecessor(seed):
+def test_most_frames_are_one_to_three_degrees_apart(seed):
     steps = step_degrees(shipped_run(seed))
     assert ((steps >= 1.0) & (steps <= 3.0)).mean() > 0.9
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_the_ball_is_visible_in_four_frames_of_five(seed):
+def test_ball_is_visible_in_four_of_five_frames(seed):
     assert shipped_run(seed).visible.mean() > 0.8
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_the_gaze_keeps_the_ball_about_the_middle_of_the_image(seed):
+def test_gaze_keeps_the_ball_near_image_centre(seed):
     run = shipped_run(seed)
     assert run.robot.calibration is not None
     pixels = run.robot.calibration.project(run.x)[:, :2]
@@ -70,7 +70,7 @@ def test_the_gaze_keeps_the_ball_about_the_middle_of_the_image(seed):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_twelve_seconds_of_guiding_cover_a_third_of_every_arm_joints_range(seed):
+def test_guiding_covers_a_third_of_arm_joint_ranges(seed):
     run = shipped_run(seed)
     share = np.ptp(run.q, axis=0) / (run.robot.upper - run.robot.lower)
     assert share[2:].min() > 1 / 3
@@ -78,14 +78,14 @@ def test_twelve_seconds_of_guiding_cover_a_third_of_every_arm_joints_range(seed)
 
 @pytest.mark.soak
 @pytest.mark.parametrize("seed", SEEDS)
-def test_the_ball_stays_visible_with_a_tool_that_is_250_mm_longer(seed):
+def test_ball_stays_visible_with_a_longer_tool(seed):
     run = guide(shipped(), SimConfig(seed=seed), 5.0, tool=(0.23, 0.0, -0.37), settle=1.0)
     assert run.visible.mean() > 0.8
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.soak
-def test_a_single_tag_is_turned_to_the_eyes_in_nine_frames_of_ten(seed):
+def test_single_tag_faces_the_eyes_in_most_frames(seed):
     robot = shipped()
     tag = SimTag(id=0, xyz=(0.0, 0.0, 0.0), rpy=(0.0, 0.0, 0.0), side_m=0.06)
     config = SimConfig(seed=seed, camera=CameraConfig(tags=(tag,)))
@@ -110,7 +110,7 @@ def test_a_single_tag_is_turned_to_the_eyes_in_nine_frames_of_ten(seed):
     ids=len,
 )  # fmt: skip
 @pytest.mark.soak
-def test_other_choices_of_learnt_joints_are_guided_in_view_too(joints):
+def test_other_joint_selections_are_guided_in_view(joints):
     run = guide(learning(joints), SimConfig(seed=1), 5.0)
     steps = step_degrees(run)
     assert run.visible.mean() > 0.8

@@ -178,7 +178,7 @@ def test_the_triangles_of_mirrored_meshes_face_outwards(tmp_path) -> None:
     assert outwards(mirrored) == pytest.approx(outwards(plain), rel=1e-5)
 
 
-def test_hulls_hold_the_mesh_and_flat_ones_are_boxes(tmp_path) -> None:
+def test_hulls_enclose_meshes_and_flat_ones_become_boxes(tmp_path) -> None:
     (tmp_path / "ball.stl").write_bytes(stl(ball(40)))
     (tmp_path / "flat.stl").write_bytes(stl([[[0, 0, 0], [1, 0, 0], [0, 2, 0]]]))
     known = Meshes(tmp_path / "robot.urdf")
@@ -280,7 +280,7 @@ def test_many_missing_meshes_make_one_sentence(tmp_path) -> None:
 @pytest.mark.parametrize(
     "name", ["/etc/passwd", "../../../../../../../../etc/passwd", "package://a/../../etc/passwd", "linked.stl"]
 )
-def test_a_file_that_is_no_mesh_is_not_read(tmp_path, name, monkeypatch) -> None:
+def test_non_mesh_file_is_not_read(tmp_path, name, monkeypatch) -> None:
     monkeypatch.setattr(meshes, "read_mesh", lambda file: pytest.fail(f"{file} was read"))
     (tmp_path / "linked.stl").symlink_to("/etc/passwd")
     urdf = written(robot_of(tmp_path, mesh(name)))
@@ -296,7 +296,7 @@ def test_pybullet_hears_of_no_file_but_ours(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("scale", ["1000 1000 1000", "1e300 1 1", "1e-320 1e-320 1e-320"])
-def test_absurd_sizes_are_told(tmp_path, scale) -> None:
+def test_absurd_sizes_are_reported(tmp_path, scale) -> None:
     (tmp_path / "wedge.stl").write_bytes(stl(WEDGE))
     assert "A mesh in millimetres needs" in written(robot_of(tmp_path, mesh("wedge.stl", scale=scale))).said[0]
 

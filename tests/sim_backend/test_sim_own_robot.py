@@ -51,7 +51,7 @@ ON_THE_HAND = TOML.format(
 )  # fmt: skip
 
 
-def test_a_robot_with_a_rail_and_a_camera_on_the_base_is_guided_in_view(tmp_path):
+def test_base_camera_rail_robot_is_guided_in_view(tmp_path):
     run = guide(described(tmp_path, URDF, ON_A_MAST), SimConfig(seed=1), 6.0)
     steps = step_degrees(run)
     assert run.visible.mean() > 0.8
@@ -59,7 +59,7 @@ def test_a_robot_with_a_rail_and_a_camera_on_the_base_is_guided_in_view(tmp_path
 
 
 @pytest.mark.parametrize("toml", [ON_A_MAST, ON_THE_HAND], ids=["camera on a mast", "camera on the hand"])
-def test_the_true_chain_of_such_a_robot_agrees_with_pybullets_own_links(tmp_path, toml):
+def test_true_chain_of_own_robot_matches_pybullet_links(tmp_path, toml):
     robot, config = described(tmp_path, URDF, toml), SimConfig(seed=2)
     assert robot.calibration is not None
     truth = TrueRobot.draw(robot, config)
@@ -70,12 +70,12 @@ def test_the_true_chain_of_such_a_robot_agrees_with_pybullets_own_links(tmp_path
             np.testing.assert_allclose(chain.positions(q), in_eye(physics.scene()), atol=1e-6)
 
 
-def test_with_the_camera_on_the_hand_the_camera_joints_are_guided(tmp_path):
+def test_camera_joints_are_guided_for_hand_camera(tmp_path):
     roles = JointRoles.of(described(tmp_path, URDF, ON_THE_HAND))
     assert (roles.gaze, roles.guided, roles.wrist) == ((), (2, 1, 0), "fore")
 
 
-def test_a_robot_with_the_camera_on_the_hand_is_guided_in_view(tmp_path):
+def test_hand_camera_robot_is_guided_in_view(tmp_path):
     run = guide(described(tmp_path, URDF, ON_THE_HAND), SimConfig(seed=1), 6.0)
     assert run.visible.mean() > 0.8
 
@@ -89,7 +89,7 @@ def test_such_a_robot_delivers_readings_and_frames(tmp_path):
     assert (frame.left.shape, reading.q.shape) == ((480, 640, 3), (3,))
 
 
-def test_a_camera_that_never_sees_the_marker_is_refused(tmp_path):
+def test_camera_never_seeing_the_marker_is_refused(tmp_path):
     looking_away = ON_A_MAST.replace("1.5707963, 0.0, 1.5707963", "1.5707963, 0.0, -1.5707963")
     robot = described(tmp_path, URDF, looking_away)
     with pytest.raises(ConfigError, match="hardly any posture"), SimWorld(robot, SimConfig()):

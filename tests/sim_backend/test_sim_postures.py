@@ -54,7 +54,7 @@ def test_encoders_report_each_posture_to_the_tick(postures: FloatArray, unrender
     assert np.abs(readings - postures).max() < 3 * tick
 
 
-def test_a_posture_is_read_and_seen_at_the_same_time(postures: FloatArray, unrendered) -> None:
+def test_posture_reading_and_frame_share_a_time(postures: FloatArray, unrendered) -> None:
     with PosedWorld(shipped(), SimConfig(), postures) as world:
         frames = seen(world)
         with world.joints as joints:
@@ -69,7 +69,7 @@ def test_the_sources_end_after_the_last_posture(postures: FloatArray, unrendered
 
 
 @pytest.mark.soak
-def test_the_same_postures_give_the_same_frames_bit_by_bit(postures: FloatArray) -> None:
+def test_same_postures_give_bitwise_identical_frames(postures: FloatArray) -> None:
     taken = []
     for _ in range(2):
         with PosedWorld(shipped(), SimConfig(), postures) as world:
@@ -77,7 +77,7 @@ def test_the_same_postures_give_the_same_frames_bit_by_bit(postures: FloatArray)
     np.testing.assert_array_equal(*taken)
 
 
-def test_the_posed_robot_is_the_one_that_is_guided(postures: FloatArray, unrendered) -> None:
+def test_posed_robot_equals_the_guided_robot(postures: FloatArray, unrendered) -> None:
     with PosedWorld(shipped(), SimConfig(), postures) as world:
         np.testing.assert_array_equal(
             world.true_chain().positions(postures), true_chain(shipped(), SimConfig()).positions(postures)

@@ -60,7 +60,7 @@ def random_places(count, seed):
     return np.column_stack([rng.uniform(-0.3, 0.3, (count, 2)) * depth[:, None], depth])
 
 
-def test_the_rendered_balls_centre_is_where_the_calibration_projects_it(bullet):
+def test_rendered_ball_centre_matches_the_calibration(bullet):
     misses = []
     for x in random_places(12, 0):
         for image, shift in zip(painted(bullet, x), (0.0, CALIBRATION.baseline_m), strict=True):
@@ -70,7 +70,7 @@ def test_the_rendered_balls_centre_is_where_the_calibration_projects_it(bullet):
 
 
 @pytest.mark.parametrize("per_pixel", [0.5, 1, 3])
-def test_tiny_renderer_draws_the_robot_on_the_same_pixels(bullet, per_pixel):
+def test_tiny_renderer_matches_calibrated_pixel_positions(bullet, per_pixel):
     module, client = bullet
     shape = module.createVisualShape(module.GEOM_SPHERE, radius=RADIUS, physicsClientId=client)
     body = module.createMultiBody(0, -1, shape, physicsClientId=client)
@@ -85,7 +85,7 @@ def test_tiny_renderer_draws_the_robot_on_the_same_pixels(bullet, per_pixel):
     assert np.abs(np.mean(misses, axis=0)).max() < 0.1
 
 
-def test_depths_of_the_robot_are_metres_along_the_optical_axis(bullet):
+def test_robot_depths_are_metres_along_optical_axis(bullet):
     module, client = bullet
     shape = module.createVisualShape(module.GEOM_BOX, halfExtents=[1, 1, 0.1], physicsClientId=client)
     module.createMultiBody(0, -1, shape, [0, 0, 0.9], physicsClientId=client)
@@ -99,7 +99,7 @@ def red_pixels(image):
 
 
 @pytest.mark.parametrize(("z", "hidden"), [(0.4, True), (0.8, False)])
-def test_what_stands_before_the_ball_hides_it_and_what_stands_behind_does_not(bullet, z, hidden):
+def test_only_objects_in_front_hide_the_ball(bullet, z, hidden):
     module, client = bullet
     shape = module.createVisualShape(
         module.GEOM_BOX, halfExtents=[0.2, 0.2, 0.02], rgbaColor=[0.5, 0.5, 0.5, 1], physicsClientId=client
@@ -110,7 +110,7 @@ def test_what_stands_before_the_ball_hides_it_and_what_stands_behind_does_not(bu
     assert seen == [not hidden, not hidden]
 
 
-def test_an_edge_half_across_the_ball_hides_half_of_it(bullet):
+def test_edge_half_across_the_ball_hides_half(bullet):
     module, client = bullet
     shape = module.createVisualShape(
         module.GEOM_BOX, halfExtents=[0.1, 0.2, 0.001], rgbaColor=[0.5, 0.5, 0.5, 1], physicsClientId=client
@@ -121,7 +121,7 @@ def test_an_edge_half_across_the_ball_hides_half_of_it(bullet):
     assert red_pixels(painted(bullet, x)[0]) == pytest.approx(whole_area / 2, rel=0.1)
 
 
-def test_image_noise_has_the_stated_size_and_differs_between_the_eyes(bullet):
+def test_image_noise_has_stated_size_independently_per_eye(bullet):
     behind = np.array([0.0, 0.0, -1.0])
     clean = painted(bullet, behind)
     noisy = painted(bullet, behind, CameraConfig(noise=3.0, clutter=0))
@@ -146,7 +146,7 @@ def test_the_background_moves_against_the_heads_turn(bullet):
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 5))])
-def test_nothing_in_the_background_is_as_red_as_the_ball(seed):
+def test_background_is_never_as_red_as_the_ball(seed):
     assert red_pixels(cluttered_room(200, np.random.default_rng(seed))) == 0
 
 
@@ -168,7 +168,7 @@ def test_a_lamp_is_brighter_than_all_else(bullet):
     assert np.percentile(grey, 90) < 0.3 * 255
 
 
-def test_the_shipped_calibration_has_its_axis_in_the_middle_of_the_image():
+def test_shipped_calibration_has_a_centred_principal_point():
     calibration = shipped().calibration
     assert calibration is not None
     assert calibration.principal_point_px == (319.5, 239.5)
@@ -196,7 +196,7 @@ def test_a_tag_is_not_seen_from_behind(bullet) -> None:
     assert from_behind.min() > 60
 
 
-def test_what_stands_before_a_tag_hides_it(bullet) -> None:
+def test_object_before_a_tag_hides_it(bullet) -> None:
     module, client = bullet
     shape = module.createVisualShape(
         module.GEOM_BOX, halfExtents=[0.1] * 3, rgbaColor=[0, 1, 0, 1], physicsClientId=client

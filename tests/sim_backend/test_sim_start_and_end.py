@@ -51,7 +51,7 @@ def test_a_killed_parent_leaves_no_renderer_behind():
     assert ended
 
 
-def test_an_interrupted_world_closes_its_renderer_and_says_nothing():
+def test_interrupted_world_closes_its_renderer_silently():
     with run_python(HOLD_OPEN, stdin=subprocess.PIPE) as parent:
         renderer = os.pidfd_open(int(parent.stdout.readline()))
         parent.send_signal(signal.SIGINT)
@@ -73,7 +73,7 @@ def test_without_pybullet_the_remedy_is_named(monkeypatch):
         pass
 
 
-def test_a_robot_without_stereo_calibration_is_told_which_keys_are_missing():
+def test_missing_stereo_calibration_error_names_missing_keys():
     file = model_file("upper_body")
     tables, text = read_toml(file)
     for key in ("focal_px", "principal_point_px", "baseline_m", "image_size_px"):
@@ -83,7 +83,7 @@ def test_a_robot_without_stereo_calibration_is_told_which_keys_are_missing():
         pass
 
 
-def test_an_unknown_model_is_answered_with_the_known_ones():
+def test_unknown_model_error_lists_known_models():
     with pytest.raises(ConfigError, match="upper_body"):
         model_file("upper_bodi")
 

@@ -57,7 +57,7 @@ def test_the_true_chain_agrees_with_pybullets_own_links(joints):
             np.testing.assert_allclose(chain.positions(q), (np.linalg.inv(T_world_camera) @ x_world)[:3], atol=1e-6)
 
 
-def test_another_tool_moves_the_true_marker_by_as_much_as_described():
+def test_tool_change_moves_true_marker_as_described():
     robot, config = shipped(), SimConfig(seed=4)
     q = postures(robot, 20, 3)
     before = true_chain(robot, config, (0.0, 0.0, -0.1)).positions(q)
@@ -65,7 +65,7 @@ def test_another_tool_moves_the_true_marker_by_as_much_as_described():
     np.testing.assert_allclose(np.linalg.norm(after - before, axis=1), 0.25, atol=1e-9)
 
 
-def test_the_nominal_model_errs_by_60_to_80_mm_on_average_over_many_robots():
+def test_nominal_model_errs_by_60_to_80_mm():
     robot = shipped()
     assert robot.calibration is not None
     q = Gaze(robot, robot.calibration, JointRoles.of(robot).gaze).solve(postures(robot, 400, 4))

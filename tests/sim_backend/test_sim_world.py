@@ -74,12 +74,12 @@ def triangulated(calibration, frame):
     return np.append((left - calibration.principal_point_px) * z / calibration.focal_px, z)
 
 
-def test_the_sources_are_what_the_sampler_expects(running):
+def test_sources_implement_the_sampler_s_interface(running):
     assert isinstance(running.joints, JointSource)
     assert isinstance(running.camera, StereoCamera)
 
 
-def test_the_same_seed_gives_the_same_readings_and_frames_bit_by_bit(running, world):
+def test_same_seed_gives_bitwise_identical_readings_and_frames(running, world):
     runs = running.begun, begin(world)
     for first, second in zip(runs[0][0], runs[1][0], strict=True):
         assert first.t == second.t
@@ -90,7 +90,7 @@ def test_the_same_seed_gives_the_same_readings_and_frames_bit_by_bit(running, wo
         np.testing.assert_array_equal(first.right, second.right)
 
 
-def test_two_threads_get_all_readings_and_frames_in_order_at_their_rates(black):
+def test_two_threads_get_ordered_readings_and_frames(black):
     times, seen = [], []
 
     def read_joints():
@@ -107,14 +107,14 @@ def test_two_threads_get_all_readings_and_frames_in_order_at_their_rates(black):
     np.testing.assert_allclose(seen, np.arange(1, 13) / 30, atol=1e-12)
 
 
-def test_encoders_do_not_run_more_than_two_frames_ahead_of_the_camera(black):
+def test_encoders_lead_camera_by_at_most_two_frames(black):
     times = []
     while (reading := black.joints.read(0.0)) is not None:
         times.append(reading.t)
     assert times[-1] == pytest.approx(2 / 30)
 
 
-def test_the_camera_waits_for_joints_that_nobody_reads(black):
+def test_camera_waits_for_unread_joints(black):
     frame = black.camera.read(WAIT_S)
     while frame is not None:
         last = frame.t
@@ -122,12 +122,12 @@ def test_the_camera_waits_for_joints_that_nobody_reads(black):
     assert last == pytest.approx(1.0)
 
 
-def test_joints_alone_run_on_when_no_camera_is_open(unrendered):
+def test_joints_run_on_without_an_open_camera(unrendered):
     with SimWorld(shipped(), SimConfig()) as world, world.joints:
         assert readings_until(world, 0.5)[-1].t == pytest.approx(0.5)
 
 
-def test_the_triangulated_ball_is_where_the_true_chain_puts_it(running):
+def test_triangulated_ball_matches_the_true_chain(running):
     misses = []
     for frame in frames(running, 10):
         reading = readings_until(running, frame.t)[-1]
@@ -138,7 +138,7 @@ def test_the_triangulated_ball_is_where_the_true_chain_puts_it(running):
     assert np.abs(misses)[:, 2].max() < 10e-3
 
 
-def test_a_tool_change_shows_in_the_next_frames_and_in_the_truth(running):
+def test_tool_change_shows_in_frames_and_truth(running):
     world = running
     frame = frames(world, 3)[-1]
     q = readings_until(world, frame.t)[-1].q
@@ -183,7 +183,7 @@ def test_a_closed_world_has_no_more_readings(unrendered):
         joints.read(WAIT_S)
 
 
-def test_a_reader_that_waits_is_told_when_the_world_closes(unrendered):
+def test_closing_world_wakes_a_waiting_reader(unrendered):
     told = threading.Event()
     with SimWorld(shipped(), SimConfig()) as world, world.joints, world.camera:
         while world.joints.read(0.0) is not None:
@@ -200,7 +200,7 @@ def test_a_reader_that_waits_is_told_when_the_world_closes(unrendered):
     reader.join(WAIT_S)
 
 
-def test_a_dead_renderer_is_a_lost_source_until_the_camera_is_opened_again(running):
+def test_dead_renderer_is_lost_until_camera_reopens(running):
     world = running
     world._renderer.process.kill()
     with pytest.raises(SourceLost, match="renderer"):
@@ -209,14 +209,14 @@ def test_a_dead_renderer_is_a_lost_source_until_the_camera_is_opened_again(runni
         assert None not in frames(world, 3)
 
 
-def test_a_lost_renderer_has_ended_when_it_is_told(monkeypatch):
+def test_lost_renderer_is_reported_with_its_exit_code(monkeypatch):
     start = "bodyschema.sim_backend.rendering.render_client._start"
     monkeypatch.setattr(start, lambda *_: subprocess.Popen(["sleep", "0.2"]))
     with pytest.raises(SourceLost, match="exit code 0"), SimWorld(shipped(), SimConfig(seed=3)):
         pass
 
 
-def test_a_robot_with_one_eye_is_rendered_with_one_image_that_shows_the_marker():
+def test_one_eyed_robot_renders_one_image_with_marker():
     robot = shipped()
     assert robot.calibration is not None
     alone = replace(robot, calibration=replace(robot.calibration, baseline_m=0.0))

@@ -70,7 +70,7 @@ def lose_each_other(config: Config, link: BadLink, pairs: int) -> None:
     status_when(config, "learner", LearnerStatus, lambda status: status.sampler_alive)
 
 
-def test_after_a_partition_the_learner_catches_up_without_loss_or_doubling(tmp_path, free_endpoint) -> None:
+def test_partition_loses_and_doubles_no_pair(tmp_path, free_endpoint) -> None:
     with apart(tmp_path, free_endpoint) as (config, link):
         lose_each_other(config, link, MORE)
         status = expect_each_pair_learnt_once(config)
@@ -78,7 +78,7 @@ def test_after_a_partition_the_learner_catches_up_without_loss_or_doubling(tmp_p
 
 
 @pytest.mark.soak
-def test_after_a_partition_of_minutes_thousands_of_pairs_are_caught_up_with(tmp_path, free_endpoint) -> None:
+def test_learner_catches_up_thousands_after_long_partition(tmp_path, free_endpoint) -> None:
     with apart(tmp_path, free_endpoint) as (config, link):
         for pairs in (6000, 300, 300):
             lose_each_other(config, link, pairs)
@@ -86,7 +86,7 @@ def test_after_a_partition_of_minutes_thousands_of_pairs_are_caught_up_with(tmp_
 
 
 @pytest.mark.soak
-def test_connections_that_are_cut_again_and_again_cost_no_pair(tmp_path, free_endpoint) -> None:
+def test_repeated_disconnections_lose_no_pair(tmp_path, free_endpoint) -> None:
     with apart(tmp_path, free_endpoint) as (config, link):
         for _ in range(4):
             link.cut()
@@ -95,7 +95,7 @@ def test_connections_that_are_cut_again_and_again_cost_no_pair(tmp_path, free_en
 
 
 @pytest.mark.soak
-def test_over_a_slow_network_every_pair_comes_though_late(tmp_path, free_endpoint) -> None:
+def test_slow_network_delivers_every_pair(tmp_path, free_endpoint) -> None:
     with apart(tmp_path, free_endpoint) as (config, link):
         link.delay_s, link.bytes_per_s = 0.4, 40_000
         learner_with(config, sampler_with(config, 0).pairs + MORE)
@@ -103,7 +103,7 @@ def test_over_a_slow_network_every_pair_comes_though_late(tmp_path, free_endpoin
 
 
 @pytest.mark.soak
-def test_a_learner_that_is_gone_for_a_while_catches_up(tmp_path, free_endpoint) -> None:
+def test_learner_catches_up_after_absence(tmp_path, free_endpoint) -> None:
     config = write_robot(tmp_path, free_endpoint)
     with running(config, "sampler"):
         with running(config, "learner"):
@@ -129,7 +129,7 @@ def in_a_namespace(how: str, folder: Path, pairs: int) -> int:
 
 @pytest.mark.soak
 @pytest.mark.parametrize(("how", "pairs"), [("down", 200), ("down", 6000), ("slow", 300)])
-def test_minutes_without_a_link_or_with_a_slow_one_cost_no_pair(tmp_path, how, pairs) -> None:
+def test_long_outage_or_slow_link_loses_no_pair(tmp_path, how, pairs) -> None:
     assert in_a_namespace(how, tmp_path, pairs) > pairs
 
 
@@ -191,7 +191,7 @@ class Flood:
 
 
 @pytest.mark.soak
-def test_under_a_flood_of_queries_pairs_go_on_being_learnt(tmp_path, free_endpoint) -> None:
+def test_query_flood_does_not_stop_learning(tmp_path, free_endpoint) -> None:
     config = write_robot(tmp_path, free_endpoint)
     with running(config, "sampler"), running(config, "learner"):
         begun = learner_with(config, SOME).last_seq

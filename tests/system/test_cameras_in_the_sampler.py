@@ -73,7 +73,7 @@ def moving(tmp_path: Path, free_endpoint: Callable[[], str]) -> Iterator[tuple[C
 
 
 @pytest.mark.soak  # with images in a folder: below; cameras below OpenCV: test_v4l2; latency_s: test_cameras
-def test_servos_and_a_stereo_camera_give_pairs_that_agree_in_time(library, moving) -> None:
+def test_servo_and_camera_samples_agree_in_time(library, moving) -> None:
     config, _ = moving
     with sampling(config, preloaded(library)) as sampler:
         until(sampler, lambda said: said.pairs >= 20)
@@ -83,7 +83,7 @@ def test_servos_and_a_stereo_camera_give_pairs_that_agree_in_time(library, movin
 
 
 @pytest.mark.soak
-def test_a_camera_that_is_unplugged_is_told_of_and_taken_again_while_the_servos_are_read_on(library, moving) -> None:
+def test_unplugged_camera_is_reported_and_reopened(library, moving) -> None:
     config, camera = moving
     with sampling(config, preloaded(library)) as sampler:
         until(sampler, lambda said: said.pairs >= 5)
@@ -96,7 +96,7 @@ def test_a_camera_that_is_unplugged_is_told_of_and_taken_again_while_the_servos_
 
 
 @pytest.mark.soak
-def test_a_hidden_latency_is_found_by_moving_the_arm(library, moving) -> None:
+def test_moving_arm_reveals_hidden_latency(library, moving) -> None:
     config, _ = moving
     file = config.file
     file.write_text(file.read_text().replace(f"latency_s = {LATENCY_S}", "latency_s = 0.01"))

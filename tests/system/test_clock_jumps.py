@@ -19,7 +19,7 @@ BETWEEN = 12
 
 @pytest.mark.soak
 @pytest.mark.parametrize("jumping", [("sampler",), ("learner",), ("sampler", "learner")], ids="-and-".join)
-def test_jumps_of_the_wall_clock_cost_no_pair_and_no_order(tmp_path, free_endpoint, disk_shim, jumping) -> None:
+def test_wall_clock_jumps_keep_pairs_and_order(tmp_path, free_endpoint, disk_shim, jumping) -> None:
     config = write_robot(tmp_path, free_endpoint)
     disk = FailingDisk(config.state_dir, disk_shim)
     environments = {name: disk.environment if name in jumping else {} for name in ("sampler", "learner")}

@@ -54,7 +54,7 @@ def test_the_demo_leaves_a_recording_with_every_pair(demo: Demo) -> None:
         assert len(list(csv.DictReader(stream))) >= FIRST + SECOND
 
 
-def test_the_recording_of_the_first_tool_ends_where_the_tool_was_changed(demo: Demo) -> None:
+def test_first_tool_recording_ends_at_tool_change(demo: Demo) -> None:
     robot = RobotDescription.load(demo.folder / "robot.toml")
     both, first = (Recording.read(demo.folder / f"{name}.csv", robot.joints) for name in ("recording", "first_tool"))
     moved = np.linalg.norm(np.diff(both.x[len(first) - 3 : len(first) + 3], axis=0), axis=1)
@@ -85,7 +85,7 @@ def test_without_a_terminal_the_demo_prints_plain_lines(demo: Demo) -> None:
 
 @pytest.mark.soak
 @pytest.mark.parametrize("seed", range(5))
-def test_the_demo_reaches_its_figures_and_claims_what_is_true(tmp_path: Path, seed: int) -> None:
+def test_demo_reaches_its_figures_with_honest_uncertainty(tmp_path: Path, seed: int) -> None:
     """Require 20 mm after 600 pairs, 30 mm 300 pairs after the tool change, and predicted errors within a factor 2."""
     command = [sys.executable, "-m", "bodyschema", "demo", "--out", str(tmp_path / "out"), "--seed", str(seed)]
     done = subprocess.run(command, check=True, capture_output=True, text=True, timeout=LIMIT_S)
@@ -97,7 +97,7 @@ def test_the_demo_reaches_its_figures_and_claims_what_is_true(tmp_path: Path, se
         assert 40.0 < float(covered) < 95.0
 
 
-def test_the_demo_refuses_a_folder_that_is_not_its_own(tmp_path: Path) -> None:
+def test_demo_refuses_foreign_folder(tmp_path: Path) -> None:
     precious = tmp_path / "thesis.tex"
     precious.write_text("years of work")
     result = warm.run("-m", "bodyschema", "demo", "--out", tmp_path)
@@ -123,7 +123,7 @@ def test_the_demo_over_servos_learns_as_well(tmp_path: Path) -> None:
 
 @pytest.mark.soak
 @pytest.mark.parametrize("seed", range(5))
-def test_the_demo_over_servos_reaches_the_figures_of_the_demo(tmp_path: Path, seed: int) -> None:
+def test_demo_over_servos_reaches_demo_figures(tmp_path: Path, seed: int) -> None:
     command = [sys.executable, "-m", "bodyschema", "demo", "--bus", "dynamixel", "--out", str(tmp_path / "out")]
     done = subprocess.run([*command, "--seed", str(seed)], check=True, capture_output=True, text=True, timeout=LIMIT_S)
     first, second = re.findall(r"│ +([\d.]+) mm │ +([\d.]+) mm │ +\d+ % │", done.stdout)

@@ -64,9 +64,7 @@ def fill(file: Path) -> None:
 # --- a disk that takes nothing for a while
 
 
-def test_a_disk_that_takes_nothing_is_told_by_both_processes_and_gone_on_with(
-    tmp_path, free_endpoint, disk_shim
-) -> None:
+def test_both_processes_report_unwritable_disk_and_continue(tmp_path, free_endpoint, disk_shim) -> None:
     config = write_robot(tmp_path, free_endpoint)
     disk = FailingDisk(config.state_dir, disk_shim)
     with (
@@ -90,7 +88,7 @@ def test_a_disk_that_takes_nothing_is_told_by_both_processes_and_gone_on_with(
         expect_each_pair_learnt_once(config)
 
 
-def test_a_full_disk_with_room_again_goes_on_without_a_gap(tmp_path, free_endpoint, mount_small_disk) -> None:
+def test_freed_disk_resumes_without_gap(tmp_path, free_endpoint, mount_small_disk) -> None:
     folder = mount_small_disk("size=1m")
     config = write_robot(tmp_path, free_endpoint, state_dir=folder)
     ballast = folder / "ballast"
@@ -107,7 +105,7 @@ def test_a_full_disk_with_room_again_goes_on_without_a_gap(tmp_path, free_endpoi
 
 
 @pytest.mark.soak
-def test_a_slow_disk_is_told_and_costs_no_pair_that_was_accepted(tmp_path, free_endpoint, disk_shim) -> None:
+def test_slow_disk_is_reported_and_loses_nothing(tmp_path, free_endpoint, disk_shim) -> None:
     config = write_robot(tmp_path, free_endpoint)
     disk = FailingDisk(config.state_dir, disk_shim)
     with running(config, "sampler", environment=disk.environment), running(config, "learner"):
@@ -175,7 +173,7 @@ def kept(worked: Config) -> Config:
 @pytest.mark.parametrize(
     "how", [flipped, *(pytest.param(how, marks=pytest.mark.soak) for how in (truncated, emptied, zeroed))]
 )
-def test_a_damaged_checkpoint_gives_way_to_the_one_before_which_is_said(kept, how) -> None:
+def test_damaged_checkpoint_falls_back_to_previous_one(kept, how) -> None:
     damage(kept, how, 0)
     with running(kept, "learner"):
         text = health(kept, "learner", LearnerStatus, "the learner went on from")
@@ -183,7 +181,7 @@ def test_a_damaged_checkpoint_gives_way_to_the_one_before_which_is_said(kept, ho
     assert f"It was kept as {kept.checkpoint_file}.unusable-1" in text
 
 
-def test_with_both_checkpoints_damaged_the_learner_learns_every_stored_pair_again(kept) -> None:
+def test_two_damaged_checkpoints_relearn_the_store(kept) -> None:
     for generation in (0, 1):
         damage(kept, flipped, generation)
     with running(kept, "sampler"), running(kept, "learner"):
@@ -192,7 +190,7 @@ def test_with_both_checkpoints_damaged_the_learner_learns_every_stored_pair_agai
 
 
 @pytest.mark.soak
-def test_a_process_that_may_not_write_a_file_so_large_tells_it(tmp_path, free_endpoint) -> None:
+def test_file_size_limit_is_reported(tmp_path, free_endpoint) -> None:
     config = write_robot(tmp_path, free_endpoint)
     limited = ("prlimit", f"--fsize={256 * 1024}")
     if not any(os.access(f"{folder}/prlimit", os.X_OK) for folder in os.environ["PATH"].split(":")):

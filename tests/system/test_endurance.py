@@ -103,7 +103,7 @@ def watched(config: Config, endpoint: str) -> list[Look]:
 
 @pytest.mark.soak
 @pytest.mark.timeout(3600)
-def test_many_hours_of_pairs_leave_memory_and_latency_as_they_are(tmp_path, free_endpoint) -> None:
+def test_memory_and_latency_stay_constant_over_hours(tmp_path, free_endpoint) -> None:
     config = write_robot(tmp_path, free_endpoint, rows=WARM + (PARTS + 4) * PART, pairs_per_s=PAIRS_PER_S)
     looks = watched(config, free_endpoint())
     memory, latency = (np.array([getattr(each, name) for each in looks], dtype=float) for name in ("memory", "latency"))

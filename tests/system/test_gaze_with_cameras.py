@@ -226,27 +226,27 @@ def with_the_head_still(episode: Episode, q: FloatArray) -> FloatArray:
     return q
 
 
-def test_the_hand_stays_in_both_images_where_it_would_have_left_them(episode) -> None:
+def test_gaze_keeps_hand_in_both_images(episode) -> None:
     q = episode.gazing.q
     lost, without = (1.0 - in_view(episode.robot, poses).mean() for poses in (q, with_the_head_still(episode, q)))
     assert without > 0.2
     assert lost < 0.4 * without
 
 
-def test_pairs_are_made_where_a_head_that_stands_still_sees_nothing(episode) -> None:
+def test_moving_head_samples_beyond_fixed_view(episode) -> None:
     q = np.array([pair.q for pair in episode.gazing.pairs])
     unseen = ~in_view(episode.robot, with_the_head_still(episode, q))
     assert unseen.mean() > 0.1
     assert in_view(episode.robot, np.array([pair.q for pair in episode.without.pairs])).all()
 
 
-def test_pairs_agree_with_the_arm_while_the_head_turns(episode) -> None:
+def test_samples_stay_accurate_while_head_turns(episode) -> None:
     pairs = episode.gazing.pairs
     error = episode.robot.chain.positions(np.array([pair.q for pair in pairs])) - [pair.x for pair in pairs]
     assert np.median(np.linalg.norm(error, axis=1)) < 3e-3
 
 
-def test_the_head_stands_still_without_torque_until_a_person_asks(episode) -> None:
+def test_head_has_no_torque_until_asked(episode) -> None:
     assert np.ptp(episode.without.q[:, HEAD], axis=0).max() < 1e-9
     assert episode.without.torque == {(0, 0, 0, 0, 0, 0, 0)}
 
@@ -262,18 +262,18 @@ def test_the_head_keeps_its_speed(episode) -> None:
     assert np.degrees(np.abs(turned)).max() < 1.2 * SPEED_DEG_S
 
 
-def test_the_head_keeps_its_range_and_comes_to_its_end(episode) -> None:
+def test_head_reaches_but_respects_its_limits(episode) -> None:
     yaw = np.degrees(episode.gazing.q[:, 0])
     assert YAW_DEG[0] - 0.2 <= yaw.min() < YAW_DEG[0] + 1.0
     assert yaw.max() <= YAW_DEG[1] + 0.2
 
 
-def test_a_fault_of_the_head_ends_it_with_torque_off_and_is_told_once(episode) -> None:
+def test_head_fault_stops_torque_and_reports_once(episode) -> None:
     assert episode.failed.torque == {(0, 0, 0, 0, 0, 0, 0)}
     assert np.ptp(episode.failed.q[:, HEAD], axis=0).max() < 1e-9
     assert sum("gaze ended, torque off" in text for text in episode.failed.health) == 1
 
 
-def test_asked_again_it_begins_again_and_a_signal_ends_it_with_torque_off(episode) -> None:
+def test_gaze_restarts_and_signal_ends_without_torque(episode) -> None:
     assert episode.torque_again == (1, 1, 0, 0, 0, 0, 0)
     assert episode.torque_at_exit == (0, 0, 0, 0, 0, 0, 0)

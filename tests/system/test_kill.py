@@ -187,7 +187,7 @@ def expect_every_published_pair_in_the_store(aftermath: Aftermath) -> None:
     assert aftermath.published == [aftermath.stored[number - 1] for number in heard]
 
 
-def test_a_published_pair_is_in_the_store_as_it_was_published_and_comes_once(aftermath: Aftermath) -> None:
+def test_published_pair_is_stored_unchanged_and_once(aftermath: Aftermath) -> None:
     expect_every_published_pair_in_the_store(aftermath)
 
 
@@ -200,7 +200,7 @@ def test_a_killed_learner_learns_every_accepted_pair_once(aftermath: Aftermath) 
     expect_every_pair_learnt_once(aftermath)
 
 
-def test_no_kill_leaves_a_checkpoint_that_is_of_no_use(aftermath: Aftermath) -> None:
+def test_kills_always_leave_a_usable_checkpoint(aftermath: Aftermath) -> None:
     assert aftermath.unusable == []
 
 
@@ -219,9 +219,7 @@ def test_two_hundred_kills_lose_nothing(tmp_path: Path, free_endpoint, seed: int
 @pytest.mark.parametrize(
     ("point", "stored"), [("at the commit", 16), ("before the publication", 17), ("after the publication", 17)]
 )
-def test_a_sampler_killed_at_its_17th_pair_leaves_exactly_the_committed_ones(
-    tmp_path: Path, free_endpoint, point: str, stored: int
-) -> None:
+def test_killed_sampler_leaves_exactly_committed_pairs(tmp_path: Path, free_endpoint, point: str, stored: int) -> None:
     config = write_robot(tmp_path, free_endpoint, rows=40)
     with doomed(config, "sampler", Kill(point, 17, 0.0, False)) as child:
         assert child.wait(LIFE_LIMIT_S) == -9

@@ -133,7 +133,7 @@ def test_a_downgrade_is_refused_with_the_remedy(config: Config, monkeypatch) -> 
         pass
 
 
-def test_a_migration_that_cannot_be_finished_leaves_the_first_version(config: Config) -> None:
+def test_interrupted_migration_leaves_first_version(config: Config) -> None:
     with contextlib.closing(sqlite3.connect(config.store_file)) as connection:
         connection.execute("CREATE TABLE devices (somebody, elses)")
     with pytest.raises(StoreError), PairStore(config.store_file, session_of(config, SystemClock())):
@@ -141,7 +141,7 @@ def test_a_migration_that_cannot_be_finished_leaves_the_first_version(config: Co
     assert schema(config.store_file) == 1
 
 
-def test_the_first_version_s_pairs_are_backed_up_and_restored(config: Config, tmp_path: Path) -> None:
+def test_first_version_pairs_survive_backup_and_restore(config: Config, tmp_path: Path) -> None:
     write_backup(config, tmp_path / "arm.zip", utc="", version="0")
     with Backup(tmp_path / "arm.zip") as backup:
         restore(backup, tmp_path / "other" / "robot.toml")
@@ -157,12 +157,12 @@ def test_the_first_version_s_pairs_are_backed_up_and_restored(config: Config, tm
         (3, "cannot be understood: Object missing required field"),
     ],
 )
-def test_a_checkpoint_that_can_no_longer_be_read_says_why(version: int, said: str) -> None:
+def test_unreadable_old_checkpoint_says_why(version: int, said: str) -> None:
     with pytest.raises(CheckpointError, match=said):
         read_checkpoint(OLDER / f"learner_{version}.ckpt", robot="arm")
 
 
-def test_a_learner_with_an_older_checkpoint_keeps_it_and_learns_every_stored_pair_again(config: Config) -> None:
+def test_old_checkpoint_is_kept_and_store_relearnt(config: Config) -> None:
     shutil.copy(OLDER / "learner_1.ckpt", config.checkpoint_file)
     with running(config, "sampler"), running(config, "learner"):
         status = status_when(config, "learner", LearnerStatus, lambda status: status.pairs == PAIRS + ROWS)

@@ -79,7 +79,7 @@ def expect_numbers(config: Config, pairs: int) -> None:
         time.sleep(0.05)
 
 
-def test_a_stored_pair_that_cannot_be_is_refused_and_those_after_it_learnt(config) -> None:
+def test_impossible_stored_pair_is_refused(config) -> None:
     spoil(config, "cov", "[1e300,0,0,1e300,0,1e300]")
     with history(config), running(config, "learner"):
         status = learner_with(config, PAIRS)
@@ -88,7 +88,7 @@ def test_a_stored_pair_that_cannot_be_is_refused_and_those_after_it_learnt(confi
     assert any(f"pair {SPOILT} says that it may be 1e+150 m wrong" in text for text in status.health)
 
 
-def test_a_stored_row_that_is_no_pair_is_left_out_and_those_after_it_learnt(config) -> None:
+def test_malformed_stored_row_is_skipped(config) -> None:
     spoil(config, "x", "[null,0.2,1.0]")
     with history(config), running(config, "learner"):
         status = learner_with(config, PAIRS)
@@ -96,7 +96,7 @@ def test_a_stored_row_that_is_no_pair_is_left_out_and_those_after_it_learnt(conf
     assert (status.pairs, status.missed, status.refused) == (PAIRS - 1, 1, 0)
 
 
-def test_a_stored_pair_that_is_ten_metres_off_is_doubted(config) -> None:
+def test_stored_pair_ten_metres_off_is_outlier(config) -> None:
     spoil(config, "x", "[10.0,10.0,10.0]")
     with history(config), running(config, "learner"):
         status = learner_with(config, PAIRS)
@@ -104,7 +104,7 @@ def test_a_stored_pair_that_is_ten_metres_off_is_doubted(config) -> None:
     assert status.doubted >= 1
 
 
-def test_poison_on_the_wire_is_refused_and_the_true_pairs_learnt(config) -> None:
+def test_poisoned_messages_are_refused_and_valid_learnt(config) -> None:
     with PairReader(config.store_file) as store:
         pair = json.loads(encode(pair_to_wire(store.read(PAIRS)[0])))
     poison = [{**pair, "seq": PAIRS + 1, **wrong} for wrong in ({"x": [None, 0, 1]}, {"q": [1e300, 0.0]})]

@@ -139,9 +139,7 @@ def hundred(tmp_path_factory, free_endpoint, disk_shim) -> tuple[Config, list[Do
 
 
 @pytest.mark.soak
-def test_after_a_power_loss_accepted_pairs_are_there_and_the_checkpoint_is_the_old_or_the_new(
-    tmp_path, hundred
-) -> None:
+def test_power_loss_keeps_pairs_and_a_checkpoint(tmp_path, hundred) -> None:
     config, log = hundred
     happened = lose_power(config, tmp_path / "after", log, losses=12, seed=0)
     assert happened.torn > 2  # the losses were some
@@ -150,9 +148,7 @@ def test_after_a_power_loss_accepted_pairs_are_there_and_the_checkpoint_is_the_o
 @pytest.mark.soak
 @pytest.mark.timeout(3000)
 @pytest.mark.parametrize("seed", [1, 2])
-def test_two_thousand_power_losses_of_a_store_that_is_tidied_up_lose_nothing(
-    tmp_path, free_endpoint, disk_shim, seed
-) -> None:
+def test_power_losses_during_store_cleanup_lose_nothing(tmp_path, free_endpoint, disk_shim, seed) -> None:
     config, log = worked(tmp_path, free_endpoint, disk_shim, 1500)
     happened = lose_power(config, tmp_path / "after", log, losses=2000, seed=seed)
     assert happened.torn > 500

@@ -109,7 +109,7 @@ def log_of(config: Config) -> Path:
     return config.file.with_name("log")
 
 
-def test_a_router_is_ready_when_it_takes_connections_and_lives_until_it_is_told_to_end(
+def test_router_is_ready_when_it_accepts_connections(
     tmp_path: Path, systemd: Systemd, free_endpoint: Callable[[], str]
 ) -> None:
     pki, port = carried_out(tmp_path), free_endpoint().rpartition(":")[2]
@@ -124,7 +124,7 @@ def test_a_router_is_ready_when_it_takes_connections_and_lives_until_it_is_told_
         assert router.wait(LIMIT_S) == 0
 
 
-def test_a_sampler_is_ready_when_it_reads_stores_and_answers(config: Config, systemd: Systemd) -> None:
+def test_sampler_is_ready_when_reading_storing_answering(config: Config, systemd: Systemd) -> None:
     with started(config, systemd, "sampler"):
         systemd.wait_for("READY=1")
         with client(config.tables.zenoh.sampler) as bus:
@@ -134,7 +134,7 @@ def test_a_sampler_is_ready_when_it_reads_stores_and_answers(config: Config, sys
         assert systemd.heard[0] == "STATUS=opening encoders and cameras"
 
 
-def test_a_sampler_that_cannot_open_its_store_is_never_ready(config: Config, systemd: Systemd) -> None:
+def test_sampler_without_store_is_never_ready(config: Config, systemd: Systemd) -> None:
     config.state_dir.write_text("no folder")
     with started(config, systemd, "sampler") as child:
         assert child.wait(LIMIT_S) == 1
@@ -143,7 +143,7 @@ def test_a_sampler_that_cannot_open_its_store_is_never_ready(config: Config, sys
     assert "READY=1" not in systemd.heard
 
 
-def test_a_sampler_whose_port_is_taken_is_never_ready(config: Config, systemd: Systemd) -> None:
+def test_sampler_with_taken_port_is_never_ready(config: Config, systemd: Systemd) -> None:
     host, _, port = config.tables.zenoh.sampler.removeprefix("tcp/").rpartition(":")
     with socket.create_server((host, int(port))), started(config, systemd, "sampler") as child:
         assert child.wait(LIMIT_S) == 1
@@ -152,7 +152,7 @@ def test_a_sampler_whose_port_is_taken_is_never_ready(config: Config, systemd: S
     assert "READY=1" not in systemd.heard
 
 
-def test_a_learner_is_ready_when_it_answers_and_its_line_tells_how_it_is(config: Config, systemd: Systemd) -> None:
+def test_learner_is_ready_when_it_answers(config: Config, systemd: Systemd) -> None:
     with started(config, systemd, "learner") as child:
         systemd.wait_for("READY=1")
         with client(config.tables.zenoh.learner) as bus:
@@ -177,7 +177,7 @@ def test_each_loop_that_hangs_starves_the_watchdog_alone(config: Config, systemd
         systemd.wait_for("WATCHDOG=1")
 
 
-def test_the_loops_that_are_watched_are_those_that_can_hang_here() -> None:
+def test_every_loop_that_can_hang_is_watched() -> None:
     assert {loop for loops in LOOPS.values() for loop in loops} == set(WORK)
 
 
@@ -186,7 +186,7 @@ def pairs_of(config: Config) -> PairsReply:
         return decode(bus.ask_one(KEYS.pairs), PairsReply)
 
 
-def test_a_sampler_that_is_told_to_read_robot_toml_again_loses_no_frame(config: Config, systemd: Systemd) -> None:
+def test_reload_of_robot_toml_loses_no_frame(config: Config, systemd: Systemd) -> None:
     text = config.file.read_text()
     with started(config, systemd, "sampler") as child:
         systemd.wait_for("READY=1")
@@ -205,7 +205,7 @@ def test_a_sampler_that_is_told_to_read_robot_toml_again_loses_no_frame(config: 
     assert max(b - a for a, b in pairwise(t)) < 1.5 / PAIRS_PER_S  # every frame of the recording
 
 
-def test_a_sampler_goes_on_when_robot_toml_is_wrong(config: Config, systemd: Systemd) -> None:
+def test_sampler_survives_wrong_robot_toml_on_reload(config: Config, systemd: Systemd) -> None:
     with started(config, systemd, "sampler") as child:
         systemd.wait_for("READY=1")
         config.file.write_text(config.file.read_text().replace("any_step = true", "any_stop = true"))

@@ -106,7 +106,7 @@ def desk(network: Network, tmp_path_factory) -> Iterator[dict[str, Any]]:
 
 
 @pytest.mark.soak
-def test_pairs_of_the_robot_are_learnt_elsewhere_and_a_viewer_is_answered(desk: dict[str, Any]) -> None:
+def test_pairs_are_learnt_remotely_and_viewers_answered(desk: dict[str, Any]) -> None:
     assert (desk["predict"]["pairs"], desk["sampler"]["pairs"]) == (PAIRS, PAIRS)
 
 
@@ -114,7 +114,7 @@ def test_the_page_of_a_viewer_follows_both_processes(desk: dict[str, Any]) -> No
     assert desk["page"] == {"sampler": True, "learner": True}
 
 
-def test_a_viewer_may_give_no_command_and_an_operator_may(desk: dict[str, Any]) -> None:
+def test_only_operators_may_give_commands(desk: dict[str, Any]) -> None:
     assert "certificate or name has no role" in desk["viewer's command"]["error"]
     assert desk["operator's command"]["command"] == "pause"
 

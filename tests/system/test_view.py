@@ -213,7 +213,7 @@ def test_pause_and_resume_are_one_button(page) -> None:
     says(page, "#pill-sampler", "running")
 
 
-def test_a_changed_tool_is_asked_for_twice_and_then_marked(page) -> None:
+def test_tool_change_is_confirmed_and_marked(page) -> None:
     says(page, "#error-text", "pairs")
     page.click("#tool")
     page.keyboard.press("Escape")
@@ -238,7 +238,7 @@ def test_a_diagnosis_is_begun_and_stopped_by_buttons(page) -> None:
     expect(page.locator("#diagnose")).to_be_enabled()
 
 
-def test_a_learner_that_is_silent_is_named_and_the_page_goes_on_when_it_is_back(page, running: Running) -> None:
+def test_page_names_silent_learner_and_resumes(page, running: Running) -> None:
     says(page, "#pill-learner", "learning")
     os.kill(running.learner, signal.SIGSTOP)
     try:
@@ -282,7 +282,7 @@ def test_everything_is_reached_with_the_keyboard_alone(drawn) -> None:
 
 
 @pytest.mark.parametrize(("size", "scheme"), [("desktop", "light"), ("phone", "dark")])
-def test_nothing_is_wider_than_the_screen_and_all_text_can_be_read(page, size: str, scheme: str) -> None:
+def test_page_fits_screen_with_readable_text(page, size: str, scheme: str) -> None:
     page.set_viewport_size(SIZES[size])
     page.emulate_media(color_scheme=scheme)
     says(page, "#cloud-text", "median")
@@ -327,7 +327,7 @@ def test_before_its_first_documents_the_page_waits(page) -> None:
     assert not any("does not answer" in words for words, _ in said)
 
 
-def test_a_page_s_server_that_ends_is_named_and_comes_back_by_itself(page, server: PageServer, complaints) -> None:
+def test_page_names_ended_server_and_reconnects(page, server: PageServer, complaints) -> None:
     says(page, "#pill-learner", "learning")
     server.end()
     says(page, "#notices", "The page's server does not answer")

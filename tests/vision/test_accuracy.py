@@ -55,7 +55,7 @@ def errors() -> Errors:
     return pooled(frames=12, seed=1)
 
 
-def test_the_claimed_sigma_covers_60_to_75_percent_of_the_errors_on_each_axis(errors):
+def test_sigma_covers_60_to_75_percent_per_axis(errors):
     covered = errors.covered()
     # 72 frames: a standard error is 0.06.
     assert (covered >= 0.60 - 0.06).all(), covered
@@ -66,7 +66,7 @@ def test_two_claimed_sigmas_cover_nine_errors_in_ten(errors):
     assert (errors.covered(2.0) >= 0.88).all(), errors.covered(2.0)
 
 
-def test_half_of_all_centres_are_within_a_thirtieth_of_a_pixel(errors):
+def test_median_centre_error_is_below_a_thirtieth_pixel(errors):
     assert np.median(np.abs(errors.centres_px)) < 1 / 30
 
 
@@ -75,13 +75,13 @@ def test_the_centres_have_no_bias(errors):
     assert np.abs(medians).max() < 0.01, medians
 
 
-def test_a_ball_in_full_view_is_found_nearly_always(errors):
+def test_ball_in_full_view_is_nearly_always_found(errors):
     # 45 of 1200 others are missed; at a rate of 4 % there are more than this once in a thousand times.
     most = successes(1.0 - 1e-3, len(errors.x) + len(errors.misses), 0.04)
     assert len(errors.misses) <= most, errors.misses
 
 
-def test_a_phone_s_images_show_the_ball_as_surely_as_claimed():
+def test_phone_image_errors_stay_within_claimed_sigma():
     found = measure_errors(SMALL, PHONE, 5, seed=3)
     assert len(found.misses) <= 2, found.misses
     assert (np.abs(found.x) < 4.0 * found.sigma).all()
@@ -107,7 +107,7 @@ def carpet(rng: np.random.Generator) -> FloatArray:
     return np.clip((1.0 + 0.6 * grain / grain.std())[..., None] * np.array([0.1, 0.32, 0.25]), 0.0, 1.0)
 
 
-def test_a_bar_behind_the_ball_along_its_limb_hardly_pulls_its_centre():
+def test_bar_along_limb_hardly_pulls_the_centre():
     x = np.array([0.01, 0.0, SMALL.focal_px * RADIUS_M / 12.0])
     u = SMALL.project(x)[0]
     pictures = np.full((2, *SMALL.image_size_px[::-1], 3), 0.6)
@@ -124,7 +124,7 @@ def test_a_bar_behind_the_ball_along_its_limb_hardly_pulls_its_centre():
     assert abs(np.mean(off_px)) < 0.05, off_px
 
 
-def test_the_evenness_of_a_limb_is_the_share_of_its_rays_that_carry_it():
+def test_limb_evenness_is_share_of_carrying_rays():
     rays = np.zeros((8, 3))
     for carrying in (2, 4, 8):
         weight = np.where(np.arange(8) < carrying, 50.0, 0.0)
@@ -136,7 +136,7 @@ def test_more_image_noise_makes_the_claimed_sigma_larger():
     assert np.median(loud) > 1.5 * np.median(quiet)
 
 
-def test_the_pixel_sigma_of_the_calibration_adds_to_the_covariance():
+def test_calibration_pixel_sigma_adds_to_covariance():
     rng = np.random.default_rng(3)
     pictures = clutter(rng, SMALL.image_size_px), clutter(rng, SMALL.image_size_px)
     frame = render_pair(np.array([0.02, 0.0, 0.8]), RADIUS_M, Look(), pictures, rng, SMALL)
@@ -148,7 +148,7 @@ def test_the_pixel_sigma_of_the_calibration_adds_to_the_covariance():
     assert added == pytest.approx((0.3 / np.sqrt(2) * 0.8 / SMALL.focal_px) ** 2, rel=0.02)
 
 
-def test_the_centre_of_a_large_ball_far_off_axis_is_the_sphere_s_not_the_ellipse_s():
+def test_off_axis_centre_is_sphere_s_not_ellipse_s():
     rng = np.random.default_rng(5)
     wall = np.full((480, 640, 3), 0.5)
     x = np.array([0.12, 0.085, 0.28])
@@ -171,7 +171,7 @@ def many_errors() -> dict[str, Errors]:
 @pytest.mark.soak
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("name", LOOKS)
-def test_the_claimed_sigma_covers_60_to_75_percent_in_every_kind_of_image(many_errors, name):
+def test_sigma_covers_60_to_75_percent_per_look(many_errors, name):
     covered = many_errors[name].covered()
     # Of 1000 fixes a standard error is 0.014.
     assert ((covered >= 0.60 - 0.014) & (covered <= 0.75 + 0.014)).all(), covered
@@ -179,7 +179,7 @@ def test_the_claimed_sigma_covers_60_to_75_percent_in_every_kind_of_image(many_e
 
 @pytest.mark.soak
 @pytest.mark.timeout(3600)
-def test_the_claimed_sigma_covers_65_to_71_percent_over_all_kinds_of_images(many_errors):
+def test_sigma_covers_65_to_71_percent_overall(many_errors):
     together = joined(many_errors.values())
     report("all together", together)
     # Of 5900 fixes a standard error is 0.006.
@@ -187,14 +187,14 @@ def test_the_claimed_sigma_covers_65_to_71_percent_over_all_kinds_of_images(many
 
 
 @pytest.mark.soak
-def test_before_an_even_wall_the_claim_is_not_too_small():
+def test_claimed_sigma_is_large_enough_before_even_wall():
     found = measure_errors(VGA, Look(noise_sd=1.0, wall=0.5), 300, 300)
     report("even wall", found)
     assert (found.covered() >= 0.60).all(), found.covered()
 
 
 @pytest.mark.soak
-def test_before_black_most_centres_stay_within_a_tenth_of_a_pixel():
+def test_median_centre_before_black_stays_within_tenth_pixel():
     found = measure_errors(VGA, Look(wall=0.02), 300, 400)
     report("black wall", found)
     assert np.median(np.abs(found.centres_px)) < 0.1
@@ -217,20 +217,20 @@ def errors_on_bullet_images(calibration: StereoCalibration, frames: int, seed: i
 
 
 @pytest.mark.soak
-def test_the_simulator_s_pixels_are_where_the_tracker_expects_them():
+def test_simulator_pixel_convention_matches_the_tracker():
     bullet_errors = errors_on_bullet_images(SMALL, frames=20, seed=2)
     # Half a pixel would be the renderer's own convention.
     assert np.abs(np.median(bullet_errors.centres_px, axis=0)).max() < 0.05
 
 
-def test_the_ball_is_found_in_nearly_all_images_of_the_simulator_s_renderer():
+def test_ball_is_found_in_nearly_all_simulator_images():
     found = errors_on_bullet_images(SMALL, frames=8, seed=2)
     assert len(found.misses) <= 1, found.misses
 
 
 @pytest.mark.soak
 @pytest.mark.timeout(3600)
-def test_many_images_of_the_simulator_s_renderer_have_fixes_and_claims_that_hold():
+def test_claimed_sigma_holds_over_many_simulator_images():
     found = errors_on_bullet_images(VGA, frames=1000, seed=200)
     report("bullet", found)
     covered = found.covered()

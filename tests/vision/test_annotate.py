@@ -37,12 +37,12 @@ def disc(bgr: tuple[int, int, int]) -> np.ndarray:
         (VisionConfig(marker="tag"), (30, 30, 200), 0),
     ],
 )
-def test_what_is_marked_is_of_the_marker_that_is_looked_for(config, bgr, seen) -> None:
+def test_only_the_configured_marker_is_annotated(config, bgr, seen) -> None:
     assert len(Annotator(CAMERAS, config).sights(disc(bgr))) == seen
 
 
 @pytest.mark.parametrize(("marker", "circled"), [("tag", False), ("ball", True)])
-def test_a_ball_is_circled_and_a_tag_is_not(marker, circled) -> None:
+def test_ball_is_circled_and_tag_is_not(marker, circled) -> None:
     grey = np.full((240, 320, 3), 40, dtype=np.uint8)
     fix = MarkerFix(t=0.0, x=np.array([0.0, 0.0, 0.5]), cov=1e-8 * np.eye(3), centres_px=(160.0, 120.0, 100.0, 120.0))
     above = AT[1] - round(700.0 * VisionConfig().radius_m / 0.5) - 2
@@ -67,14 +67,14 @@ def has(picture: np.ndarray, colour: tuple[int, int, int]) -> bool:
     return bool((np.abs(picture.astype(int) - colour).max(axis=2) < 12).any())
 
 
-def test_a_tag_that_was_found_is_outlined_where_the_fix_has_it() -> None:
+def test_found_tag_is_outlined_at_its_fix() -> None:
     picture, fix = shown((3,), wanted=3)
     assert fix is not None
     corner = SMALL.project(np.array([-0.04, -0.02, 0.5]))[:2].round().astype(int) - (0, 30)
     assert has(picture[corner[1] - 3 : corner[1] + 4, corner[0] - 3 : corner[0] + 4], GREEN)
 
 
-def test_a_tag_that_nobody_looks_for_is_outlined_in_red() -> None:
+def test_unwanted_tag_is_outlined_in_red() -> None:
     picture, fix = shown((7,), wanted=3)
     assert fix is None
     assert has(picture, RED)

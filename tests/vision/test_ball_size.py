@@ -41,12 +41,12 @@ def size_after(fixes: int, radius_m: float = RADIUS_M) -> BallSize:
     return size
 
 
-def test_a_size_that_fits_leaves_the_claim_as_it_is() -> None:
+def test_matching_size_leaves_covariance_unchanged() -> None:
     found = located()
     assert size_after(5).doubted(found) is found
 
 
-def test_what_makes_both_eyes_see_a_smaller_ball_makes_their_centres_as_unsure() -> None:
+def test_size_mismatch_in_both_eyes_inflates_centre_covariance() -> None:
     found = located(smaller=0.04, pulled_px=0.5)
     doubted = size_after(5).doubted(found)
     off = doubted.x - X
@@ -54,7 +54,7 @@ def test_what_makes_both_eyes_see_a_smaller_ball_makes_their_centres_as_unsure()
     assert off @ np.linalg.solve(doubted.cov, off) < 2.0**2
 
 
-def test_the_first_fix_is_held_against_the_configured_radius() -> None:
+def test_first_fix_is_checked_against_configured_radius() -> None:
     found = located(smaller=0.1, pulled_px=0.5)
     assert BallSize(SMALL).doubted(found).cov[1, 1] > 100.0 * found.cov[1, 1]
 
@@ -66,13 +66,13 @@ def test_a_radius_that_was_measured_badly_is_learnt() -> None:
     assert size_after(3, wrong_m).doubted(found) is found
 
 
-def test_a_fix_of_another_size_hardly_changes_what_is_known() -> None:
+def test_outlier_size_does_not_disturb_learnt_size() -> None:
     size = size_after(10)
     size.learn(located(smaller=0.2))
     assert size.doubted(located()).cov[2, 2] == located().cov[2, 2]
 
 
-def test_a_ball_of_another_size_in_the_marker_s_place_is_refused_and_the_marker_found_again() -> None:
+def test_swapped_in_other_size_is_refused_marker_refound() -> None:
     marker, tracker = Ball((0.02, 0.01, 0.8)), StereoTracker(SMALL)
     other = replace(marker, radius_m=0.85 * RADIUS_M)
     for number in range(6):
@@ -81,7 +81,7 @@ def test_a_ball_of_another_size_in_the_marker_s_place_is_refused_and_the_marker_
     assert isinstance(tracker.track(stage(marker, t=7 * FRAME_S)), MarkerFix)
 
 
-def test_a_tracker_told_to_forget_takes_a_ball_of_another_size() -> None:
+def test_tracker_accepts_another_ball_size_after_forgetting() -> None:
     marker, tracker = Ball((0.02, 0.01, 0.8)), StereoTracker(SMALL)
     for number in range(6):
         tracker.track(stage(marker, t=number * FRAME_S, seed=number))

@@ -33,7 +33,7 @@ BOARDS = [Board(), Board(7, 5, 0.025, dictionary="6X6_250"), Board(10, 7, 0.020,
         *(pytest.param(board, svg, from_svg, marks=pytest.mark.soak) for board in BOARDS[1:]),
     ],
 )
-def test_squares_on_the_page_are_of_the_size_that_was_asked_for(board, write, read) -> None:
+def test_printed_squares_have_the_requested_size(board, write, read) -> None:
     drawn = page(board)
     image = rasterised(*read(write(drawn)))
     found = BoardDetector(board).find(cv2.GaussianBlur(image, (0, 0), 1.0))
@@ -53,7 +53,7 @@ def test_rulers_are_as_long_as_the_page_says(write, read) -> None:
     assert "this line is 240 mm, the upright one 180 mm" in words
 
 
-def test_nothing_on_the_page_is_nearer_to_its_edge_than_printers_print() -> None:
+def test_page_content_stays_inside_printer_margins() -> None:
     for board in BOARDS:
         (width, height), black = from_pdf(pdf(page(board)))
         assert black[:, :2].min() >= 5.0
@@ -78,7 +78,7 @@ def test_the_file_is_a_whole_pdf() -> None:
     assert int(length) == len(stream)
 
 
-def test_a_board_too_large_for_the_paper_is_refused_with_what_fits() -> None:
+def test_oversized_board_is_refused_with_fitting_square_size() -> None:
     with pytest.raises(ConfigError, match=r"do not fit on A4. There is room for squares of 3\d"):
         page(Board(8, 6, 0.040))
 
@@ -111,7 +111,7 @@ def shown(taken: Taken, printed: Printed | None = None, turned: float = 0.2) -> 
     return photographer.left(*pose), photographer.corners(*pose)[0]
 
 
-def test_corners_are_found_to_a_few_hundredths_of_a_pixel() -> None:
+def test_corners_are_found_to_hundredths_of_a_pixel() -> None:
     rig, pairs, shown_at = photographed(count=4)
     photographer = Photographer(rig, Printed(), Taken(), np.random.default_rng(0))
     errors = []
@@ -126,7 +126,7 @@ def test_corners_are_found_to_a_few_hundredths_of_a_pixel() -> None:
 
 
 @pytest.mark.parametrize("turned", [2.9, *(pytest.param(turned, marks=pytest.mark.soak) for turned in (0.2, -1.5))])
-def test_a_plain_chessboards_corners_are_in_one_order_however_it_is_turned(turned) -> None:
+def test_chessboard_corner_order_is_independent_of_rotation(turned) -> None:
     rng = np.random.default_rng(3)
     rig = webcams(rng)
     printed = Printed(8, 5, 0.025, dictionary=None)
@@ -221,6 +221,6 @@ def test_a_plain_chessboard_of_other_squares_is_named(board, said) -> None:
     assert said in fault(small(Printed(8, 5, 0.025, dictionary=None)), board).text
 
 
-def test_an_image_without_a_board_says_so() -> None:
+def test_image_without_board_reports_not_found() -> None:
     noise = np.random.default_rng(0).integers(60, 190, (240, 320, 3), dtype=np.uint8)
     assert fault(noise).why == "not_found"

@@ -73,7 +73,7 @@ def test_intervals_cover_over_many_rigs() -> None:
 
 
 @pytest.mark.soak
-def test_intervals_cover_where_corners_of_a_view_move_together() -> None:
+def test_intervals_cover_correlated_corners_within_views() -> None:
     misses = []
     for seed in range(2):
         rng = np.random.default_rng(40 + seed)
@@ -83,7 +83,7 @@ def test_intervals_cover_where_corners_of_a_view_move_together() -> None:
     assert np.mean(np.abs(np.concatenate(misses)) < 2.0) > 0.85
 
 
-def test_a_view_left_out_changes_the_weights_of_others_too() -> None:
+def test_baseline_sigma_matches_jackknife_over_views() -> None:
     rng = np.random.default_rng(0)
     moved = np.linspace(0.0, 0.4, 14)[:, None] * rng.standard_normal((14, 2))  # [px], between the two images
     views = [
@@ -138,14 +138,14 @@ def test_views_of_one_eye_alone_count_too(planted) -> None:
 
 
 @pytest.mark.parametrize("fisheye", [pytest.param(False, marks=pytest.mark.soak), True])
-def test_the_lens_model_is_chosen_that_foretells_views_better(fisheye) -> None:
+def test_better_predicting_lens_model_is_chosen(fisheye) -> None:
     rng = np.random.default_rng(4)
     rig = webcams(rng, fisheye=fisheye)
     found = calibrate(corner_views(rig, rng, 9), BOARD, ASKED)
     assert found.rig.model == ("fisheye" if fisheye else "pinhole")
 
 
-def test_a_model_that_folds_the_image_over_is_refused(planted, monkeypatch) -> None:
+def test_folding_lens_model_is_refused(planted, monkeypatch) -> None:
     monkeypatch.setattr(Lens, "is_one_to_one", lambda lens, _: False)
     with pytest.raises(CalibrationError, match="the pinhole model folds over within the image"):
         fit(planted[1][:9], BOARD.corners_m, SIZE, "pinhole")
@@ -164,7 +164,7 @@ def test_a_model_that_is_refused_leaves_the_others(planted, monkeypatch) -> None
     assert "pinhole lenses do not fit: it folds over" in told
 
 
-def test_a_lens_that_far_views_let_fold_over_is_kept_from_it(planted) -> None:
+def test_prior_keeps_lens_of_far_views_from_folding(planted) -> None:
     rig, rng = planted[0], np.random.default_rng(1)
     photographer = Photographer(rig, Printed(), Taken(), rng)
     far = []
@@ -178,14 +178,14 @@ def test_a_lens_that_far_views_let_fold_over_is_kept_from_it(planted) -> None:
     assert np.linalg.norm(bundle.vector[-3:]) == pytest.approx(rig.baseline_m, rel=0.02)
 
 
-def test_the_held_out_error_is_that_of_new_views(planted) -> None:
+def test_held_out_error_matches_noise_of_new_views(planted) -> None:
     _, views = planted
     found = fit(views, BOARD.corners_m, SIZE, "pinhole")
     assert found.held_out.rms_px == pytest.approx(NOISE_PX, rel=0.1)
     assert found.held_out.rms_px > found.bundle.sigma_px
 
 
-def test_a_view_that_moved_between_the_eyes_is_left_out_and_named(planted) -> None:
+def test_view_moved_between_eyes_is_left_out(planted) -> None:
     _, views = planted
     moved = replace(views[6], right=replace(views[6].right, px=views[6].right.px + np.array([2.5, 0.5])))
     found = fit([*views[:6], moved, *views[7:]], BOARD.corners_m, SIZE, "pinhole")
@@ -193,7 +193,7 @@ def test_a_view_that_moved_between_the_eyes_is_left_out_and_named(planted) -> No
     assert found.left_out[0].rms_px > 5 * found.left_out[0].usual_px
 
 
-def test_a_corner_that_was_mistaken_is_left_out_and_its_view_kept(planted) -> None:
+def test_outlier_corner_is_left_out_keeping_its_view(planted) -> None:
     _, views = planted
     px = views[6].right.px.copy()
     px[3] += np.array([1.0, 0.6])
@@ -216,7 +216,7 @@ def test_views_that_were_found_less_exactly_count_less(planted) -> None:
     assert 8.0 < good / poor < 24.0
 
 
-def test_a_board_of_unsure_size_makes_the_baseline_as_unsure(planted) -> None:
+def test_board_size_uncertainty_carries_over_to_baseline(planted) -> None:
     _, views = planted
     sure, unsure = (calibrate(views, BOARD, replace(PINHOLE, scale_sigma=each)).rig for each in (0.0, 0.002))
     expected = np.hypot(sure.baseline_sigma_m, 0.002 * sure.baseline_m)
@@ -256,7 +256,7 @@ def test_views_that_all_face_the_cameras_are_named(planted) -> None:
     assert "the board faces the cameras in all views" in refusal(frontal)
 
 
-def test_parts_of_the_image_that_the_board_never_was_in_are_named(planted) -> None:
+def test_uncovered_image_regions_are_named(planted) -> None:
     rig, _ = planted
     rng = np.random.default_rng(1)
     photographer = Photographer(rig, Printed(), Taken(), rng)
@@ -268,7 +268,7 @@ def test_parts_of_the_image_that_the_board_never_was_in_are_named(planted) -> No
     assert re.search(r"these parts of the left image: .*lower right", said)
 
 
-def test_a_board_printed_at_97_percent_is_contradicted_by_the_baseline_measured_by_hand(planted) -> None:
+def test_shrunken_board_is_contradicted_by_measured_baseline(planted) -> None:
     rig, _ = planted
     rng = np.random.default_rng(3)
     small = Printed(square_m=0.97 * 0.030)
@@ -279,7 +279,7 @@ def test_a_board_printed_at_97_percent_is_contradicted_by_the_baseline_measured_
     assert calibrate(views, replace(BOARD, square_m=0.97 * 0.030), by_hand).rig.made.views == 12
 
 
-def test_noise_of_pixels_is_refused_by_the_held_out_error(planted) -> None:
+def test_excessive_pixel_noise_fails_held_out_error_check(planted) -> None:
     rig, _ = planted
     views = corner_views(rig, np.random.default_rng(5), 9, noise_px=1.5)
     assert re.search(r"views that were not fitted are off by 1\.\d+ px, 0.96 px is the most", refusal(views))
@@ -292,14 +292,14 @@ def test_eyes_of_different_resolutions_are_named() -> None:
         gathered([smaller], BOARD)
 
 
-def test_when_no_image_can_be_used_the_usual_reason_is_said() -> None:
+def test_unusable_images_error_gives_most_common_reason() -> None:
     black = np.zeros((120, 160, 3), np.uint8)
     found = gathered([ImagePair(str(k), black, black) for k in range(3)], BOARD)
     with pytest.raises(CalibrationError, match=r"6 of 6: the image is black. Take the lens cap off"):
         require_both(found)
 
 
-def test_an_eye_that_never_sees_the_board_is_named_with_the_reason() -> None:
+def test_eye_never_seeing_board_is_named_with_reason() -> None:
     _, pairs, _ = photographed(count=3)
     found = gathered([ImagePair(pair.name, pair.left, np.zeros_like(pair.right)) for pair in pairs[:3]], BOARD)
     with pytest.raises(CalibrationError, match=r"no right image .*; 3 of 3: the image is black. Take the lens cap off"):
@@ -307,7 +307,7 @@ def test_an_eye_that_never_sees_the_board_is_named_with_the_reason() -> None:
 
 
 @pytest.mark.soak  # of the command: tests/cli/test_cameras_command.py
-def test_three_pairs_of_another_board_are_enough_to_say_so() -> None:
+def test_three_pairs_suffice_to_report_another_board() -> None:
     _, pairs, _ = photographed(count=6)
     taken: list[str] = []
 
@@ -322,14 +322,14 @@ def test_three_pairs_of_another_board_are_enough_to_say_so() -> None:
         require_both(found)
 
 
-def test_how_far_the_search_for_the_board_is_shows_as_it_goes() -> None:
+def test_board_search_reports_progress() -> None:
     black = np.zeros((120, 160), np.uint8)
     told: list[str] = []
     gathered([ImagePair(str(k), black, black) for k in range(20)], BOARD, told.append)
     assert told[:2] == ["10 pairs looked at; the board is in 0", "20 pairs looked at; the board is in 0"]
 
 
-def test_images_with_the_same_fault_are_told_in_one_line() -> None:
+def test_images_with_same_fault_share_one_line() -> None:
     blurred = NotFound("blurred", "the sharpest edge has 3.7 px"), NotFound("blurred", "the sharpest edge has 2.9 px")
     unusable = [Unusable(f"{k:02d}", "left", blurred[k == 2]) for k in range(6)]
     unusable.append(Unusable("03", "right", NotFound("not_found", "no board")))
@@ -352,7 +352,7 @@ def test_nothing_is_missing_of_a_careful_persons_views(planted) -> None:
     ("axis", "said"),
     [([0, 1, 0], "right edge"), ([0, -1, 0], "left edge"), ([1, 0, 0], "upper edge"), ([-1, 0, 0], "lower edge")],
 )
-def test_a_tilt_that_was_shown_is_not_asked_for_again(planted, axis, said) -> None:
+def test_shown_tilt_is_not_requested_again(planted, axis, said) -> None:
     rig, _ = planted
     rng = np.random.default_rng(1)
     photographer = Photographer(rig, Printed(), Taken(), rng)
@@ -366,7 +366,7 @@ def test_a_tilt_that_was_shown_is_not_asked_for_again(planted, axis, said) -> No
     assert not any(said in wish for wish in wishes)
 
 
-def test_equations_whose_poses_explain_more_than_all_have_no_step() -> None:
+def test_indefinite_normal_equations_have_no_step() -> None:
     normal, mixed = np.full((1, 1), 1e10), np.full((1, 1, POSE), 1e10)
     poses = 1e10 * np.eye(POSE)[None]
     at = Linear(
@@ -384,7 +384,7 @@ def test_equations_whose_poses_explain_more_than_all_have_no_step() -> None:
     assert at.step(0.0) is None
 
 
-def test_a_fit_whose_equations_have_no_solution_is_refused() -> None:
+def test_fit_with_unsolvable_equations_is_refused() -> None:
     rng = np.random.default_rng(0)
     found = fit(corner_views(webcams(rng), rng, 14), BOARD.corners_m, SIZE, "pinhole")
     nowhere = replace(found.bundle, normal=-found.bundle.normal)

@@ -65,12 +65,12 @@ def two(left: str = BY_ID, right: str = "/dev/v4l/by-path/b") -> dict[str, objec
         ({"videos": {"side_by_side": "c", "fps": 1.0, "times": "t"}}, "times have to come from one thing"),
     ],
 )
-def test_a_table_that_cannot_be_meant_is_refused_with_a_remedy(table, message) -> None:
+def test_contradictory_cameras_table_is_refused_with_remedy(table, message) -> None:
     with pytest.raises(ConfigError, match=message):
         msgspec.convert(table, CamerasConfig).check(FILE, "")
 
 
-def test_the_uncertainty_of_an_unmeasured_latency_is_declared_for_devices_only() -> None:
+def test_default_latency_uncertainty_applies_to_devices_only() -> None:
     images = {"images": {"left": "a", "right": "b", "fps": 1.0}}
     assert msgspec.convert(two(), CamerasConfig).sigma_s > 0.01
     assert msgspec.convert({**two(), "latency_sigma_s": 0.001}, CamerasConfig).sigma_s == 0.001
@@ -92,7 +92,7 @@ def test_believable_stamps_are_taken_once_some_were_seen() -> None:
 
 
 @pytest.mark.parametrize("kernel", [lambda k: 0.0, lambda k: 1.7e9 + k, lambda k: 5.0, lambda k: 1.2 + k])
-def test_zero_wall_clock_standing_or_future_stamps_give_way_to_the_arrival(kernel) -> None:
+def test_implausible_kernel_timestamps_are_replaced_by_arrival_time(kernel) -> None:
     stamps, times = stamped([(kernel(k), 1.03 + k) for k in range(5)])
     assert stamps.source == "arrival"
     assert times[-1] == 5.03
@@ -116,7 +116,7 @@ def shots(pairing: Pairing, stream: list[tuple[float, int]]) -> list[tuple[float
 
 
 @given(phase=st.floats(0, 1), jitter=st.lists(st.floats(-0.04, 0.04), min_size=80, max_size=80), late=st.floats(0, 0.3))
-def test_free_running_cameras_give_each_image_once_within_the_longest_distance(phase, jitter, late) -> None:
+def test_free_running_images_are_paired_once_within_limit(phase, jitter, late) -> None:
     stream = [(k + jitter[k], 0) for k in range(40)] + [(k + phase + jitter[40 + k], 1) for k in range(40)]
     pairs = shots(Pairing(0.6), stream)
     assert len(pairs) >= 37
@@ -124,7 +124,7 @@ def test_free_running_cameras_give_each_image_once_within_the_longest_distance(p
     assert all(len({pair[eye] for pair in pairs}) == len(pairs) for eye in (0, 1))
 
 
-def test_images_too_far_apart_make_no_pair_and_are_counted() -> None:
+def test_images_too_far_apart_are_counted_not_paired() -> None:
     pairing = Pairing(0.1)
     assert shots(pairing, [(k, 0) for k in range(10)] + [(k + 0.4, 1) for k in range(10)]) == []
     assert pairing.too_far > 5
@@ -140,7 +140,7 @@ def test_an_image_is_black_white_or_fine(level, words) -> None:
     assert said is None if words is None else words in str(said)
 
 
-def test_a_white_wall_in_a_corner_is_no_over_exposure() -> None:
+def test_white_wall_in_corner_is_not_over_exposure() -> None:
     image = np.full((120, 160, 3), 128, np.uint8)
     image[:50, :60] = 255
     assert of_image(image, "left camera") is None
@@ -149,7 +149,7 @@ def test_a_white_wall_in_a_corner_is_no_over_exposure() -> None:
 # --- which camera
 
 
-def test_the_serial_number_is_that_of_the_usb_device(tmp_path) -> None:
+def test_serial_number_comes_from_usb_device(tmp_path) -> None:
     device = tmp_path / "sys/devices/usb1/1-2/1-2:1.0"
     device.mkdir(parents=True)
     (device.parent / "serial").write_text("46D3A1\n")
@@ -160,11 +160,11 @@ def test_the_serial_number_is_that_of_the_usb_device(tmp_path) -> None:
     assert serial_of(str(tmp_path / "video0"), tmp_path) == "46D3A1"
 
 
-def test_without_a_serial_number_the_name_tells_cameras_apart() -> None:
+def test_missing_serial_number_falls_back_to_device_name() -> None:
     assert serial_of("/dev/v4l/by-id/usb-Cam_A-video-index0") == "usb-Cam_A"
 
 
-def test_a_camera_is_listed_once_by_its_better_name(tmp_path) -> None:
+def test_camera_is_listed_once_by_better_name(tmp_path) -> None:
     for folder in ("by-id", "by-path"):
         (tmp_path / "dev/v4l" / folder).mkdir(parents=True)
     for number, names in enumerate([("by-id/usb-A", "by-path/pci-1"), ("by-path/pci-2",)]):
@@ -190,7 +190,7 @@ def test_numbers_in_names_count_as_numbers(tmp_path) -> None:
     assert [int(roll.next()[0].mean()) for _ in range(2)] == [0, 10]
 
 
-def test_names_in_nanoseconds_keep_their_digits_and_tell_how_far_apart_the_eyes_are(tmp_path) -> None:
+def test_nanosecond_names_give_exact_times_and_eye_offset(tmp_path) -> None:
     write_images(tmp_path, [f"{eye}_{n}.png" for n in (1403636579763555584, 1403636579813555456) for eye in "l"])
     write_images(tmp_path, [f"{eye}_{n}.png" for n in (1403636579764555584, 1403636579814555456) for eye in "r"])
     roll = ImageRoll(ImagesConfig(left="l_*.png", right="r_*.png", name_ticks_per_s=1e9), tmp_path)
@@ -198,7 +198,7 @@ def test_names_in_nanoseconds_keep_their_digits_and_tell_how_far_apart_the_eyes_
     assert roll.t_sigma == pytest.approx([1e-3, 1e-3], abs=1e-9)
 
 
-def test_as_many_images_of_each_eye_are_asked_for(tmp_path) -> None:
+def test_unequal_image_counts_are_refused(tmp_path) -> None:
     write_images(tmp_path, ["l_1.png", "l_2.png", "r_1.png"])
     with pytest.raises(ConfigError, match=r"l_\*.png are 2 images, r_\*.png are 1"):
         ImageRoll(ImagesConfig(left="l_*.png", right="r_*.png", fps=2.0), tmp_path)
@@ -214,14 +214,14 @@ def test_eyes_of_different_sizes_are_refused(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"), [("0.1\n", "has 1 times for 2"), ("0.2\n0.1\n", "time 2 is not later"), ("a\nb\n", "cannot")]
 )
-def test_times_that_do_not_fit_the_images_are_refused(tmp_path, text, message) -> None:
+def test_times_not_fitting_the_images_are_refused(tmp_path, text, message) -> None:
     write_images(tmp_path, ["l_1.png", "l_2.png", "r_1.png", "r_2.png"])
     (tmp_path / "times.txt").write_text(text)
     with pytest.raises(ConfigError, match=message):
         ImageRoll(ImagesConfig(left="l_*.png", right="r_*.png", times="times.txt"), tmp_path)
 
 
-def test_a_film_in_its_own_time_skips_what_nobody_asked_for(tmp_path) -> None:
+def test_real_time_film_skips_unread_frames(tmp_path) -> None:
     write_images(tmp_path, [f"{eye}_{k}.png" for eye in "lr" for k in range(10)])
     clock = HandClock()
     table = {"images": {"left": "l_*.png", "right": "r_*.png", "fps": 10.0}, "latency_s": 0.02}
@@ -236,14 +236,14 @@ def test_a_film_in_its_own_time_skips_what_nobody_asked_for(tmp_path) -> None:
     assert film.dropped == 3
 
 
-def test_a_film_that_is_shorter_than_it_says_is_found_when_it_is_opened(tmp_path) -> None:
+def test_unreadable_film_is_refused_on_opening(tmp_path) -> None:
     (tmp_path / "l.avi").write_bytes(b"RIFF")
     config = CamerasConfig(videos=VideosConfig(left="l.avi", right="l.avi"))
     with pytest.raises(ConfigError, match="is not a readable video"), eyes_of(config, tmp_path, HandClock()):
         raise AssertionError
 
 
-def test_two_films_give_as_many_pairs_as_the_shorter_has(tmp_path) -> None:
+def test_film_pair_ends_with_the_shorter_film(tmp_path) -> None:
     for name, count in (("l.avi", 7), ("r.avi", 5)):
         film = cv2.VideoWriter(str(tmp_path / name), cv2.VideoWriter.fourcc(*"MJPG"), 20.0, (32, 24))
         for _ in range(count):

@@ -103,7 +103,7 @@ def curled(eyes: str, curl: float, frames: int = 12) -> tuple[FloatArray, FloatA
 
 
 @pytest.mark.parametrize("eyes", EYES)
-def test_curled_chessboard_is_as_sure_as_a_flat_one(eyes) -> None:
+def test_curled_chessboard_sigma_stays_valid_and_small(eyes) -> None:
     errors, sigmas = curled(eyes, 4.0)
     assert np.sqrt(np.square(errors / sigmas).mean(axis=0)).max() < 1.6
     assert (np.median(sigmas, axis=0) < 2.0 * np.median(curled(eyes, 0.0)[1], axis=0)).all()
@@ -113,7 +113,7 @@ def test_curled_chessboard_is_as_sure_as_a_flat_one(eyes) -> None:
 @pytest.mark.parametrize(
     "bent", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.5, 0.7, 0.5)], ids=["curled", "twisted", "askew"]
 )
-def test_bent_plate_is_placed_as_well_as_a_flat_one(eyes, bent) -> None:
+def test_bent_plate_pose_error_matches_its_covariance(eyes, bent) -> None:
     calibration, noise_px, rng = EYES[eyes], 0.03, np.random.default_rng(3)
     corners = TagBody.chessboard(ChessboardConfig(columns=8, rows=5, square_m=0.02)).corners[0]
     heights, off_flat, off_bent = bends(corners), [], []

@@ -21,7 +21,7 @@ def ball_of_hue(hue_deg: float) -> Ball:
 
 
 @pytest.mark.parametrize("colour", NAMED_COLOURS)
-def test_a_ball_of_the_colour_named_is_found_as_exactly_as_a_red_one(colour):
+def test_ball_of_each_named_colour_is_located(colour):
     ball = ball_of_hue(NAMED_COLOURS[colour].hue_deg)
     assert sigmas_off(StereoTracker(SMALL, VisionConfig(colour=colour)).track(stage(ball)), ball) < FAR_SIGMAS
 
@@ -47,7 +47,7 @@ def test_bands_of_the_named_colours_do_not_overlap():
 
 
 @pytest.mark.parametrize("hue_deg", [350.0, 5.0, 75.0, 200.0, 275.0])
-def test_a_ball_of_a_hue_given_in_degrees_is_found(hue_deg):
+def test_ball_of_hue_in_degrees_is_located(hue_deg):
     ball = ball_of_hue(hue_deg)
     tracker = StereoTracker(SMALL, VisionConfig(colour=HueBand(hue_deg)))
     assert sigmas_off(tracker.track(stage(ball)), ball) < FAR_SIGMAS
@@ -67,7 +67,7 @@ def read(tmp_path, table: str) -> VisionConfig:
     return convert(tables["vision"], VisionConfig, file=file, text=text, prefix=("vision",))
 
 
-def test_a_band_of_hues_is_a_table_in_the_file(tmp_path):
+def test_hue_band_is_read_from_its_table(tmp_path):
     config = read(tmp_path, "[vision.colour]\nhue_deg = 95\nhalf_width_deg = 10")
     assert config.band == HueBand(95.0, half_width_deg=10.0)
 
@@ -105,6 +105,6 @@ def test_a_wrong_setting_is_refused_with_its_line(tmp_path, table, line, said):
         ("image_size_px", (320, 8)),
     ],
 )
-def test_a_calibration_of_no_stereo_pair_is_refused_with_its_key(field, value):
+def test_invalid_stereo_calibration_is_refused_with_its_key(field, value):
     with pytest.raises(ConfigError, match=field):
         StereoTracker(replace(SMALL, **{field: value}))

@@ -30,14 +30,14 @@ def pixel(thing: Ball) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("hue_deg", [5.0, 60.0, 150.0, 240.0, 330.0])
-def test_a_click_on_a_ball_is_enough_to_track_it(hue_deg):
+def test_one_click_suffices_to_track_a_ball(hue_deg):
     shown = ball(hue_deg)
     band = colour_at(stage(shown).left, *pixel(shown))
     elsewhere = ball(hue_deg, x=0.05)
     assert sigmas_off(StereoTracker(SMALL, VisionConfig(colour=band)).track(stage(elsewhere)), elsewhere) < FAR_SIGMAS
 
 
-def test_a_colour_learnt_in_one_light_tells_the_ball_in_another():
+def test_learnt_colour_holds_in_other_light():
     shown = ball(200.0)
     band = colour_at(stage(shown, look=Look(ambient=0.5, diffuse=0.6)).left, *pixel(shown))
     dim = stage(shown, look=Look(ambient=0.3, diffuse=0.4, exposure=0.5))
@@ -55,7 +55,7 @@ def test_a_click_outside_the_image_is_refused():
 
 
 @pytest.mark.parametrize("hue_deg", [120.0, 240.0, 330.0])
-def test_the_ball_that_moves_is_learnt_though_a_hand_moves_with_it(hue_deg):
+def test_moving_ball_colour_is_learnt_despite_moving_hand(hue_deg):
     frames = []
     for number in range(8):
         moved = ball(hue_deg, x=-0.04 + 0.02 * number)
@@ -71,7 +71,7 @@ def test_where_nothing_moves_nothing_is_learnt():
         colour_of_the_moving([stage(ball(120.0), seed=number).left for number in range(5)])
 
 
-def test_the_printed_table_is_the_band_that_was_learnt(tmp_path):
+def test_printed_table_matches_learnt_band(tmp_path):
     shown = ball(100.0)
     file = tmp_path / "left.png"
     cv2.imwrite(str(file), stage(shown).left)
@@ -94,7 +94,7 @@ def test_the_band_follows_light_that_grows_warm():
     assert all(isinstance(fix, MarkerFix) for fix in fixes)
 
 
-def test_the_band_does_not_walk_farther_than_half_its_width():
+def test_band_drift_is_limited_to_half_its_width():
     gate = ColourGate(HueBand(120.0, half_width_deg=20.0))
     for hue in np.linspace(120.0, 200.0, 400):
         rgb = np.array(colorsys.hsv_to_rgb(float(hue) / 360, 0.9, 0.8))
@@ -109,7 +109,7 @@ def test_the_table_has_every_setting_of_a_band():
 
 
 @pytest.mark.parametrize("exposure", [1.0, 1.6])
-def test_a_bright_ball_is_found_by_its_brightness_over_exposed_or_not(exposure):
+def test_bright_ball_is_found_even_when_over_exposed(exposure):
     white = Ball((0.02, 0.01, 0.8), rgb=(0.95, 0.95, 0.95))
     look = Look(exposure=exposure, ambient=0.7, diffuse=0.3, specular=0.0, noise_sd=2.0)
     frame = stage(white, Slab((-1, -1), (1, 1), 0.8, rgb=(0.2, 0.2, 0.2)), white, look=look)

@@ -83,7 +83,7 @@ def test_the_ball_is_followed_episode_by_episode(version: str, config: Config, t
     np.testing.assert_allclose(track.x[:, 2], wanted[:, 2], rtol=0.03)
 
 
-def test_readout_of_the_configured_camera_holds_for_its_videos(tmp_path: Path) -> None:
+def test_configured_readout_time_applies_to_videos(tmp_path: Path) -> None:
     cameras = '[vision.cameras]\nreadout_s = 0.02\n[vision.cameras.one]\ndevice = "usb"\nimage_size_px = [320, 240]\n'
     config = Config.load(write_small_arm(tmp_path, CAMERA_TABLE + cameras), {})
     track = markers_in_video(config, dataset(tmp_path / "data", "v2.1"), CAMERA)
@@ -97,7 +97,7 @@ def test_a_camera_that_is_not_there_is_named(config: Config, tmp_path: Path) -> 
         markers_in_video(config, dataset(tmp_path / "data", "v2.1"), "observation.images.top")
 
 
-def test_an_av1_video_without_pyav_says_what_to_install(config: Config, tmp_path: Path, monkeypatch) -> None:
+def test_av1_video_without_pyav_names_the_package(config: Config, tmp_path: Path, monkeypatch) -> None:
     folder = dataset(tmp_path / "data", "v2.1")
     codec = cv2.VideoCapture(str(next(folder.rglob("*.mp4")))).get(cv2.CAP_PROP_FOURCC)
     monkeypatch.setattr(videos, "_AV1", round(codec))
@@ -106,7 +106,7 @@ def test_an_av1_video_without_pyav_says_what_to_install(config: Config, tmp_path
         markers_in_video(config, folder, CAMERA)
 
 
-def test_the_ball_is_followed_in_av1_as_lerobot_encodes_it(config: Config, tmp_path: Path) -> None:
+def test_ball_is_followed_in_lerobot_av1_video(config: Config, tmp_path: Path) -> None:
     av = pytest.importorskip("av", reason="no PyAV; to run it: pip install av")
     folder = dataset(tmp_path / "data", "v2.1")
     for episode, file in enumerate(sorted(folder.rglob("*.mp4"))):
@@ -131,7 +131,7 @@ def test_a_video_that_cannot_be_decoded_is_refused(config: Config, tmp_path: Pat
         markers_in_video(config, folder, CAMERA)
 
 
-def test_the_ball_is_followed_in_a_bags_compressed_images(config: Config, tmp_path: Path) -> None:
+def test_ball_is_followed_in_compressed_bag_images(config: Config, tmp_path: Path) -> None:
     pytest.importorskip("rosbags")
     from written_bags import BEGUN_S, compressed_image, write_bag
 

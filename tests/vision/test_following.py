@@ -37,7 +37,7 @@ def test_a_moving_ball_is_followed():
         assert sigmas_off(tracker.track(stage(ball, t=number * FRAME_S, seed=number)), ball) < FAR_SIGMAS
 
 
-def test_following_gives_the_same_fixes_as_searching_the_whole_images():
+def test_following_gives_same_fixes_as_full_search():
     following, searching = StereoTracker(SMALL), StereoTracker(SMALL)
     for number, ball in enumerate(walk(10)):
         frame = stage(ball, t=number * FRAME_S, seed=number)
@@ -49,19 +49,19 @@ def test_following_gives_the_same_fixes_as_searching_the_whole_images():
         assert np.abs(np.array(followed.centres_px) - np.array(searched.centres_px)).max() < 0.01
 
 
-def test_a_followed_ball_is_not_confused_with_another_one_farther_off():
+def test_followed_ball_is_not_confused_with_distant_twin():
     tracker = tracker_that_saw(NEAR)
     assert sigmas_off(tracker.track(stage(NEAR, ELSEWHERE, t=FRAME_S)), NEAR) < FAR_SIGMAS
 
 
-def test_a_copy_in_a_mirror_is_refused_however_near_when_the_ball_has_gone():
+def test_nearby_mirror_copy_is_refused_after_ball_leaves():
     tracker = tracker_that_saw(NEAR)
     copy = Ball((0.06, 0.0, 1.0), rgb=(0.45, 0.04, 0.04))
     for number in range(1, 6):
         assert reason(tracker.track(stage(copy, t=number * FRAME_S))) is Reason.REFLECTION
 
 
-def test_a_ball_that_goes_away_into_the_shade_is_followed():
+def test_ball_receding_into_shade_is_followed():
     tracker = tracker_that_saw(NEAR)
     for number in range(1, 8):
         shade = 1.0 - 0.07 * number
@@ -69,7 +69,7 @@ def test_a_ball_that_goes_away_into_the_shade_is_followed():
         assert sigmas_off(tracker.track(stage(ball, t=number * FRAME_S)), ball) < FAR_SIGMAS
 
 
-def test_a_followed_ball_is_found_before_a_box_of_nearly_its_colour():
+def test_followed_ball_is_found_before_similarly_coloured_box():
     ball = Ball((0.05, 0.0, 1.4))
     box = Slab((0.05, -0.06), (0.13, 0.02), 1.4, (0.8, 0.2, 0.15))
     frame = stage(box, ball, t=FRAME_S)
@@ -78,13 +78,13 @@ def test_a_followed_ball_is_found_before_a_box_of_nearly_its_colour():
     assert reason(StereoTracker(SMALL).track(frame)) is Reason.OCCLUDED
 
 
-def test_a_box_of_the_ball_s_colour_where_the_ball_was_expected_is_no_ball():
+def test_same_coloured_box_at_predicted_place_is_refused():
     tracker = tracker_that_saw(NEAR)
     box = Slab((0.01, -0.04), (0.09, 0.04), 0.8, NEAR.rgb)
     assert reason(tracker.track(stage(box, t=FRAME_S))) is Reason.OCCLUDED
 
 
-def test_a_ball_that_is_expected_out_of_view_is_missed_with_a_reason():
+def test_prediction_beyond_view_distinguishes_visible_from_absent_ball():
     tracker = StereoTracker(SMALL)
     edge_m = 0.8 * SMALL.principal_point_px[0] / SMALL.focal_px
     for number in (3, 2):
@@ -94,18 +94,18 @@ def test_a_ball_that_is_expected_out_of_view_is_missed_with_a_reason():
     assert reason(tracker.track(stage(t=4 * FRAME_S))) is Reason.NO_MARKER
 
 
-def test_a_tracker_told_to_forget_searches_the_whole_images():
+def test_forgetting_tracker_searches_whole_images():
     tracker = tracker_that_saw(NEAR)
     tracker.forget()
     assert reason(tracker.track(stage(NEAR, ELSEWHERE, t=FRAME_S))) is Reason.AMBIGUOUS
 
 
-def test_after_a_long_pause_the_whole_images_are_searched():
+def test_long_pause_triggers_full_search():
     tracker = tracker_that_saw(NEAR)
     assert reason(tracker.track(stage(NEAR, ELSEWHERE, t=0.6))) is Reason.AMBIGUOUS
 
 
-def test_time_that_steps_back_makes_the_whole_images_be_searched():
+def test_backward_time_step_triggers_full_search():
     tracker = tracker_that_saw(NEAR, t=9.0)
     assert reason(tracker.track(stage(NEAR, ELSEWHERE, t=8.9))) is Reason.AMBIGUOUS
 
@@ -116,25 +116,25 @@ def test_after_a_miss_the_whole_images_are_searched():
     assert reason(tracker.track(stage(NEAR, ELSEWHERE, t=2 * FRAME_S))) is Reason.AMBIGUOUS
 
 
-def test_a_ball_that_jumps_is_found_in_the_same_frame():
+def test_jumping_ball_is_found_in_same_frame():
     tracker = tracker_that_saw(NEAR)
     assert sigmas_off(tracker.track(stage(ELSEWHERE, t=FRAME_S)), ELSEWHERE) < FAR_SIGMAS
 
 
-def test_after_a_jump_the_ball_is_followed_at_its_new_place():
+def test_ball_is_followed_at_new_place_after_jump():
     tracker = tracker_that_saw(NEAR)
     tracker.track(stage(ELSEWHERE, t=FRAME_S))
     assert sigmas_off(tracker.track(stage(NEAR, ELSEWHERE, t=2 * FRAME_S)), ELSEWHERE) < FAR_SIGMAS
 
 
-def test_a_ball_that_comes_out_from_behind_a_hand_is_found_at_once():
+def test_ball_reappearing_from_behind_hand_is_found_immediately():
     tracker = tracker_that_saw(NEAR)
     hand = Slab((-0.1, 0.0), (0.2, 0.2), 0.7)
     assert reason(tracker.track(stage(NEAR, hand, t=FRAME_S))) is Reason.OCCLUDED
     assert sigmas_off(tracker.track(stage(NEAR, t=2 * FRAME_S)), NEAR) < FAR_SIGMAS
 
 
-def test_a_ball_followed_out_of_the_image_is_at_border_then_gone():
+def test_ball_leaving_image_is_at_border_then_gone():
     tracker = StereoTracker(SMALL)
     # 15 px a frame; the centre leaves the left image at the fourth.
     answers = [reason(tracker.track(stage(Ball((0.14 + 0.02 * n, 0.0, 0.8)), t=n * FRAME_S))) for n in range(6)]
@@ -144,13 +144,13 @@ def test_a_ball_followed_out_of_the_image_is_at_border_then_gone():
 
 
 @pytest.mark.parametrize(("t", "said"), [(0.5, Reason.AMBIGUOUS), (1.2, None)])
-def test_of_two_balls_alike_the_one_that_is_left_is_the_marker_after_a_second(t, said):
+def test_remaining_twin_ball_becomes_marker_after_one_second(t, said):
     tracker = StereoTracker(SMALL)
     tracker.track(stage(NEAR, ELSEWHERE))
     assert reason(tracker.track(stage(ELSEWHERE, t=t))) is said
 
 
-def test_the_mirrored_copy_of_a_ball_that_was_in_view_but_not_measured_is_a_reflection():
+def test_mirror_copy_of_unmeasured_ball_is_a_reflection():
     tracker = StereoTracker(SMALL)
     hand = Slab((NEAR.x[0] + 0.7 * NEAR.radius_m, -0.1), (0.2, 0.1), NEAR.x[2])
     mirrored = Ball((0.1, -0.05, 1.3), rgb=(0.45, 0.04, 0.04))
@@ -158,7 +158,7 @@ def test_the_mirrored_copy_of_a_ball_that_was_in_view_but_not_measured_is_a_refl
     assert reason(tracker.track(stage(mirrored, t=FRAME_S))) is Reason.REFLECTION
 
 
-def test_a_followed_ball_stays_the_marker_though_another_one_was_in_view_beside_it():
+def test_followed_ball_stays_marker_after_rival_in_view():
     tracker = tracker_that_saw(NEAR)
     tracker.track(stage(t=FRAME_S))
     tracker.track(stage(NEAR, ELSEWHERE, t=2 * FRAME_S))
@@ -187,7 +187,7 @@ class Camera:
         return frame
 
 
-def test_a_tracked_camera_answers_every_frame_with_its_time():
+def test_tracked_camera_answers_every_frame_with_its_time():
     with TrackedCamera(Camera(stage(NEAR, t=1.0), stage(t=1.1)), StereoTracker(SMALL)) as source:
         found, lost = source.read(0.1), source.read(0.1)
     assert found is not None
@@ -195,7 +195,7 @@ def test_a_tracked_camera_answers_every_frame_with_its_time():
     assert (found.t, lost.t) == (1.0, 1.1)
 
 
-def test_a_tracked_camera_shows_its_newest_frame_with_detections():
+def test_tracked_camera_shows_newest_frame_with_detections():
     annotator = Annotator(SMALL, VisionConfig())
     with TrackedCamera(Camera(stage(NEAR)), StereoTracker(SMALL), annotator) as source:
         assert source.picture() is None
@@ -210,7 +210,7 @@ def test_a_tracked_camera_shows_its_newest_frame_with_detections():
     assert np.abs(np.hstack(stage(NEAR).images).astype(float) - drawn).mean() > 6.0
 
 
-def test_a_tracked_camera_has_nothing_while_no_frame_comes():
+def test_tracked_camera_returns_none_without_frame():
     with TrackedCamera(Camera(None), StereoTracker(SMALL)) as source:
         assert source.read(0.1) is None
 

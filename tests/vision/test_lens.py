@@ -47,6 +47,6 @@ def test_a_webcams_lens_is_one_to_one(model) -> None:
         ("rational", (0.0, 0.0, 0.0, 0.0, 0.0, 0.5, 0.5, 0.0)),
     ],
 )
-def test_a_lens_that_folds_over_within_the_image_is_not(model, distortion) -> None:
+def test_folding_lens_is_not_one_to_one(model, distortion) -> None:
     assert not lens(model, 200.0, distortion).is_one_to_one(SIZE)
     assert lens(model, 900.0, distortion).is_one_to_one(SIZE)

@@ -34,7 +34,7 @@ def moved(view: View, px: float) -> View:
     return View(view.name, left, right)
 
 
-def test_a_board_that_is_still_for_two_frames_is_taken_once(views) -> None:
+def test_board_still_for_two_frames_is_taken_once(views) -> None:
     live, found = outcomes([views[0]] * 3)
     assert found == [Outcome.MOVING, Outcome.TAKEN, Outcome.KNOWN]
     assert [view.name for view in live.found.views] == ["view 1"]
@@ -44,7 +44,7 @@ def test_a_moving_board_is_not_taken(views) -> None:
     assert set(outcomes([moved(views[0], 3.0 * k) for k in range(6)])[1]) == {Outcome.MOVING}
 
 
-def test_a_board_that_only_tilts_is_a_new_view() -> None:
+def test_board_tilted_in_place_is_a_new_view() -> None:
     flat, tilted = tilted_in_place(0.0), tilted_in_place(25.0)
     assert outcomes([flat, flat, tilted, tilted])[1][2:] == [Outcome.MOVING, Outcome.TAKEN]
 
@@ -59,14 +59,14 @@ def tilted_in_place(degrees: float) -> View:
     return View("tilted", corners, corners)
 
 
-def test_frames_before_and_after_a_loss_are_not_held_against_each_other(views) -> None:
+def test_frames_across_a_loss_are_not_compared(views) -> None:
     live = LiveViews(BOARD, KnownCorners([views[0]] * 2))
     live.look(shot(0))
     live.forget()
     assert live.look(shot(1)).outcome is Outcome.MOVING
 
 
-def test_what_one_eye_alone_sees_is_taken_where_its_image_was_empty(views) -> None:
+def test_single_eye_view_is_taken_only_while_uncovered(views) -> None:
     both = views[0]
     alone = View("alone", both.left, None)
     live, found = outcomes([alone, alone, both, both, alone, alone])
@@ -80,7 +80,7 @@ def test_views_of_all_kinds_leave_nothing_missing(views) -> None:
     assert live.found.image_size_px == SIZE
 
 
-def test_rendered_images_are_taken_and_an_eye_that_sees_nothing_is_named() -> None:
+def test_rendered_board_is_taken_and_blind_eye_named() -> None:
     pair = photographed(count=6)[1][4]
     live = LiveViews(BOARD)
     frames = [StereoFrame(0.1 * k, pair.left, pair.right) for k in range(2)]

@@ -90,7 +90,7 @@ def errors(found: MeasuredCluster, places: Places) -> tuple[FloatArray, FloatArr
     return np.array(off), np.array(turns)
 
 
-def test_tags_are_found_where_they_were_glued_and_the_intervals_cover() -> None:
+def test_glued_tag_poses_are_recovered_with_covering_intervals() -> None:
     off, claimed = [], []
     for seed in range(6):
         rng = np.random.default_rng(seed)
@@ -105,7 +105,7 @@ def test_tags_are_found_where_they_were_glued_and_the_intervals_cover() -> None:
     assert np.abs(np.concatenate(off)[:, :3]).max() < 3e-4
 
 
-def test_tags_of_other_sides_are_found_where_they_were_glued() -> None:
+def test_tags_of_different_sides_are_recovered() -> None:
     rng = np.random.default_rng(2)
     places, sides_m = built(rng), {4: 0.025, 9: 0.03}
     found = measure_cluster(looked(places, rng, sides_m=sides_m), EYES, SIDE_M, sides_m)
@@ -113,14 +113,14 @@ def test_tags_of_other_sides_are_found_where_they_were_glued() -> None:
     assert {tag.placed.id: tag.placed.side_m for tag in found.tags} == {3: None, 4: 0.025, 7: None, 8: None, 9: 0.03}
 
 
-def test_the_tables_name_the_side_of_tags_that_have_their_own() -> None:
+def test_tables_name_individual_tag_sides() -> None:
     tags = [PlacedTag(id=3), PlacedTag(id=4, side_m=0.025)]
     written = tomllib.loads(cluster_tables("apriltag_36h11", SIDE_M, tags))
     assert written["vision"]["tag"]["side_m"] == SIDE_M
     assert [tag.get("side_m") for tag in written["vision"]["cluster"]["tags"]] == [None, 0.025]
 
 
-def test_views_that_show_one_tag_alone_are_named_as_unused() -> None:
+def test_single_tag_view_is_reported_as_unused() -> None:
     rng = np.random.default_rng(4)
     views = looked(built(rng), rng)
     alone = {min(views[5].left): views[5].left[min(views[5].left)]}
@@ -140,7 +140,7 @@ def test_a_text_that_tells_no_sides_is_refused(text: str) -> None:
         sides_of(text)
 
 
-def test_a_tag_that_moved_in_one_view_is_left_out_and_named() -> None:
+def test_tag_moved_in_one_view_is_left_out() -> None:
     rng = np.random.default_rng(1)
     places = built(rng)
     views = looked(places, rng)
@@ -155,7 +155,7 @@ def test_a_tag_that_moved_in_one_view_is_left_out_and_named() -> None:
 
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.soak
-def test_a_number_that_is_there_twice_is_no_rigid_body_and_named(seed: int) -> None:
+def test_duplicate_tag_on_opposite_faces_is_named(seed: int) -> None:
     """Check duplicate numbers on opposite faces, so that no image shows both."""
     rng = np.random.default_rng(seed)
     places = built(rng)
@@ -175,7 +175,7 @@ def renumbered(view: ClusterView, numbers: Mapping[int, int]) -> ClusterView:
     return ClusterView(view.name, eye(view.left), eye(view.right))
 
 
-def test_squares_of_another_size_than_told_are_noticed() -> None:
+def test_tags_of_wrongly_stated_size_are_noticed() -> None:
     rng = np.random.default_rng(2)
     found = measure_cluster(looked(built(rng), rng), EYES, 0.97 * SIDE_M)
     assert found.grown == pytest.approx(0.03, abs=max(4 * found.grown_sigma, 0.004))
@@ -199,18 +199,18 @@ def test_views_of_single_tags_are_too_few() -> None:
         measure_cluster([only(view, [3]) for view in looked(built(rng), rng)], EYES, SIDE_M)
 
 
-def test_a_tag_that_should_be_there_and_is_in_no_image_is_named() -> None:
+def test_wanted_tag_in_no_image_is_named() -> None:
     views = looked(built(np.random.default_rng(0)), np.random.default_rng(0))
     with pytest.raises(CalibrationError, match=r"not tag 5, 6 of apriltag_36h11 .* there are 3, 4, 7, 8, 9"):
         _require_tags(views, {}, Wanted("apriltag_36h11", SIDE_M, (3, 4, 5, 6)))
 
 
-def test_images_without_tags_of_the_family_are_told_so() -> None:
+def test_images_without_tags_of_family_are_refused() -> None:
     with pytest.raises(CalibrationError, match=r"no tag of aruco_6x6_50 .* Are --family"):
         _require_tags([ClusterView("00", {}, {})], {}, Wanted("aruco_6x6_50", SIDE_M))
 
 
-def test_a_number_that_images_show_twice_is_named_with_them() -> None:
+def test_duplicate_tag_in_one_image_is_named() -> None:
     views = looked(built(np.random.default_rng(0)), np.random.default_rng(0))
     with pytest.raises(CalibrationError, match=r"tag 3 is there twice in one image \(04, 07\)"):
         _require_tags(views, {3: ["04", "07"]}, Wanted("apriltag_36h11", SIDE_M))

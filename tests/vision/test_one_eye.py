@@ -72,7 +72,7 @@ def test_a_tag_is_where_one_image_shows_it(degrees) -> None:
     assert fix.centres_px is None
 
 
-def test_depth_is_claimed_to_be_several_times_less_sure_than_what_is_across() -> None:
+def test_single_eye_depth_sigma_exceeds_lateral_sigma_fivefold() -> None:
     across, _, depth = np.sqrt(np.diag(fixed(tracker_of(ONE, TAG), seen(at(tilted(30.0), [0.0, 0.0, 0.35]))).cov))
     assert depth > 5.0 * across
 
@@ -84,21 +84,21 @@ def film_of_a_small_tag_that_turns_to_the_camera() -> tuple[FloatArray, list[Ste
     return turns[-1], frames
 
 
-def test_a_small_tag_that_may_be_tilted_either_way_is_ambiguous() -> None:
+def test_small_tag_with_two_possible_tilts_is_ambiguous() -> None:
     _, frames = film_of_a_small_tag_that_turns_to_the_camera()
     found = tracker_of(ONE, TAG).track(frames[-1])
     assert isinstance(found, MarkerMiss)
     assert found.reason is Reason.AMBIGUOUS
 
 
-def test_motion_tells_which_way_it_is_tilted() -> None:
+def test_motion_resolves_the_tilt_ambiguity() -> None:
     turn, frames = film_of_a_small_tag_that_turns_to_the_camera()
     tracker = tracker_of(ONE, TAG)
     fix = [fixed(tracker, frame) for frame in frames][-1]
     assert np.linalg.norm(turned_off(fix, turn)) < np.radians(6.0)
 
 
-def test_no_tag_that_is_tilted_the_other_way_becomes_a_fix() -> None:
+def test_oppositely_tilted_pose_never_becomes_a_fix() -> None:
     rng = np.random.default_rng(20261124)
     for k in range(12):
         truth = tilted(float(rng.uniform(0.0, 25.0)), rng.standard_normal(3) * [1.0, 1.0, 0.0])
@@ -109,7 +109,7 @@ def test_no_tag_that_is_tilted_the_other_way_becomes_a_fix() -> None:
             assert off @ np.linalg.solve(found.cov_R, off) < 36.0
 
 
-def test_the_plates_of_a_flat_cluster_are_one_plane_to_it() -> None:
+def test_flat_cluster_pose_is_recovered_from_one_image() -> None:
     plate = ClusterConfig(tags=tuple(PlacedTag(id=k, xyz=(0.04 * (k - 0.5), 0.0, 0.0)) for k in range(2)))
     tracker = TagTracker(ONE, TagBody.cluster(plate, TAG.tag), TAG.tag)
     truth, x = tilted(-25.0), np.array([0.0, 0.01, 0.4])
@@ -118,12 +118,12 @@ def test_the_plates_of_a_flat_cluster_are_one_plane_to_it() -> None:
     assert np.linalg.norm(turned_off(fix, truth)) < np.radians(1.0)
 
 
-def test_frames_of_two_eyes_are_refused_by_their_number() -> None:
+def test_stereo_frames_are_refused_by_image_count() -> None:
     with pytest.raises(SourceError, match=r"2 images for each instant, but the calibration is of 1.*\[camera\] eyes"):
         tracker_of(ONE, TAG).track(photograph([at(FACING, [0, 0, 0.4])], SMALL, Look(), np.random.default_rng(0)))
 
 
-def test_of_a_ball_the_direction_is_sharp_and_the_depth_as_sure_as_its_size() -> None:
+def test_ball_direction_is_sharp_depth_follows_size_sigma() -> None:
     ball = Ball((0.03, -0.02, 0.4))
     fix = fixed(tracker_of(ONE, BALL), replace(stage(ball), right=None))
     sight = fix.x / np.linalg.norm(fix.x)
@@ -138,7 +138,7 @@ def test_two_balls_are_ambiguous() -> None:
     assert reason(tracker_of(ONE, BALL).track(replace(frame, right=None))) is Reason.AMBIGUOUS
 
 
-def test_no_ball_is_none() -> None:
+def test_image_without_ball_has_no_marker() -> None:
     assert reason(tracker_of(ONE, BALL).track(replace(stage(), right=None))) is Reason.NO_MARKER
 
 
@@ -158,7 +158,7 @@ def test_one_camera_is_calibrated_within_its_intervals(calibrated) -> None:
     assert found.rig.sigma[0] < 1.0
 
 
-def test_its_file_says_the_same(calibrated, tmp_path) -> None:
+def test_one_eye_calibration_file_round_trips(calibrated, tmp_path) -> None:
     _, found = calibrated
     write_rig(found.rig, tmp_path / "cameras.toml")
     read = read_rig(tmp_path / "cameras.toml")
@@ -184,7 +184,7 @@ def test_another_camera_than_the_calibrated_one_is_refused(calibrated) -> None:
             rig.require(size, serials)
 
 
-def test_what_is_missing_of_its_views_is_said_of_one_image() -> None:
+def test_missing_views_are_requested_for_one_image() -> None:
     missing = Coverage.of([], BOARD, SIZE, ONE_EYE).missing()
     assert "bring the board to the upper left of the image" in missing
     assert "tilt the board's right edge away from the camera, by 30°" in missing

@@ -93,7 +93,7 @@ POSES = [facing(0, 0, 0), facing(35, 0, 0), facing(0, 40, 20), facing(0, 150, 0)
     [POSES[0], *(pytest.param(pose, marks=pytest.mark.soak) for pose in POSES[1:-2]), *POSES[-2:]],
     ids=["front", "below", "left", "behind", "top"],
 )
-def test_a_cube_that_was_printed_cut_out_and_folded_is_found_as_its_tables_say(rotation) -> None:
+def test_printed_folded_cube_matches_its_tables(rotation) -> None:
     shape, x = cube(), np.array([0.03, -0.02, 0.45])
     page = shape_page(shape, ids_of(shape, 7), APRILTAG, SIDE_MM, "A4")
     text = cluster_tables(APRILTAG, 1e-3 * SIDE_MM, shape.placed(ids_of(shape, 7), WIDTH_M))
@@ -111,7 +111,7 @@ def test_a_cube_that_was_printed_cut_out_and_folded_is_found_as_its_tables_say(r
         pytest.param(4, 1, 90.0, marks=pytest.mark.soak),
     ],
 )
-def test_a_plate_that_was_printed_is_found_as_its_tables_say(columns, rows, fold_deg) -> None:
+def test_printed_plate_matches_its_tables(columns, rows, fold_deg) -> None:
     shape, x, rotation = plate(columns, rows, fold_deg), np.array([-0.05, -0.02, 0.40]), facing(0, 12, 0)
     page = shape_page(shape, ids_of(shape), APRILTAG, SIDE_MM, "A4")
     text = cluster_tables(APRILTAG, 1e-3 * SIDE_MM, shape.placed(ids_of(shape), WIDTH_M))
@@ -120,7 +120,7 @@ def test_a_plate_that_was_printed_is_found_as_its_tables_say(columns, rows, fold
 
 
 @pytest.mark.parametrize("dictionary", ["aruco_6x6_50", "apriltag_36h11"])
-def test_a_charuco_board_that_was_printed_is_found_as_its_tables_say(dictionary) -> None:
+def test_printed_charuco_board_matches_its_tables(dictionary) -> None:
     # A side of 24 mm has squares of 32 mm: whole pixels, again.
     board = Tags("board", None, dictionary, 24.0, columns=4, rows=3)
     square_m, x, rotation = 1e-3 * face_mm(board), np.array([-0.02, -0.02, 0.40]), facing(0, 12, 0)
@@ -156,7 +156,7 @@ def test_a_single_tag_of_another_family_is_found(dictionary) -> None:
 
 
 @pytest.mark.parametrize(("write", "read"), [(pdf, from_pdf), (svg, from_svg)], ids=["pdf", "svg"])
-def test_single_tags_are_of_the_size_that_was_asked_for_and_have_their_numbers(write, read) -> None:
+def test_printed_single_tags_have_requested_size_and_numbers(write, read) -> None:
     page = tags_page([3, 11, 40, 41, 42], APRILTAG, SIDE_MM, "A4")
     data = write(page)
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11))
@@ -182,13 +182,13 @@ def test_faces_meet_where_the_sheet_is_folded(shape) -> None:
         np.testing.assert_allclose(edge(shape, cell, other), edge(shape, other, cell), atol=1e-12)
 
 
-def test_a_cubes_faces_look_outwards_each_its_own_way() -> None:
+def test_cube_faces_look_outwards_in_six_directions() -> None:
     normals = np.array([face.rotation[:, 2] for face in cube().faces])
     np.testing.assert_allclose([face.centre for face in cube().faces], 0.5 * normals, atol=1e-12)
     assert len({tuple(np.rint(normal).astype(int)) for normal in normals}) == 6
 
 
-def test_a_plate_has_no_folds_where_it_is_flat_and_is_cut_all_around() -> None:
+def test_flat_plate_has_no_folds_only_cuts() -> None:
     shape = plate(3, 2, 0.0)
     assert (shape.folds, len(shape.cuts)) == ([], 10)
 
@@ -217,6 +217,6 @@ def test_nothing_leaves_the_sheet() -> None:
         (lambda: tags_page([0], APRILTAG, 40.0, "A9"), "there is no paper 'A9'"),
     ],
 )
-def test_what_cannot_be_printed_is_refused_with_what_can(make, said) -> None:
+def test_unprintable_request_is_refused_with_its_reason(make, said) -> None:
     with pytest.raises(ConfigError, match=re.escape(said)):
         make()

@@ -140,7 +140,7 @@ def test_bright_ball_is_measured_and_checked_by_depth(device, depth_mm, complain
 
 
 @SDK
-def test_stamps_of_a_clock_of_its_own_are_not_used(device) -> None:
+def test_hardware_clock_timestamps_are_not_used(device) -> None:
     with device.camera() as camera:
         assert shown(device, camera, domain="hardware_clock").t_sigma > 0.01
         assert "Update its firmware" in camera.health[0]

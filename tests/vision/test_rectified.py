@@ -21,7 +21,7 @@ from bodyschema.vision.rig.stereo_rig import CalibrationError, StereoRig, triang
 
 
 @pytest.mark.parametrize("fisheye", [False, True], ids=["pinhole", "fisheye"])
-def test_rectified_images_are_those_of_two_pinholes_in_the_stated_frame(fisheye) -> None:
+def test_rectified_images_match_pinholes_in_stated_frame(fisheye) -> None:
     rng = np.random.default_rng(6)
     truth = webcams(rng, fisheye=fisheye)
     rig = known_rig(truth)
@@ -62,14 +62,14 @@ def test_rectified_points_and_triangulation_agree() -> None:
     np.testing.assert_allclose(rectification.points(right, 1), expected[:, 2:], atol=1e-6)
 
 
-def test_the_rectified_frame_is_turned_little_against_the_left_cameras_own() -> None:
+def test_rectified_frame_is_rotated_little_from_left_camera() -> None:
     truth = webcams(np.random.default_rng(6))
     R = Rectification(known_rig(truth)).R_rectified_left
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
     assert Rotation.from_matrix(R).magnitude() < np.radians(8)
 
 
-def test_cameras_that_were_not_calibrated_are_refused_and_closed_again() -> None:
+def test_uncalibrated_cameras_are_refused_and_closed() -> None:
     black = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
     rig = known_rig(webcams(np.random.default_rng(6)))
     eyes = Eyes([StereoFrame(0.0, black, black)], ("A1", "C3"))
@@ -81,7 +81,7 @@ def test_cameras_that_were_not_calibrated_are_refused_and_closed_again() -> None
         pass
 
 
-def test_an_image_of_another_size_is_an_error_of_the_source() -> None:
+def test_image_of_another_size_is_a_source_error() -> None:
     black = np.zeros((SIZE[1], SIZE[0], 3), np.uint8)
     eyes = Eyes([StereoFrame(0.0, black, black[::2])])
     camera = RectifiedCamera(eyes, known_rig(webcams(np.random.default_rng(6))))
@@ -100,7 +100,7 @@ def calibrated() -> tuple[StereoRig, View]:
     return calibrate(views[:-1], BOARD, asked).rig, views[-1]
 
 
-def test_a_calibration_that_holds_is_said_to_hold(calibrated) -> None:
+def test_valid_calibration_passes_the_check(calibrated) -> None:
     found = check(*calibrated, BOARD)
     assert found.holds
     assert abs(found.rows_px) < 4 * found.rows_sigma_px
@@ -123,13 +123,13 @@ def test_another_board_than_was_calibrated_with_is_noticed(calibrated) -> None:
     assert "a square of 29.1 mm is measured as 30.0" in check(*calibrated, replace(BOARD, square_m=0.0291)).wrong[0]
 
 
-def test_too_little_of_the_board_is_said(calibrated) -> None:
+def test_too_few_visible_corners_are_refused(calibrated) -> None:
     rig, view = calibrated
     with pytest.raises(CalibrationError, match="both eyes see 0 corners"):
         check(rig, replace(view, right=None), BOARD)
 
 
-def test_cameras_without_a_common_view_are_named_by_their_angle() -> None:
+def test_cameras_without_common_view_report_their_angle() -> None:
     rig = known_rig(webcams(np.random.default_rng(6)))
     apart = replace(rig, rotation_rad=np.array([0.0, np.radians(70.0), 0.0]))
     with pytest.raises(CalibrationError, match=r"share almost no view: their lines of sight are 70° apart"):

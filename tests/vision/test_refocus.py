@@ -82,7 +82,7 @@ def of_left(views: Sequence[View]) -> list[View]:
     return [replace(view, right=None) for view in views]
 
 
-def test_focal_lengths_that_wander_are_found_with_one_eye(wandering) -> None:
+def test_wandering_focal_length_is_found_with_one_eye(wandering) -> None:
     assert spread_of(of_left(wandering), ONE_EYE) == pytest.approx(0.015, rel=0.5)
 
 
@@ -105,7 +105,7 @@ def test_the_boards_own_shape_hides_no_wandering(wandering) -> None:
     assert spread_of(of_left(wandering), ONE_EYE, SHEARED) == pytest.approx(0.015, rel=0.5)
 
 
-def test_a_board_that_moved_between_the_images_is_no_refocusing() -> None:
+def test_board_moved_between_images_is_not_refocusing() -> None:
     rng = np.random.default_rng(5)
     rig = webcams(rng)
     photographer, views = Photographer(rig, Printed(), Taken(), rng), []

@@ -46,7 +46,7 @@ def test_a_ball_before_a_wall_is_found():
 
 
 @pytest.mark.parametrize("side_px", [9, 10, 11, 12, 14, 18])
-def test_a_square_of_the_ball_s_hue_is_no_ball(side_px):
+def test_square_of_ball_hue_is_not_round(side_px):
     rng = np.random.default_rng(side_px)
     images = []
     for u in (150, 110):
@@ -66,7 +66,7 @@ def test_a_ball_of_another_colour_is_no_marker():
     assert reason(answer(replace(BALL, rgb=(0.1, 0.2, 0.8)))) is Reason.NO_MARKER
 
 
-def test_a_ball_too_far_away_to_be_measured_is_no_marker():
+def test_ball_too_far_to_measure_is_no_marker():
     # Radius 2.4 px: 18 pixels.
     assert reason(answer(Ball((0.1, 0.0, 5.0)))) is Reason.NO_MARKER
 
@@ -75,12 +75,12 @@ def test_a_ball_too_far_away_to_be_measured_is_no_marker():
 @pytest.mark.parametrize(
     ("u", "v"), [(200, 8), (200, 16), (200, 230), (310, 120), (302, 120), (62, 120), (50, 120), (200, -5)]
 )
-def test_a_ball_that_reaches_the_border_of_either_image_is_at_border(u, v):
+def test_ball_touching_either_image_border_is_at_border(u, v):
     assert reason(answer(at_pixel(u, v))) is Reason.AT_BORDER
 
 
 @pytest.mark.parametrize(("u", "v"), [(200, 21), (200, 218), (298, 120), (67, 120)])
-def test_a_ball_just_clear_of_the_borders_is_found(u, v):
+def test_ball_just_clear_of_borders_is_found(u, v):
     ball = at_pixel(u, v)
     assert sigmas_off(answer(ball), ball) < FAR_SIGMAS
 
@@ -99,7 +99,7 @@ def test_a_ball_partly_behind_something_is_occluded(slab):
     assert reason(answer(BALL, slab)) is Reason.OCCLUDED
 
 
-def test_a_ball_hidden_from_one_eye_only_is_occluded():
+def test_ball_half_hidden_from_one_eye_is_occluded():
     # At half the depth a board that covers half of the ball in the left image is beside it in the right one.
     assert reason(answer(BALL, Slab((0.012, -0.1), (0.03, 0.1), 0.4))) is Reason.OCCLUDED
 
@@ -109,19 +109,19 @@ def test_a_ball_wholly_hidden_is_no_marker():
 
 
 @pytest.mark.parametrize("covered", [0.02, 0.06, 0.10, 0.15, 0.2, 0.3, 0.4])
-def test_however_much_of_the_ball_is_covered_a_fix_is_right_or_there_is_none(covered):
+def test_partly_covered_ball_is_accurate_or_occluded(covered):
     limb = BALL.x[0] + BALL.radius_m * (1 - 2 * covered)
     found = answer(BALL, Slab((limb, -0.1), (0.2, 0.1), BALL.x[2]))
     assert reason(found) is Reason.OCCLUDED or sigmas_off(found, BALL) < FAR_SIGMAS
 
 
-def test_an_arm_that_touches_the_ball_s_outline_does_not_pull_the_centre():
+def test_arm_touching_ball_outline_does_not_pull_centre():
     beside = Slab((BALL.x[0] + 1.02 * BALL.radius_m, -0.1), (0.2, 0.1), BALL.x[2], rgb=(0.15, 0.15, 0.2))
     assert sigmas_off(answer(beside, BALL), BALL) < FAR_SIGMAS
 
 
 @pytest.mark.soak
-def test_fingertips_a_tenth_of_the_radius_over_a_small_ball_do_not_pass():
+def test_fingertips_over_small_ball_do_not_pass():
     rng = np.random.default_rng(3)
     tracker = StereoTracker(SMALL)
     passed = 0
@@ -138,14 +138,14 @@ def test_fingertips_a_tenth_of_the_radius_over_a_small_ball_do_not_pass():
     assert passed <= 1
 
 
-def test_a_limb_uneven_in_both_eyes_is_covered_and_in_one_eye_it_is_what_is_behind():
+def test_limb_is_occluded_only_if_uneven_in_both():
     matcher = StereoMatcher(SMALL, VisionConfig())
     left, right = (replace(disc, unrest=6.0) for disc in seen_discs(BALL, level=120.0))
     assert matcher.match([left], [right]) is Reason.OCCLUDED
     assert isinstance(matcher.match([left], [replace(right, unrest=1.0)]), Location)
 
 
-def test_a_ball_out_of_round_by_half_a_percent_is_found_however_little_noise_there_is():
+def test_slightly_unround_ball_is_found_without_noise():
     # OpenCV draws a circle as a polygon, the same in both images.
     images = []
     for u in (160, 100):
@@ -160,7 +160,7 @@ def test_a_red_box_is_no_ball():
     assert reason(answer(Slab((-0.02, -0.1), (0.05, 0.0), 0.8, rgb=(0.7, 0.1, 0.1)))) is Reason.OCCLUDED
 
 
-def test_a_ball_before_a_red_box_of_its_hue_is_found_or_occluded_but_never_misplaced():
+def test_ball_before_red_box_is_never_misplaced():
     box = Slab((0.0, -0.05), (0.15, 0.1), 0.9, rgb=(0.45, 0.12, 0.1))
     found = answer(box, BALL)
     assert reason(found) is Reason.OCCLUDED or sigmas_off(found, BALL) < FAR_SIGMAS
@@ -178,33 +178,33 @@ def test_two_balls_are_ambiguous(other):
 
 # The second of two balls: the border of the left image cuts it at the top, that of the right one at the left, too.
 @pytest.mark.parametrize(("u", "v"), [(200, 4), (120, -3), (55, 10)])
-def test_a_second_ball_that_reaches_out_of_view_makes_the_marker_ambiguous(u, v):
+def test_second_ball_partly_out_of_view_is_ambiguous(u, v):
     assert reason(answer(at_pixel(220, 150), at_pixel(u, v))) is Reason.AMBIGUOUS
 
 
-def test_a_red_board_at_the_border_is_no_second_ball():
+def test_red_board_at_border_is_no_second_ball():
     board = Slab((-0.3, -0.3), (-0.09, -0.05), 0.9, rgb=(0.7, 0.1, 0.1))
     assert sigmas_off(answer(board, BALL), BALL) < FAR_SIGMAS
 
 
-def test_a_second_ball_of_another_size_is_not_taken_for_the_marker():
+def test_second_ball_of_another_size_is_ignored():
     assert sigmas_off(answer(BALL, Ball((0.08, -0.06, 0.8), radius_m=0.012)), BALL) < FAR_SIGMAS
 
 
-def test_a_larger_ball_farther_away_fails_the_size_check():
+def test_larger_distant_ball_fails_size_check():
     # It looks just as large as the marker at half the distance.
     assert reason(answer(Ball((0.05, 0.0, 1.6), radius_m=0.04))) is Reason.SIZE_MISMATCH
 
 
-def test_a_smaller_ball_nearer_by_fails_the_size_check():
+def test_smaller_near_ball_fails_size_check():
     assert reason(answer(Ball((0.02, 0.0, 0.4), radius_m=0.01))) is Reason.SIZE_MISMATCH
 
 
-def test_a_wrong_radius_in_the_configuration_fails_the_size_check():
+def test_wrong_configured_radius_fails_size_check():
     assert reason(answer(BALL, config=VisionConfig(radius_m=0.03))) is Reason.SIZE_MISMATCH
 
 
-def test_eyes_that_see_balls_of_different_sizes_fail_the_size_check():
+def test_different_ball_sizes_between_eyes_fail_size_check():
     left, right = stage(BALL), stage(replace(BALL, radius_m=0.026))
     # Within the depth limit, so that only the comparison of the two images can detect it.
     tracker = StereoTracker(SMALL, VisionConfig(radius_m=0.023))
@@ -252,18 +252,18 @@ def test_an_all_red_image_gives_a_reason():
         (np.zeros(7, np.uint8), "an array of shape"),
     ],
 )
-def test_an_image_that_does_not_fit_the_calibration_is_refused_with_its_eye_named(image, said):
+def test_image_not_fitting_calibration_is_refused_naming_eye(image, said):
     frame = StereoFrame(0.0, stage(BALL).left, image)
     with pytest.raises(SourceError, match=f"the right image is {said}"):
         StereoTracker(SMALL).track(frame)
 
 
-def test_a_ball_over_exposed_to_white_in_part_is_still_found():
+def test_partly_over_exposed_ball_is_found():
     found = answer(BALL, look=Look(specular=1.5, shininess=12.0, noise_sd=2.0))
     assert sigmas_off(found, BALL) < FAR_SIGMAS
 
 
-def test_a_glossy_ball_before_a_white_wall_is_found_as_before_a_grey_one():
+def test_glossy_ball_is_found_before_white_wall():
     # A fifth of the ball is white; with the wall's share of its bounding box it would be too much.
     look = Look(specular=5.0, shininess=4.0, noise_sd=2.0)
     wall = Slab((-9.0, -9.0), (9.0, 9.0), 5.0, rgb=(3.0, 3.0, 3.0))
@@ -271,7 +271,7 @@ def test_a_glossy_ball_before_a_white_wall_is_found_as_before_a_grey_one():
         assert sigmas_off(answer(*things, look=look), BALL) < FAR_SIGMAS
 
 
-def test_the_largest_ball_that_both_eyes_hold_is_found():
+def test_largest_ball_within_both_images_is_found():
     ball = Ball((0.06, 0.0, 0.2))
     tracker = StereoTracker(VGA)
     assert sigmas_off(tracker.track(stage(ball, calibration=VGA)), ball) < FAR_SIGMAS
@@ -282,12 +282,12 @@ def test_a_ball_that_is_mostly_white_is_saturated():
     assert reason(answer(BALL, look=flooded)) in (Reason.SATURATED, Reason.NO_MARKER)
 
 
-def test_a_dimmer_copy_farther_off_is_no_second_marker():
+def test_dimmer_distant_copy_is_no_second_marker():
     mirrored = Ball((-0.02, -0.03, 1.0), rgb=(0.45, 0.04, 0.04))
     assert sigmas_off(answer(BALL, mirrored), BALL) < FAR_SIGMAS
 
 
-def test_a_disc_that_one_eye_alone_measured_is_a_rival_of_what_is_above_it_in_the_other_eye():
+def test_disc_measured_in_one_eye_rivals_disc_above():
     matcher = StereoMatcher(SMALL, VisionConfig())
     copy = seen_discs(Ball((0.0, -0.06, 1.6)), level=60.0)
     found = matcher.match(*([disc] for disc in copy))
@@ -300,7 +300,7 @@ def test_a_disc_that_one_eye_alone_measured_is_a_rival_of_what_is_above_it_in_th
     assert matcher.shows_too(marker[1], [copy[0]], mask, found, in_left=False)
 
 
-def test_a_copy_beside_a_marker_that_was_not_measured_is_a_reflection():
+def test_copy_beside_unmeasured_marker_is_a_reflection():
     matcher = StereoMatcher(SMALL, VisionConfig())
     mirrored = seen_discs(Ball((-0.02, -0.03, 1.0)), level=80.0)
     marker = seen_discs(BALL, level=120.0)
@@ -310,7 +310,7 @@ def test_a_copy_beside_a_marker_that_was_not_measured_is_a_reflection():
     assert matcher.doubt(found, *both_eyes) is Reason.REFLECTION
 
 
-def test_a_ball_found_by_its_brighter_part_is_as_bright_as_when_found_whole():
+def test_brightness_from_brighter_part_matches_whole_ball():
     image, config, gate = stage(BALL).left, VisionConfig(), gate_of(VisionConfig())
     eye = Pinhole(SMALL.focal_px, SMALL.principal_point_px)
     (patch,) = find_patches(image, Region(0, 0, *SMALL.image_size_px), gate)
@@ -322,14 +322,14 @@ def test_a_ball_found_by_its_brighter_part_is_as_bright_as_when_found_whole():
     assert again.level == pytest.approx(whole.level, rel=0.02)
 
 
-def test_the_mirrored_copy_of_a_ball_that_got_hidden_is_a_reflection():
+def test_mirror_copy_of_hidden_ball_is_a_reflection():
     tracker = StereoTracker(SMALL)
     tracker.track(stage(BALL))
     mirrored = Ball((-0.1, -0.1, 1.3), rgb=(0.45, 0.04, 0.04))
     assert reason(tracker.track(stage(mirrored, t=0.1))) is Reason.REFLECTION
 
 
-def test_a_twin_out_of_reach_is_not_taken_for_a_ball_that_got_hidden():
+def test_twin_out_of_reach_has_implausible_speed():
     tracker = StereoTracker(SMALL)
     tracker.track(stage(BALL))
     twin = Ball((-0.1, -0.1, 1.3))
@@ -343,21 +343,21 @@ def test_a_twin_out_of_reach_is_not_taken_for_a_ball_that_got_hidden():
         (Ball((0.02, -0.05, 1.1)), Reason.IMPLAUSIBLE_SPEED),
     ],
 )
-def test_what_cannot_have_been_the_marker_does_not_become_it_while_it_stays_where_it_is(other, said):
+def test_stationary_impostor_is_rejected_in_every_frame(other, said):
     tracker = StereoTracker(SMALL)
     tracker.track(stage(BALL))
     # 0.3 m away, which the marker itself might go in 0.1 s.
     assert [reason(tracker.track(stage(other, t=number / 30))) for number in range(1, 7)] == [said] * 6
 
 
-def test_a_second_after_the_last_fix_the_marker_may_be_anywhere():
+def test_marker_may_be_anywhere_one_second_after_fix():
     tracker = StereoTracker(SMALL)
     tracker.track(stage(BALL))
     elsewhere = Ball((-0.1, -0.1, 1.3))
     assert sigmas_off(tracker.track(stage(elsewhere, t=1.2)), elsewhere) < FAR_SIGMAS
 
 
-def test_eyes_that_disagree_on_the_size_by_more_than_noise_claim_less():
+def test_size_disagreement_between_eyes_inflates_sigma():
     matcher = StereoMatcher(SMALL, VisionConfig())
     agreeing = seen_discs(BALL, level=120.0)
     apart = [agreeing[0], replace(agreeing[1], radius_px=1.02 * agreeing[1].radius_px)]
@@ -366,7 +366,7 @@ def test_eyes_that_disagree_on_the_size_by_more_than_noise_claim_less():
     assert (sigmas[1] > 2.0 * sigmas[0]).all()
 
 
-def test_rows_that_differ_by_less_than_two_sigmas_leave_the_claim_as_it_is():
+def test_row_difference_within_two_sigmas_keeps_covariance():
     matcher = StereoMatcher(SMALL, VisionConfig())
     left, right = seen_discs(BALL, level=120.0)
     sigma_px = float(np.sqrt(left.cov_px[1, 1] + right.cov_px[1, 1]))

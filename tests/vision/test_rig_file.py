@@ -27,7 +27,7 @@ def rig(request) -> StereoRig:
     )  # fmt: skip
 
 
-def test_what_was_written_is_read(rig, tmp_path) -> None:
+def test_rig_file_round_trip_restores_all_values(rig, tmp_path) -> None:
     write_rig(rig, tmp_path / "cameras.toml")
     read = read_rig(tmp_path / "cameras.toml")
     np.testing.assert_array_equal(read.vector, rig.vector)
@@ -37,7 +37,7 @@ def test_what_was_written_is_read(rig, tmp_path) -> None:
     )  # fmt: skip
 
 
-def test_a_file_that_cannot_be_replaced_stays_as_it_was(rig, tmp_path, monkeypatch) -> None:
+def test_failed_write_keeps_existing_file(rig, tmp_path, monkeypatch) -> None:
     file = tmp_path / "cameras.toml"
     write_rig(rig, file)
     before = file.read_bytes()
@@ -93,7 +93,7 @@ def test_damage_is_named_with_its_line(rig, tmp_path, what, by, said) -> None:
         assert raised.value.line is not None
 
 
-def test_a_file_cut_short_is_refused_wherever_it_was_cut(rig, tmp_path) -> None:
+def test_file_truncated_anywhere_is_refused(rig, tmp_path) -> None:
     file = tmp_path / "cameras.toml"
     write_rig(rig, file)
     data = file.read_bytes()
@@ -103,14 +103,14 @@ def test_a_file_cut_short_is_refused_wherever_it_was_cut(rig, tmp_path) -> None:
             read_rig(file)
 
 
-def test_bytes_that_are_no_text_are_told_to_be_calibrated_again(tmp_path) -> None:
+def test_non_utf8_file_error_advises_recalibration(tmp_path) -> None:
     file = tmp_path / "cameras.toml"
     file.write_bytes(b"\x8d\xff\x00")
     with pytest.raises(ConfigError, match=r"not UTF-8 text. Take the file from a copy, or calibrate again"):
         read_rig(file)
 
 
-def test_no_file_says_what_writes_one(tmp_path) -> None:
+def test_missing_file_error_names_calibrate_command(tmp_path) -> None:
     with pytest.raises(ConfigError, match=r"no such file. `bodyschema calibrate cameras` writes one"):
         read_rig(tmp_path / "cameras.toml")
 

@@ -86,11 +86,11 @@ def sigmas_off(fix: MarkerFix | MarkerMiss | None, true: tuple[Rotation, FloatAr
 
 
 @pytest.mark.parametrize("eyes", EYES)
-def test_moving_tag_is_where_it_was_at_its_time(eyes) -> None:
+def test_moving_tag_pose_matches_truth_at_its_timestamp(eyes) -> None:
     assert np.abs(sigmas_off(both_fixes(eyes, READOUT_S)[1])).max() < 4.5
 
 
-def test_global_shutter_that_is_none_is_felt() -> None:
+def test_wrong_global_shutter_assumption_biases_fix() -> None:
     assert np.abs(sigmas_off(both_fixes("one", 0.0)[1])).max() > 8.0
 
 
@@ -165,7 +165,7 @@ def test_sigma_covers_every_readout_of_unknown(eyes, speed) -> None:
     assert (np.abs(off) < 2.0).mean() > 0.9
 
 
-def test_tag_that_was_not_seen_before_is_unsure_of_its_time() -> None:
+def test_newly_seen_tag_has_readout_time_uncertainty() -> None:
     finder = Projected(EYES["one"], 0.0, np.random.default_rng(1))
     body = TagBody({k: TagBody.single(TAG).corners[0] + np.array([0.06 * k, 0.0, 0.0]) for k in (0, 1)})
     tracker = TagTracker(EYES["one"], body, TAG, finder, READOUT_S)  # pyright: ignore[reportArgumentType]
@@ -184,7 +184,7 @@ def test_unknown_readout_costs_nothing_at_rest(eyes) -> None:
     assert np.sqrt(np.diag(b.cov)) == pytest.approx(np.sqrt(np.diag(a.cov)), rel=0.05)
 
 
-def test_time_of_a_fix_is_that_of_its_row() -> None:
+def test_fix_timestamp_is_that_of_its_row() -> None:
     first, second = both_fixes("one", READOUT_S)
     assert isinstance(first, MarkerFix)
     assert isinstance(second, MarkerFix)

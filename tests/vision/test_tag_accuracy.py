@@ -44,7 +44,7 @@ def pose(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
 
 
 @pytest.mark.parametrize("name", LOOKS)
-def test_place_and_turn_of_a_tag_are_as_sure_as_claimed(name, capsys) -> None:
+def test_tag_pose_errors_match_claimed_sigmas(name, capsys) -> None:
     config = TagConfig(side_m=SIDE_M)
     tracker, rng = TagTracker(VGA, TagBody.single(config), config), np.random.default_rng(0)
     pictures = [[backdrop(rng, VGA.image_size_px, None) for _ in range(2)] for _ in range(8)]

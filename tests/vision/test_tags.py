@@ -77,7 +77,7 @@ def _length(error: FloatArray, cov: FloatArray) -> float:
 
 
 @pytest.mark.parametrize("degrees", [0.0, 20.0, 45.0])
-def test_a_tag_is_found_where_and_as_it_is(degrees) -> None:
+def test_tag_pose_error_is_within_its_covariance(degrees) -> None:
     rotation = tilted([1.0, 0.5, 0.3], degrees)
     assert max(off(tracker().track(seen(sheet(rotation=rotation))), rotation, MIDDLE)) < 4.0
 
@@ -112,7 +112,7 @@ def test_corners_come_out_to_hundredths_of_a_pixel() -> None:
 
 
 @pytest.mark.parametrize("blur_px", [0.4, 0.8, 1.4])
-def test_what_blur_brings_from_the_modules_beyond_pulls_no_edge(blur_px) -> None:
+def test_blur_from_neighbouring_modules_pulls_no_edge(blur_px) -> None:
     # Modules of 5 px, before a dark wall.
     rotation, side_m = tilted([0.0, 0.0, 1.0], 20.0), 5.0 * 8 * 0.4 / SMALL.focal_px
     frame = seen(
@@ -163,7 +163,7 @@ BLEEDING = {
 
 
 @pytest.mark.parametrize("look", BLEEDING.values(), ids=BLEEDING)
-def test_white_that_bleeds_into_black_makes_no_tag_smaller(look) -> None:
+def test_white_bleeding_into_black_shrinks_no_tag(look) -> None:
     rotation = tilted([1.0, -0.5, 0.0], 15.0)
     tag, true = measured(sheet(rotation=rotation), look), corners_in_the_left_eye(rotation)
     assert isinstance(tag, TagImage)
@@ -197,7 +197,7 @@ def test_a_covered_pattern_leaves_bleeding_unknown() -> None:
     assert np.trace(covered.cov_px) > 10.0 * np.trace(plain.cov_px)
 
 
-def test_the_least_error_of_an_edge_is_not_added_to_noise(monkeypatch) -> None:
+def test_edge_error_floor_is_not_added_to_noise(monkeypatch) -> None:
     answers = []
     for least_px in (0.0, 0.0007):
         monkeypatch.setattr("bodyschema.vision.tags.edge._Settings.floor_px", least_px)
@@ -245,7 +245,7 @@ def test_a_curled_sheet_is_measured_with_less_certainty() -> None:
     assert np.trace(curled.cov_px) > 2.0 * np.trace(flat.cov_px)
 
 
-def test_a_followed_tag_is_found_after_a_step_and_after_a_jump() -> None:
+def test_followed_tag_is_found_after_step_and_jump() -> None:
     # No edge along the pixels: there the renderer, which blurs after pixels, unlike a lens, is off by 0.015 px.
     found, rotation = tracker(), tilted([0.2, 1.0, 0.3], 20.0)
     for number, x in enumerate(MIDDLE + np.array([[0.0, 0.0, 0.0], [0.004, 0.0, 0.0], [-0.04, 0.03, 0.05]])):
@@ -284,7 +284,7 @@ def test_a_tag_of_another_dictionary_is_named(dictionary, caplog) -> None:
     assert "not one of apriltag_36h11" in caplog.text
 
 
-def test_a_tag_too_small_to_measure_is_no_marker() -> None:
+def test_tag_too_small_to_measure_is_no_marker() -> None:
     assert reason(tracker().track(seen(sheet(x=[0.02, 0.0, 1.2])))) is Reason.NO_MARKER
 
 
@@ -294,7 +294,7 @@ def test_the_same_tag_twice_is_ambiguous() -> None:
 
 
 @pytest.mark.parametrize("printed", [0.9, 0.97, 0.98, 0.99, 1.01, 1.03, 1.1])
-def test_a_tag_printed_in_another_size_is_a_size_mismatch(printed) -> None:
+def test_tag_printed_in_another_size_is_size_mismatch(printed) -> None:
     assert reason(tracker().track(seen(sheet(side_m=printed * SIDE_M)))) is Reason.SIZE_MISMATCH
 
 
@@ -309,7 +309,7 @@ def test_eyes_that_are_interchanged_are_epipolar() -> None:
     assert reason(tracker().track(replace(frame, left=frame.right, right=frame.left))) is Reason.EPIPOLAR
 
 
-def test_a_tag_at_the_border_of_one_eye_gives_no_fix() -> None:
+def test_tag_at_one_eye_s_border_gives_no_fix() -> None:
     u = -SMALL.principal_point_px[0] * 0.4 / SMALL.focal_px
     x = np.array([u + SMALL.baseline_m + SIDE_M / 2 + 0.0005, 0.0, 0.4])
     assert reason(tracker().track(seen(sheet(x=x)))) in {Reason.AT_BORDER, Reason.NO_MARKER}
@@ -323,13 +323,13 @@ def test_a_covered_tag_is_never_a_wrong_fix(covered) -> None:
     assert isinstance(answer, MarkerMiss) or max(off(answer, FACING, MIDDLE)) < 5.0
 
 
-def test_a_cluster_is_found_where_and_as_it_is() -> None:
+def test_cluster_pose_error_is_within_its_covariance() -> None:
     rotation = tilted([0.0, 1.0, 0.0], 40.0)
     frame = seen(*cube_at(rotation, MIDDLE))
     assert max(off(TagTracker(SMALL, CUBE, CONFIG).track(frame), rotation, MIDDLE)) < 4.0
 
 
-def test_a_cluster_of_which_one_tag_is_hidden_is_found_as_well() -> None:
+def test_cluster_with_one_hidden_tag_is_found() -> None:
     # No edge along the pixels: there the renderer, which blurs after pixels, unlike a lens, is off by 0.015 px.
     rotation = tilted([0.2, 1.0, 0.3], 40.0)
     frame = seen(cube_at(rotation, MIDDLE)[0])
@@ -352,7 +352,7 @@ def test_a_tag_refused_by_one_eye_tells_why(monkeypatch: pytest.MonkeyPatch) -> 
     assert reason(TagTracker(SMALL, CUBE, CONFIG).track(frame)) is Reason.LOW_CONTRAST
 
 
-def test_more_tags_of_the_same_noise_give_a_surer_orientation() -> None:
+def test_more_tags_reduce_orientation_covariance() -> None:
     rotation = tilted([0.0, 1.0, 0.0], 40.0)
     sightings = []
     for corners in CUBE.corners.values():
@@ -367,7 +367,7 @@ def test_more_tags_of_the_same_noise_give_a_surer_orientation() -> None:
     assert np.trace(both.cov[:3, :3]) < 0.7 * np.trace(one.cov[:3, :3])
 
 
-def test_tags_that_are_not_where_the_cluster_has_them_are_refused() -> None:
+def test_tags_contradicting_the_cluster_table_are_refused() -> None:
     wrong = TagBody.cluster(
         ClusterConfig(tags=(PLACED[0], PlacedTag(id=2, xyz=(0.03, 0.0, 0.0), rpy=PLACED[1].rpy))), CONFIG
     )
@@ -391,13 +391,13 @@ def test_a_cluster_with_one_tag_twice_is_refused() -> None:
         TagBody.cluster(ClusterConfig(tags=(PLACED[0], PLACED[0])), CONFIG)
 
 
-def test_a_number_that_the_dictionary_does_not_have_is_refused() -> None:
+def test_tag_number_beyond_dictionary_is_refused() -> None:
     with pytest.raises(ConfigError, match="no tag 999 in apriltag_36h11"):
         tracker(TagConfig(id=999))
 
 
 @pytest.mark.parametrize(("marker", "kind"), [("ball", StereoTracker), ("tag", TagTracker)])
-def test_the_tracker_is_that_of_the_marker_that_is_named(marker, kind) -> None:
+def test_tracker_type_follows_configured_marker(marker, kind) -> None:
     assert isinstance(tracker_of(SMALL, VisionConfig(marker=marker)), kind)
 
 
@@ -407,7 +407,7 @@ def test_an_aruco_tag_is_found_in_its_dictionary() -> None:
     assert max(off(tracker(config).track(seen(printed)), FACING, MIDDLE)) < 4.0
 
 
-def test_exact_pixels_give_the_exact_pose_from_a_rough_one() -> None:
+def test_exact_pixels_give_exact_pose_from_rough_start() -> None:
     rng = np.random.default_rng(3)
     points, rotation = 0.05 * rng.normal(size=(8, 3)), Rotation.random(rng=rng).as_matrix()
     pixels = SMALL.project(points @ rotation.T + MIDDLE)
@@ -420,12 +420,12 @@ def test_exact_pixels_give_the_exact_pose_from_a_rough_one() -> None:
     assert pose.x == pytest.approx(MIDDLE, abs=1e-9)
 
 
-def test_the_mirrored_pose_of_a_mirrored_pose_is_the_first() -> None:
+def test_mirroring_a_pose_twice_restores_it() -> None:
     rotation = Rotation.random(rng=np.random.default_rng(4)).as_matrix()
     assert mirrored(mirrored(rotation, MIDDLE), MIDDLE) == pytest.approx(rotation, abs=1e-12)
 
 
-def test_light_beyond_an_edge_is_that_of_square_pixels() -> None:
+def test_blurred_step_matches_light_on_square_pixels() -> None:
     shift = (np.arange(400) + 0.5) / 400.0
     places = np.linspace(-2.0, 2.0, 81)
     whole = np.floor(places[:, None] - shift)

@@ -32,7 +32,7 @@ def test_the_page_s_cluster_is_one() -> None:
     assert list(TagBody.cluster(vision.cluster, vision.tag).corners) == [0, 1]
 
 
-def test_the_page_lists_every_reason_of_the_tag_tracker() -> None:
+def test_page_lists_every_reason_of_tag_tracker() -> None:
     files = (
         ROOT / "vision" / name
         for name in ("tags/edge.py", "tags/image.py", "tags/bleed.py", "tags/finder.py", "tags/tracker.py", "pose.py")

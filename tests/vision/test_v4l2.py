@@ -82,7 +82,7 @@ def complaint(told: dict[str, Any], words: str) -> str:
     return next((text for text in told["health"] if words in text), f"nobody complains: {told}")
 
 
-def test_kernel_stamps_are_taken_and_both_eyes_come_from_one_image(library, camera) -> None:
+def test_kernel_timestamps_are_used_and_eyes_share_image(library, camera) -> None:
     told = probe(library, one(camera("one", WIDE)))
     assert told["stamps"] == ["kernel"]
     assert 0 < np.median(told["behind"]) < 0.1
@@ -90,7 +90,7 @@ def test_kernel_stamps_are_taken_and_both_eyes_come_from_one_image(library, came
     assert {right - left for left, right in told["levels"]} <= {39, 40, 41}
 
 
-def test_two_cameras_say_how_far_apart_their_images_are(library, camera) -> None:
+def test_time_offset_between_cameras_enters_time_sigma(library, camera) -> None:
     told = probe(library, two(camera("left"), camera("right", phase=0.3)))
     assert np.median(told["sigma"]) == pytest.approx(np.hypot(0.3 / FPS, 1e-3), rel=0.02)
 
@@ -102,7 +102,7 @@ def test_uncompressed_images_are_read_too(library, camera) -> None:
 
 
 @pytest.mark.parametrize("stamps", [ZERO, WALL_CLOCK])
-def test_stamps_that_are_not_monotonic_are_replaced_by_the_arrival_and_its_uncertainty(library, camera, stamps) -> None:
+def test_non_monotonic_timestamps_are_replaced_by_arrival_time(library, camera, stamps) -> None:
     device = camera("one", WIDE)
     device.set(stamps=stamps)
     told = probe(library, one(device))
@@ -120,7 +120,7 @@ def test_settings_arrive_at_the_camera(library, camera) -> None:
     assert not any("does not" in text or "focus" in text for text in told["health"])
 
 
-def test_a_setting_that_is_not_taken_and_an_automatic_that_stays_on_are_named(library, camera) -> None:
+def test_ignored_setting_and_persistent_automatic_are_named(library, camera) -> None:
     device = camera("one", WIDE)
     device.make_deaf("gain")
     device.make_deaf("autofocus")
@@ -130,22 +130,22 @@ def test_a_setting_that_is_not_taken_and_an_automatic_that_stays_on_are_named(li
     assert "calibration no longer holds" in complaint(told, "autofocus is on")
 
 
-def test_another_image_size_is_refused_with_what_the_camera_sends(library, camera) -> None:
+def test_wrong_image_size_is_refused_with_actual_size(library, camera) -> None:
     told = probe(library, one(camera("one", GREY)))
     assert told["error"].startswith("SourceError: the stereo camera sends 160x120 pixels, not 320x120")
 
 
-def test_a_third_of_the_frame_rate_is_told_though_the_camera_promised_more(library, camera) -> None:
+def test_reduced_frame_rate_is_reported_despite_camera_promise(library, camera) -> None:
     told = probe(library, one(camera("one", WIDE, fps=10.0, told_fps=30.0), fps=30.0), 20)
     assert "sends 10.0 frames/s instead of 30" in complaint(told, "frames/s")
 
 
-def test_a_camera_that_does_not_offer_the_rate_says_so(library, camera) -> None:
+def test_frame_rate_not_offered_is_reported(library, camera) -> None:
     told = probe(library, one(camera("one", WIDE, fps=10.0), fps=30.0), 10)
     assert "offers 10 frames/s, not 30" in complaint(told, "offers")
 
 
-def test_a_lens_cap_and_over_exposure_are_named_with_their_camera(library, camera) -> None:
+def test_lens_cap_and_over_exposure_name_their_camera(library, camera) -> None:
     black, white = [image // 30 for image in GREY], [np.full_like(image, 255) for image in GREY]
     told = probe(library, two(camera("left", black), camera("right", white)))
     assert "the left camera's image is black: is the lens cap on?" in complaint(told, "black")
@@ -160,7 +160,7 @@ def test_half_images_are_dropped_and_counted(library, camera) -> None:
     assert {right - left for left, right in told["levels"]} <= {39, 40, 41}
 
 
-def test_a_camera_that_sends_only_half_images_does_not_open(library, camera) -> None:
+def test_camera_sending_only_half_images_is_refused(library, camera) -> None:
     device = camera("one", WIDE)
     device.set(torn_every=1)
     assert "sent no whole image" in probe(library, one(device))["error"]
@@ -172,7 +172,7 @@ def test_a_camera_that_is_not_there_is_named(library, camera) -> None:
     assert "is not there. Plug it in" in probe(library, one(device))["error"]
 
 
-def test_two_cameras_that_are_too_much_for_the_bus_are_named(library, camera) -> None:
+def test_silent_second_camera_error_names_shared_hub(library, camera) -> None:
     left, right = camera("left"), camera("right")
     right.set(silent=1)
     told = probe(library, two(left, right))

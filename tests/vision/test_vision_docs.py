@@ -25,7 +25,7 @@ def test_the_pages_example_runs(capsys):
     assert capsys.readouterr().out.strip() in blocks("python")[0]
 
 
-def test_the_page_shows_every_setting_of_a_band_of_hues_with_its_default():
+def test_page_shows_every_hue_band_setting_with_default():
     shown = msgspec.toml.decode(blocks("toml")[0])["vision"]["colour"]
     assert shown == msgspec.to_builtins(HueBand(shown["hue_deg"]))
 
@@ -44,7 +44,7 @@ def test_the_limits_on_the_page_are_the_trackers():
     assert f"farther away than {TrackSettings.fastest_m_s:g} m/s allows" in PAGE
 
 
-def test_the_page_lists_every_reason_that_the_tracker_gives():
+def test_page_lists_every_reason_of_the_tracker():
     files = [file for folder in ("", "ball", "tags") for file in (ROOT / "vision" / folder).glob("*.py")]
     sources = "".join(file.read_text(encoding="utf-8") for file in files)
     given = {Reason[name].value for name in re.findall(r"\bReason\.([A-Z_]+)", sources)}

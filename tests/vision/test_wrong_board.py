@@ -111,7 +111,7 @@ def in_view(*images: FloatArray) -> bool:
     return all(bool(((px > 50.0) & (px < np.array(SIZE) - 50.0)).all()) for px in images)
 
 
-def test_two_eyes_measure_too_much_and_the_remedy_is_the_true_baseline() -> None:
+def test_overstated_squares_are_diagnosed_with_true_baseline_remedy() -> None:
     truth, rectification = calibrated(("A1", "B2"))
     real = replace(rectification.calibration, baseline_m=truth.baseline_m)
 
@@ -158,7 +158,7 @@ def test_one_eye_takes_no_length_from_the_board() -> None:
     assert file.rms_mm.aligned < 1.5
 
 
-def test_a_tag_before_two_eyes_is_refused_for_its_size() -> None:
+def test_overstated_squares_make_stereo_tag_a_size_mismatch() -> None:
     truth, rectification = calibrated(("A1", "B2"))
     shown = photographed_tag(rectification, truth)
     tracker = tracker_of(rectification.calibration, TAG)
