@@ -14,7 +14,8 @@ def long_names(source: str) -> Iterator[str]:
     """Yield the names of tests of more than `MOST_WORDS` words, the possessive `s` left out."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
-            if len([word for word in node.name.split("_")[1:] if word not in {"", "s"}]) > MOST_WORDS:
+            words = [word for word in node.name.split("_")[1:] if word not in {"", "s"}]
+            if len(words) > MOST_WORDS:
                 yield node.name
 
 
