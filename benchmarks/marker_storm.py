@@ -212,6 +212,7 @@ def main() -> None:
     table = Table("ball_storm", [Column("scene"), *(Column(name, "", "{}") for name in numbers)])
     for kind, count in counts.items():
         table.add(kind, count.frames, count.fixes, count.wrong, count.elsewhere, count.good, count.kept)
+    table.add("all", *np.sum([row[1:] for row in table.rows], axis=0, dtype=int).tolist())
     for kind, count in counts.items():
         print(f"{kind}: {', '.join(f'{number} {reason}' for reason, number in count.reasons.most_common())}")
     table.save(arguments.tables)

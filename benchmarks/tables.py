@@ -91,9 +91,12 @@ class Table:
         """Write the table to its file in a folder, if there is one."""
         if folder is None:
             return
+        columns = [
+            {key: text for key, text in asdict(column).items() if text or key == "name"} for column in self.columns
+        ]
         parts = [
             f'"commands": {json.dumps(self.commands, ensure_ascii=False)}',
-            f'"columns": {_listed([{key: value for key, value in asdict(column).items() if value or key == "name"} for column in self.columns])}',
+            f'"columns": {_listed(columns)}',
             f'"rows": {_listed(self.rows)}',
         ]
         (folder / f"{self.name}.json").write_text("{\n" + ",\n".join(parts) + "\n}\n", encoding="utf-8")

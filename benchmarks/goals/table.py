@@ -22,7 +22,7 @@ def overview(rows: Iterable[Row], results: Mapping[str, Sequence[Values]]) -> Ta
     figures = sum(len(cells) for _, cells in judgements)
     lines = [(f"**{row.name}**: {row.what}", [_met(cells), len(cells)], _standing(cells)) for row, cells in judgements]
     totals = "all", [met, figures], f"{reached} of {goals} met"
-    columns = Column("goal"), Column("figures met", "", "{} of {}"), Column("")
+    columns = Column("goal"), Column("figures met", "", "{} of {}"), Column("verdict")
     return Table.of("goals", columns, [*lines, totals], COMMAND)
 
 

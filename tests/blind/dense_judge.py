@@ -244,6 +244,7 @@ def page_table(records: Sequence[DenseJudgement]) -> Table:
     hard = [record.outcome for record in records if not record.decidable]
     if hard:
         shown.add("cannot be decided", len(hard), *outcomes(hard), None)
+    shown.add("all", len(records), *outcomes([record.outcome for record in records]), None)
     return shown
 
 

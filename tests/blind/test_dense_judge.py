@@ -164,6 +164,7 @@ def test_the_page_s_table_counts_a_crash_as_wrong() -> None:
         ["one", 1, 1, 0, 0, 0, 97],
         ["two", 1, 0, 0, 0, 1, 95],
         ["cannot be decided", 1, 0, 1, 0, 0, None],
+        ["all", 3, 1, 1, 0, 1, None],
     ]
     assert shown.commands == ["python -m tests.blind.dense --cases 3 --first-seed 1"]
 
