@@ -209,7 +209,7 @@ def main() -> None:
     except KeyboardInterrupt:
         print("Stopped; so far:")
     numbers = ("frames", "fixes", "wrong", "of other things", "good balls", "kept")
-    table = Table("ball_storm", [Column("scene"), *(Column(name, "", "{}") for name in numbers)])
+    table = Table("ball_storm", [Column("scene"), *(Column(name, "", "{:,}") for name in numbers)])
     for kind, count in counts.items():
         table.add(kind, count.frames, count.fixes, count.wrong, count.elsewhere, count.good, count.kept)
     table.add("all", *np.sum([row[1:] for row in table.rows], axis=0, dtype=int).tolist())
