@@ -377,7 +377,7 @@ def main() -> None:
     if arguments.quiet:
         print_quiet(arguments)
         return
-    delays, names = delays_table(), names_table()
+    delays, names, named = delays_table(), names_table(), list[list[object]]()
     for joints in arguments.joints:
         for sigma in arguments.sigmas:
             for case in CASES:
@@ -388,8 +388,10 @@ def main() -> None:
                     if len(kept) < len(found):
                         print(f"{change}: {len(found) - len(kept)} false alarms before the change")
                     delays.add(change, *delay_cells(kept))
-                    names.rows.append([change, *name_cells(kept)])
-    print(f"\n{names.markdown()}")
+                    named.append([change, *name_cells(kept)])
+    print()
+    for cells in named:
+        names.add(*cells)
     for table in (delays, names):
         table.save(arguments.tables)
 

@@ -208,11 +208,12 @@ def main() -> None:
             run_scene(number, arguments.seed, counts[KINDS[number % len(KINDS)]], listed=arguments.list)
     except KeyboardInterrupt:
         print("Stopped; so far:")
-    numbers = ("frames", "fixes", "wrong", "of other things", "good balls", "kept")
+    numbers = {name: name for name in ("frames", "fixes", "wrong")}
+    numbers |= {"of other things": "elsewhere", "good balls": "good", "kept": "kept"}
     table = Table("ball_storm", [Column("scene"), *(Column(name, "", "{:,}") for name in numbers)])
     for kind, count in counts.items():
-        table.add(kind, count.frames, count.fixes, count.wrong, count.elsewhere, count.good, count.kept)
-    table.add("all", *np.sum([row[1:] for row in table.rows], axis=0, dtype=int).tolist())
+        table.add(kind, *(getattr(count, part) for part in numbers.values()))
+    table.add("all", *(sum(getattr(count, part) for count in counts.values()) for part in numbers.values()))
     for kind, count in counts.items():
         print(f"{kind}: {', '.join(f'{number} {reason}' for reason, number in count.reasons.most_common())}")
     table.save(arguments.tables)

@@ -233,9 +233,9 @@ def main() -> None:
     three = "{:.0f} {:.0f} {:.0f}"
     micrometres = [Column(what, "µm", three) for what in ("RMS error of a fix: across, down, depth", "claimed")]
     columns = Column("arms"), Column("fixes", "", "{:,}"), *micrometres, Column("within 1 sigma", "%", three)
-    table = Table("webcam_fixes", columns)
-    table.add(str(given.seeds), len(error), 1e6 * rms, 1e6 * said, share)
-    table.save(given.tables)
+    shown = Table("webcam_fixes", columns)
+    shown.add(str(given.seeds), len(error), 1e6 * rms, 1e6 * said, share)
+    shown.save(given.tables)
     together = np.sqrt(np.square(table).mean(axis=0))
     print(
         f"arm: {1e6 * together[0]:.0f} µm RMS, {together[0] / together[2]:.2f} times the bound (all directions alike "
