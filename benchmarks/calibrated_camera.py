@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -18,6 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.one_camera import CAMERA, DRAWN, SIDE_M, TEST_POSES, Arm
+from benchmarks.tables import Column, Table, tables_option
 from bodyschema.interfaces.records import FloatArray, Pair, frozen_array
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.nominal import NominalModel
@@ -94,6 +95,7 @@ def main() -> None:
     parser.add_argument("--arms", type=int, default=100)
     parser.add_argument("--pairs", type=int, default=60)
     parser.add_argument("--online", type=int, default=0, help="arms that the online learner learns too")
+    tables_option(parser)
     given = parser.parse_args()
     rows: dict[str, list[tuple[float, ...]]] = {}
     for seed in range(given.arms):
@@ -110,14 +112,21 @@ def main() -> None:
         alone, told = (RigidLearner(arm.nominal, DRAWN) for _ in range(2))
         alone.learn(q, x, cov=cov)
         told.learn(q, x, cov=cov, common=error.errors(alone.predict(q)))
-        for name, learner in (("fixes alone", alone), ("with what fixes share", told)):
+        for name, learner in (("covariances of the fixes", alone), ("and what all fixes share", told)):
             estimate = learner.estimate(test)
-            judge(name, estimate.x, estimate.sigma)
+            judge(f"`RigidLearner`, {name}", estimate.x, estimate.sigma)
         if seed < given.online:
-            for name, common in (("online, fixes alone", None), ("online, with what fixes share", error.variance)):
+            for name, common in (("covariances of the fixes", None), ("and what all fixes share", error.variance)):
                 prediction = online(arm, q, x, cov, common).snapshot.predict(test)
-                judge(name, prediction.x, prediction.sigma)
-    report(rows)
+                judge(f"beside the sampler, {name}", prediction.x, prediction.sigma)
+    millimetres = [Column(what, "mm", "{:.2f}") for what in ("off by, RMS", "claimed")]
+    within = Column("within 1 sigma, 2 sigma", "%", "{:.0f}, {:.0f}")
+    columns = Column("learner, and what it is given"), *millimetres, within, Column("arms", "", "{}")
+    table = Table("webcam_calibrated", columns)
+    for name, of_arms in rows.items():
+        off_m, claimed_m, shares = means(of_arms)
+        table.add(name, 1e3 * off_m, 1e3 * claimed_m, shares, len(of_arms))
+    table.save(given.tables)
 
 
 def figures(off: FloatArray, sigma: FloatArray) -> tuple[float, ...]:
@@ -126,14 +135,10 @@ def figures(off: FloatArray, sigma: FloatArray) -> tuple[float, ...]:
     return *map(float, squares), *(float((np.abs(off) < times * sigma).mean()) for times in (1.0, 2.0))
 
 
-def report(rows: Mapping[str, Sequence[tuple[float, ...]]]) -> None:
-    """Print the means of some arms' figures, a line for each name."""
-    for name, of_arms in rows.items():
-        off, claimed, once, twice = np.mean(of_arms, axis=0)
-        print(
-            f"{name}: off by {1e6 * np.sqrt(off):.1f} µm RMS, {1e6 * np.sqrt(claimed):.1f} claimed, "
-            f"{100 * once:.0f} % within 1 sigma, {100 * twice:.0f} % within 2; {len(of_arms)} arms"
-        )
+def means(of_arms: Sequence[tuple[float, ...]]) -> tuple[float, float, tuple[float, float]]:
+    """Return the RMS of some arms' errors and claims [m], and the shares within 1 and 2 sigma [%]."""
+    off, claimed, once, twice = np.mean(of_arms, axis=0)
+    return float(np.sqrt(off)), float(np.sqrt(claimed)), (100.0 * once, 100.0 * twice)
 
 
 if __name__ == "__main__":

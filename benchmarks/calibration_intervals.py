@@ -14,6 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from benchmarks.tables import Column, Table, tables_option
 from bodyschema.vision.rig.lens import Model
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests" / "vision"))
@@ -25,6 +26,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--rigs", type=int, default=72)
     parser.add_argument("--first", type=int, default=1000, help="the first rig's seed")
+    tables_option(parser)
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     found: dict[Model, list[Figures]] = {"pinhole": [], "fisheye": []}
@@ -39,22 +41,31 @@ def main() -> None:
             print(f"rig {seed} ({lenses}): baseline off by {figures.baseline_mm:+.4f} mm", file=sys.stderr)
     except KeyboardInterrupt:
         print("Stopped; so far:")
-    print("| lenses | rigs | parameters within 1 sigma, 2 sigma | baseline off, RMS | the most | mean in its sigmas |")
-    print("| --- " * 6 + "|")
+    table = Table(
+        "calibration_intervals",
+        [
+            Column("lenses"),
+            Column("rigs", "", "{}"),
+            Column("parameters within 1 sigma, 2 sigma", "%", "{:.0f}, {:.0f}"),
+            Column("baseline off, RMS", "mm", "{:.4f}"),
+            Column("the most", "mm", "{:.4f}"),
+            Column("mean in its sigmas", "", "{:+.2f} ± {:.2f}"),
+        ],
+    )
     for lenses, rigs in found.items():
         if rigs:
-            print(row(lenses, rigs))
+            table.add(lenses, *cells(rigs))
+    table.save(arguments.tables)
 
 
-def row(lenses: str, rigs: list[Figures]) -> str:
-    """Return one line of the table."""
+def cells(rigs: list[Figures]) -> list[object]:
+    """Return the figures of a row."""
     z = np.abs(np.concatenate([each.z for each in rigs]))
     off_mm = np.array([each.baseline_mm for each in rigs])
     in_sigmas = off_mm / [each.baseline_sigma_mm for each in rigs]
-    return (
-        f"| {lenses} | {len(rigs)} | {np.mean(z < 1):.1%}, {np.mean(z < 2):.1%} | {np.sqrt(np.mean(off_mm**2)):.4f} mm "
-        f"| {np.abs(off_mm).max():.4f} mm | {in_sigmas.mean():+.2f} ± {1.0 / np.sqrt(len(rigs)):.2f} |"
-    )
+    within = [100.0 * np.mean(z < 1), 100.0 * np.mean(z < 2)]
+    mean = [in_sigmas.mean(), 1.0 / np.sqrt(len(rigs))]
+    return [len(rigs), within, np.sqrt(np.mean(off_mm**2)), np.abs(off_mm).max(), mean]
 
 
 if __name__ == "__main__":

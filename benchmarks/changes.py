@@ -32,6 +32,7 @@ import numpy as np
 
 from benchmarks.first_pairs import REACH
 from benchmarks.rough_arm import RoughArm, rough_arm
+from benchmarks.tables import Column, Table, tables_option
 from bodyschema.interfaces.records import FloatArray, Pair, frozen_array
 from bodyschema.learning.changes.known_arm import KnownArm, Origin
 from bodyschema.learning.changes.monitor import LOOKED_BACK, ChangeMonitor, Reference
@@ -303,28 +304,44 @@ def seen_in_stereo(x: FloatArray, sigma: float, rng: np.random.Generator) -> tup
     return x + noise, sigma**2 * (np.eye(3) + DEPTH**2 * view[:, :, None] * view[:, None, :])
 
 
-def row(case: Case, found: list[Outcome]) -> str:
-    """Return one line of the table."""
-    kept = [each for each in found if not each.early]
-    delays, *told = (
-        np.array([getattr(each, name) for each in kept])
+def delays_table() -> Table:
+    """Return the empty table of delays."""
+    references = ("change and arm known", "change and model known", "kind and size known")
+    columns = [
+        Column("change"),
+        Column("delay, mean (95 %)", "", "{:.3g} ({:.0f})"),
+        Column(f"not within {LONGEST}", "", "{} of {}"),
+        Column(f"within {IN_TIME}", "%", "{:.0f} ({:.0f})"),
+        *(Column(name, "", "{:.2g}") for name in references),
+    ]
+    return Table("change_detection", columns)
+
+
+def names_table() -> Table:
+    """Return the empty table of shares that are named rightly, undecided, and named wrongly."""
+    columns = [Column(f"after {count}", "%", "{:.0f} / {:.0f} / {:.0f}") for count in NAMED_AFTER]
+    return Table("change_identification", [Column("change"), *columns])
+
+
+def delay_cells(found: list[Outcome]) -> list[object]:
+    """Return the cells of a row of delays; detections before the change do not count."""
+    delays, *references = (
+        np.array([getattr(each, name) for each in found])
         for name in ("delay", "optimal", "optimal_with_model", "undirected")
     )
-    mean, cells = np.minimum(delays, LONGEST).mean(), ""
-    for each in told:
-        # One that counts no pair beyond four sigmas never sees what is far beyond that.
-        optimum = np.minimum(each, LONGEST).mean()
-        cell = f" {optimum:6.1f} {np.mean(each <= IN_TIME):4.0%} {mean / optimum:5.2f} |"
-        cells += cell if np.isfinite(each).any() else 19 * " " + "|"
-    names = [
-        "/".join(f"{np.mean([each.named[k] == said for each in kept]):4.0%}" for said in VERDICTS)
+    seen = np.minimum(delays, LONGEST)
+    within = [100.0 * np.mean(each <= IN_TIME) for each in (delays, references[0])]
+    # A reference that counts no pair beyond four sigmas never sees what is far beyond that.
+    means = [np.minimum(each, LONGEST).mean() if np.isfinite(each).any() else None for each in references]
+    return [[seen.mean(), np.percentile(seen, 95)], [int(np.isinf(delays).sum()), len(found)], within, *means]
+
+
+def name_cells(found: list[Outcome]) -> list[object]:
+    """Return the shares of each verdict after each number of pairs."""
+    return [
+        [100.0 * np.mean([each.named[k] == said for each in found]) for said in VERDICTS]
         for k in range(len(NAMED_AFTER))
     ]
-    late = np.percentile(np.minimum(delays, LONGEST), 95)
-    return (
-        f"  {case.name:20s} {mean:6.1f} {late:4.0f} {np.mean(delays <= IN_TIME):4.0%} |{cells} {'  '.join(names)} | "
-        f"{np.isinf(delays).sum()} missed, {len(found) - len(kept)} early"
-    )
 
 
 def print_quiet(arguments: argparse.Namespace) -> None:
@@ -355,21 +372,28 @@ def main() -> None:
     parser.add_argument("--sigmas", type=float, nargs="+", default=[1.0, 5.0, 20.0], help="[mm]")
     parser.add_argument("--known", type=int, default=KNOWN, help="pairs that the chain knows")
     parser.add_argument("--only", nargs="+", choices=[case.name for case in CASES], default=[], metavar="CASE")
+    tables_option(parser)
     arguments = parser.parse_args()
     if arguments.quiet:
         print_quiet(arguments)
         return
+    delays, names, named = delays_table(), names_table(), list[list[object]]()
     for joints in arguments.joints:
         for sigma in arguments.sigmas:
-            print(
-                f"d = {joints}, sigma {sigma:g} mm, {arguments.seeds} seeds: delay mean, 95 %, within {IN_TIME} | who "
-                f"knows change and arm: mean, within {IN_TIME}, ratio | change and model | kind, size and model | "
-                f"named right/undecided/wrong after {', '.join(map(str, NAMED_AFTER))} pairs"
-            )
             for case in CASES:
                 if not arguments.only or case.name in arguments.only:
                     found = [outcome(case, joints, 1e-3 * sigma, seed, arguments.known) for seed in seeds_of(arguments)]
-                    print(row(case, found), flush=True)
+                    kept = [each for each in found if not each.early]
+                    change = f"{case.name}, {joints} joints, σ = {sigma:g} mm"
+                    if len(kept) < len(found):
+                        print(f"{change}: {len(found) - len(kept)} false alarms before the change")
+                    delays.add(change, *delay_cells(kept))
+                    named.append([change, *name_cells(kept)])
+    print()
+    for cells in named:
+        names.add(*cells)
+    for table in (delays, names):
+        table.save(arguments.tables)
 
 
 if __name__ == "__main__":

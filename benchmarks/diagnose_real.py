@@ -16,6 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.tables import Column, Table, tables_option
 from bodyschema.diagnosis.diagnosis import Diagnosis, diagnose
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.fit import Fit
@@ -33,7 +34,7 @@ ASKED = {"ur5_laser": "mean ≤ 0.090", "wam_laser": "RMS ≤ 1.5"}
 # Share of the rows in a corner of the workspace; opposite corners come one after the other.
 OF_A_CORNER, CORNERS = 0.05, (0, 7, 3, 4, 5, 2, 6, 1)
 # Required mean of each set on such corners [mm].
-ASKED_OF_CORNERS = {"ur5_laser": "0.080", "wam_laser": "2.1"}
+ASKED_OF_CORNERS = {"ur5_laser": 0.080, "wam_laser": 2.1}
 ONE_DAY, ANOTHER_DAY = "ur10_laser_a", "ur10_laser_b"
 ASKED_LATER = "RMS < 0.44, aim 0.33"
 
@@ -123,20 +124,22 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--corners", type=int, default=0, choices=range(9), help="of the workspace to leave out")
     parser.add_argument("--only-corners", action="store_true", help="measure nothing else")
     parser.add_argument("--seed", type=int, default=0)
+    tables_option(parser)
     args = parser.parse_args(argv)
     if args.data is None:
         print(
             "The real recordings (docs/results/real_data.md) are not in this repository: give their folder as --data."
         )
         return
+    mm, asked = (Column(what, "mm", "{:.3g}") for what in ("mean", "goal"))
+    corners = Table("diagnosis_corners", [Column("set"), mm, Column("of the corners", "mm", "{:.3g} to {:.3g}"), asked])
     for name in args.sets if args.corners else ():
         arm = Arm.load(args.data / name, args.every if name == ONE_DAY else 1)
-        errors = []
-        for number in CORNERS[: args.corners]:
-            errors.append(corner_mm(arm, number, args.seed))
-            print(f"{name}: corner {number}, mean {errors[-1].mean():.3f} mm", flush=True)
-        mean, asked = np.concatenate(errors).mean(), ASKED_OF_CORNERS.get(name, "–")
-        print(f"{name}: mean on left-out corners {mean:.3f} mm, asked {asked}", flush=True)
+        errors = [corner_mm(arm, number, args.seed) for number in CORNERS[: args.corners]]
+        means = [error.mean() for error in errors]
+        corners.add(f"`{name}`", np.concatenate(errors).mean(), [min(means), max(means)], ASKED_OF_CORNERS.get(name))
+    if corners.rows:
+        corners.save(args.tables)
     if args.only_corners:
         return
     print("Errors on rows that were not fitted, RMS/mean [mm]; seconds are the processor's.\n")

@@ -1,6 +1,6 @@
 """What it gains that the online learner weighs each direction of a position by its covariance.
 
-Run `python -m benchmarks.directions [--arms N] [--pairs N,N] [--joints 4|6] [--eyes 1|2] [--encoder DEG] [--alike]`.
+Run `python -m benchmarks.directions [--arms N] [--pairs N ...] [--joints 4|6] [--eyes 1|2] [--encoder DEG] [--alike]`.
 The desk arm and the camera of `benchmarks.one_camera`, or an arm of six joints. One eye: covariances of the corners of
 a tag, 0.05 px each, with a depth that is taken to be 2.5 times surer than these alone leave it, as the edges have it:
 10 times less sure than across. Two eyes: a baseline of 250 mm, 0.1 px. The camera's pose and the marker's place are
@@ -17,8 +17,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from benchmarks.calibrated_camera import figures, report
+from benchmarks.calibrated_camera import figures, means
 from benchmarks.one_camera import CAMERA, DRAWN, PLACED, SIDE_M, Arm
+from benchmarks.tables import Column, Table, tables_option
 from bodyschema.interfaces.records import FloatArray, Pair, frozen_array
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.nominal import NominalModel
@@ -94,31 +95,50 @@ def snapshots(arm: Arm, q: FloatArray, x: FloatArray, cov: FloatArray, counts: l
     return found
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--arms", type=int, default=12)
-    parser.add_argument("--pairs", default="150,300,1000")
-    parser.add_argument("--joints", type=int, choices=(4, 6), default=4)
-    parser.add_argument("--eyes", type=int, choices=(1, 2), default=1)
-    parser.add_argument("--encoder", type=float, default=0.0, help="1-sigma of a joint's reading [°]")
-    parser.add_argument("--alike", action="store_true")
-    given = parser.parse_args()
-    counts = sorted(map(int, given.pairs.split(",")))
-    rows: dict[str, list[tuple[float, ...]]] = {f"{count} pairs": [] for count in counts}
+def measured(given: argparse.Namespace, joints: int, eyes: int) -> list[object]:
+    """Return the figures of one kind of arm, the errors [µm] and the coverage [%] after each number of pairs."""
+    rows: list[list[tuple[float, ...]]] = [[] for _ in given.pairs]
     for seed in range(given.arms):
-        rng = np.random.default_rng([77, given.joints, seed])
-        arm = (Arm if given.joints == 4 else SixJoints)(rng)
-        rng = np.random.default_rng([78, given.joints, seed])
-        q, test = arm.postures(counts[-1], rng), arm.postures(TEST_POSES, rng)
-        cov, truth = (one_eye if given.eyes == 1 else two_eyes)(arm, q), arm.true.positions(test)
+        rng = np.random.default_rng([77, joints, seed])
+        arm = (Arm if joints == 4 else SixJoints)(rng)
+        rng = np.random.default_rng([78, joints, seed])
+        q, test = arm.postures(given.pairs[-1], rng), arm.postures(TEST_POSES, rng)
+        cov, truth = (one_eye if eyes == 1 else two_eyes)(arm, q), arm.true.positions(test)
         x = arm.true.positions(q) + np.matvec(np.linalg.cholesky(cov), rng.standard_normal((len(q), 3)))
         q = q + np.radians(given.encoder) * rng.standard_normal(q.shape)
         if given.alike:
             cov = np.trace(cov, axis1=1, axis2=2)[:, None, None] / 3.0 * np.eye(3)
-        for count, snapshot in zip(counts, snapshots(arm, q, x, cov, counts), strict=True):
+        for row, snapshot in zip(rows, snapshots(arm, q, x, cov, given.pairs), strict=True):
             found = snapshot.predict(test)
-            rows[f"{count} pairs"].append(figures(found.x - truth, found.sigma))
-    report(rows)
+            row.append(figures(found.x - truth, found.sigma))
+    cells: list[object] = []
+    for row in rows:
+        off_m, _, shares = means(row)
+        cells += [1e6 * off_m, shares]
+    return cells
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--arms", type=int, default=12)
+    parser.add_argument("--pairs", type=int, nargs="+", default=[150, 300], help="ascending")
+    parser.add_argument("--joints", type=int, nargs="+", choices=(4, 6), default=[4, 6])
+    parser.add_argument("--eyes", type=int, nargs="+", choices=(1, 2), default=[1, 2])
+    parser.add_argument("--encoder", type=float, default=0.0, help="1-sigma of a joint's reading [°]")
+    parser.add_argument("--alike", action="store_true")
+    tables_option(parser)
+    given = parser.parse_args()
+    columns = [Column("joints", "", "{}"), Column("cameras", "", "{}")]
+    for count in given.pairs:
+        columns += [
+            Column(f"{count} pairs: off by, RMS", "µm", "{:.0f}"),
+            Column("within 1 sigma, 2 sigma", "%", "{:.0f}, {:.0f}"),
+        ]
+    table = Table("webcam_directions", columns)
+    for eyes in given.eyes:
+        for joints in given.joints:
+            table.add(joints, eyes, *measured(given, joints, eyes))
+    table.save(given.tables)
 
 
 if __name__ == "__main__":

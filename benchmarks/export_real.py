@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.tables import Column, Table, tables_option
 from bodyschema.diagnosis.diagnosis import diagnose
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.observations import Observations
@@ -45,17 +46,17 @@ def rms_mm(distances: FloatArray) -> float:
     return float(1e3 * np.sqrt(np.square(distances).mean()))
 
 
-def gain(before: FloatArray, after: FloatArray, blocks: NDArray[np.int64]) -> str:
+def gain(before: FloatArray, after: FloatArray, blocks: NDArray[np.int64]) -> list[float]:
     """Return the decrease of the RMS [%], with the 95 % interval over resampled blocks of rows."""
     numbers, rng = np.unique(blocks), np.random.default_rng(0)
     sums = np.array([[np.square(d[blocks == b]).sum() for d in (before, after)] for b in numbers])
     drawn = sums[rng.integers(len(numbers), size=(DRAWS, len(numbers)))].sum(axis=1)
     low, high = np.quantile(100.0 * (1.0 - np.sqrt(drawn[:, 1] / drawn[:, 0])), [0.025, 0.975])
-    return f"{100.0 * (1.0 - rms_mm(after) / rms_mm(before)):.1f} [{low:.1f}, {high:.1f}]"
+    return [100.0 * (1.0 - rms_mm(after) / rms_mm(before)), low, high]
 
 
-def row(folder: Path) -> str:
-    """Return one row of the table."""
+def row(folder: Path) -> list[object]:
+    """Return the cells of one row of the table."""
     simulation = load_simulation(folder / "robot.toml")
     recording = Recording.read(folder / "measured.csv", simulation.robot.joints)
     tenth = np.arange(len(recording)) * TENTHS // len(recording)
@@ -79,23 +80,35 @@ def row(folder: Path) -> str:
     left = {name: np.linalg.norm(x - asked.x, axis=1) for name, x in predicted.items()}
     # Rows that lie next to each other are not independent: thirty blocks of them.
     blocks = np.arange(len(asked)) * 30 // len(asked)
-    cells = [f"`{folder.name}`", f"{len(known)} / {len(asked)}", f"{rms_mm(left['before']):.3f}"]
+    cells: list[object] = [f"`{folder.name}`", [len(known), len(asked)], rms_mm(left["before"])]
     percent = gains.held_out_percent if gains.with_outliers_percent is None else gains.with_outliers_percent
-    cells += [f"{percent:.1f} [{promised[0]:.1f}, {promised[1]:.1f}]"]
+    cells.append([percent, *promised])
     for name in ("mjcf", "correction"):
-        cells += [f"{rms_mm(left[name]):.3f}", gain(left["before"], left[name], blocks)]
-    return f"| {' | '.join(cells)} |"
+        cells += [rms_mm(left[name]), gain(left["before"], left[name], blocks)]
+    return cells
 
 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, required=True, help="The folder of the recordings.")
-    folder = parser.parse_args().data
-    print("| recording | rows | before [mm] | promised [%] | MJCF [mm] | gain [%] | correction [mm] | gain [%] |")
-    print("| --- | --- | --- | --- | --- | --- | --- | --- |")
+    tables_option(parser)
+    given = parser.parse_args()
+    interval = "{:.1f} [{:.1f}, {:.1f}]"
+    columns = [
+        Column("recording"),
+        Column("rows diagnosed, held out", "", "{}, {}"),
+        Column("before", "mm", "{:.3g}"),
+        Column("promised by `diagnose`", "%", interval),
+        Column("MJCF in MuJoCo", "mm", "{:.3g}"),
+        Column("gain", "%", interval),
+        Column("correction.json", "mm", "{:.3g}"),
+        Column("gain", "%", interval),
+    ]
+    table = Table("export_real", columns)
     for robot in ROBOTS:
-        print(row(folder / robot), flush=True)
+        table.add(*row(given.data / robot))
+    table.save(given.tables)
 
 
 if __name__ == "__main__":

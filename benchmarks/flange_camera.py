@@ -28,6 +28,7 @@ from benchmarks import one_camera
 from benchmarks.calibrated_camera import LENS, SIDE_SIGMA_M, frame_turn
 from benchmarks.hand_eye import transform, wrist_camera
 from benchmarks.one_camera import BORDER_PX, CAMERA, MOST_OBLIQUE, ROBOT, SIDE_M, TAG, image
+from benchmarks.tables import Column, Table, tables_option
 from bodyschema.calibration.plausibility.check import plausibility
 from bodyschema.calibration.report import CalibrationReport
 from bodyschema.calibration.rigid_chain import Calibration
@@ -131,6 +132,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--arms", type=int, default=24)
     parser.add_argument("--pairs", type=int, default=60)
+    tables_option(parser)
     given = parser.parse_args()
     robot, off, claimed = wrist_camera(), [], []
     for seed in range(given.arms):
@@ -147,11 +149,14 @@ def main() -> None:
         off.append([figure.learnt for figure in learnt] - wrist.truth(rig))
         claimed.append([figure.half_width / 1.96 for figure in learnt])
     error, sigma = np.array(off), np.array(claimed)
-    print(f"{given.arms} arms of {given.pairs} postures: error (RMS), claimed, within 1 and 2 sigma")
+    lengths = [Column(what, "", "{:.3f}") for what in ("RMS error", "claimed")]
+    shares = [Column(f"within {number} sigma", "", "{} of {}") for number in (1, 2)]
+    table = Table("flange_camera", [Column("T_flange_camera"), *lengths, *shares])
     for k, name in enumerate(NAMES):
         rms, said = np.sqrt(np.square(error[:, k]).mean()), np.sqrt(np.square(sigma[:, k]).mean())
-        shares = [int((np.abs(error[:, k]) < wide * sigma[:, k]).sum()) for wide in (1.0, 2.0)]
-        print(f"{name:9} {rms:.3f} {said:.3f}  {shares[0]} and {shares[1]} of {given.arms}")
+        within = [int((np.abs(error[:, k]) < wide * sigma[:, k]).sum()) for wide in (1.0, 2.0)]
+        table.add(name, rms, said, *([count, given.arms] for count in within))
+    table.save(given.tables)
 
 
 if __name__ == "__main__":

@@ -32,6 +32,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.tables import Column, Table, tables_option
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.transport.keys import Keys
 from bodyschema.daemon.transport.session import Request, ZenohSession, client
@@ -172,8 +173,8 @@ class Course:
     seconds: float
 
 
-def measure(robots: int, course: Course, processes: int) -> str:
-    """One row of the table."""
+def measure(robots: int, course: Course, processes: int) -> list[object]:
+    """Return the cells of one row of the table."""
     with tempfile.TemporaryDirectory() as folder:
         sampler, ends = free_endpoint(), [free_endpoint() for _ in range(processes)]
         files = [
@@ -195,7 +196,7 @@ def measure(robots: int, course: Course, processes: int) -> str:
                 host.wait(60)
 
 
-def _row(pid: int, ends: list[str], walks: list[Walk], publish: list, course: Course) -> str:
+def _row(pid: int, ends: list[str], walks: list[Walk], publish: list, course: Course) -> list[object]:
     _publish(walks, publish, course.rate, course.warm_s)
     asker = Asker(ends, walks)
     asker.start()
@@ -205,11 +206,9 @@ def _row(pid: int, ends: list[str], walks: list[Walk], publish: list, course: Co
     asker.end()
     used = {part: after.seconds[part] - before.seconds[part] for part in PARTS}
     median, late, worst = np.quantile(asker.behind, [0.5, 0.99, 1.0])
-    per_pair = " | ".join(f"{1e3 * seconds / published:.2f}" for seconds in used.values())
-    return (
-        f"| {len(walks)} | {published / spent:.0f} | {per_pair} | {sum(used.values()) / spent:.2f} | "
-        f"{median:.0f}, {late:.0f}, {worst:.0f} | {after.memory / len(walks) / 1e6:.0f} | {load:.0f} |"
-    )
+    per_pair = [1e3 * seconds / published for seconds in used.values()]
+    cores, behind = sum(used.values()) / spent, [median, late, worst]
+    return [len(walks), published / spent, *per_pair, cores, behind, after.memory / len(walks) / 1e6, load]
 
 
 def _publish(walks: list[Walk], publish: list, rate: float, seconds: float) -> int:
@@ -248,12 +247,22 @@ def main() -> None:
     parser.add_argument("--warm", type=float, default=20.0)
     parser.add_argument("--seconds", type=float, default=20.0)
     parser.add_argument("--processes", type=int, default=2)
+    tables_option(parser)
     asked = parser.parse_args()
-    print(f"| robots | pairs/s | {' | '.join(f'{part}, ms' for part in PARTS)} | cores | behind | MB | load |")
-    print("| --- " * (len(PARTS) + 6) + "|")
+    columns = [
+        Column("robots", "", "{}"),
+        Column("pairs/s", "", "{:.0f}"),
+        *(Column(f"{part}, a pair", "ms", "{:.2f}") for part in PARTS),
+        Column("cores", "", "{:.2f}"),
+        Column("behind: median, 99 %, most", "", "{:.0f}, {:.0f}, {:.0f}"),
+        Column("memory of each", "MB", "{:.0f}"),
+        Column("load", "", "{:.0f}"),
+    ]
+    table = Table("fleet", columns)
     for robots in map(int, asked.robots.split(",")):
         course = Course(asked.rate, asked.warm, asked.seconds)
-        print(measure(robots, course, min(asked.processes, robots)), flush=True)
+        table.add(*measure(robots, course, min(asked.processes, robots)))
+    table.save(asked.tables)
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks.tables import Column, Table, tables_option
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
@@ -148,6 +149,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--views", type=int, default=20)
     parser.add_argument("--opencv4", type=Path, help="A Python interpreter that has OpenCV 4.")
+    tables_option(parser)
     given = parser.parse_args()
     robot = wrist_camera()
     errors: dict[str, list[tuple[float, float]]] = {}
@@ -158,7 +160,7 @@ def main() -> None:
         q, poses, grippers = views(robot, T, given.views, rng)
         own, inside = learnt(robot.chain, q, poses, T)
         within.append(inside)
-        found = {"this learner": own}
+        found = {"`RigidLearner`, all covariances": own}
         if given.opencv4 is not None:
             found |= of_opencv(given.opencv4, grippers, poses)
         for name, guess in found.items():
@@ -168,12 +170,13 @@ def main() -> None:
         f"{given.seeds} arms, {given.views} views each; T_flange_camera: RMS and largest error. This learner's 95 % "
         f"intervals hold {100.0 * np.mean(within):.0f} % of the numbers"
     )
+    both = "{:.2g} ({:.2g})"
+    columns = Column("method"), Column("place, RMS (largest)", "mm", both), Column("turn, RMS (largest)", "°", both)
+    table = Table("hand_eye", columns)
     for name, each in errors.items():
-        place, turn = np.array(each).T
-        print(
-            f"{name:13} {1e3 * np.sqrt(np.mean(place**2)):7.3f} mm (largest {1e3 * place.max():.3f}), "
-            f"{np.degrees(np.sqrt(np.mean(turn**2))):.4f}° (largest {np.degrees(turn.max()):.4f})"
-        )
+        place, turn = 1e3 * np.array(each).T[0], np.degrees(np.array(each).T[1])
+        table.add(name, *([np.sqrt(np.mean(part**2)), part.max()] for part in (place, turn)))
+    table.save(given.tables)
 
 
 if __name__ == "__main__":

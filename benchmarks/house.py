@@ -173,6 +173,7 @@ def measures() -> dict[str, float | str]:
         "docstrings that begin with a question": f"{_questions(texts):.1%}",
         "words in README": _words(ROOT / "README.md"),
         "words in the users' docs": sum(_words(page) for page in users),
+        "words in pages of results": sum(_words(page) for page in pages if page.parent.name == "results"),
         "words in pages written from the source": sum(
             _words(page) for page in (ROOT / "docs" / "reference").glob("*.md")
         ),

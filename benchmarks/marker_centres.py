@@ -18,6 +18,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from benchmarks.tables import Column, Table, tables_option
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray, ImageArray, MarkerFix, StereoFrame
 from bodyschema.vision.ball.blob import Disc, Region, find_patches, measure
@@ -88,8 +89,8 @@ def ours(image: ImageArray, region: Region) -> FloatArray | None:
     return None
 
 
-def compare_centres(name: str, look: Look, frames: int, seed: int) -> None:
-    """Print a row of errors for each detector."""
+def compare_centres(table: Table, name: str, look: Look, frames: int, seed: int) -> None:
+    """Add a row of errors for each detector."""
     rng = np.random.default_rng(seed)
     errors: dict[str, list[FloatArray]] = {"tracker": [], **{rival: [] for rival in RIVALS}}
     seconds = dict.fromkeys(errors, 0.0)
@@ -119,11 +120,8 @@ def compare_centres(name: str, look: Look, frames: int, seed: int) -> None:
         off = np.array(found)
         rms, worst = np.sqrt(np.mean(off**2)), np.quantile(np.abs(off), 0.99)
         bias = np.abs(off.mean(axis=0)).max()
-        rate = 1e3 * seconds[rival] / frames
-        print(
-            f"| {name} | {rival} | {rms:.3f} | {np.median(np.abs(off)):.3f} | {worst:.3f} | {bias:.3f} "
-            f"| {100 * len(off) / frames:.1f} | {rate:.2f} |"
-        )
+        found_percent, each_ms = 100 * len(off) / frames, 1e3 * seconds[rival] / frames
+        table.add(f"{name}, {rival}", rms, np.median(np.abs(off)), worst, bias, found_percent, each_ms)
 
 
 def information(x: FloatArray, look: Look, pictures: list[FloatArray], calibration: StereoCalibration) -> FloatArray:
@@ -147,8 +145,8 @@ def information(x: FloatArray, look: Look, pictures: list[FloatArray], calibrati
     return total
 
 
-def against_the_bound(name: str, look: Look, frames: int, bounds: int, seed: int) -> None:
-    """Print the error in space at 1 m, beside its bound."""
+def against_the_bound(table: Table, name: str, look: Look, frames: int, bounds: int, seed: int) -> None:
+    """Add the error in space at 1 m, beside its bound."""
     rng = np.random.default_rng(seed)
     tracker = StereoTracker(AT_ONE_METRE)
     errors, sigmas, limits = [], [], []
@@ -169,14 +167,7 @@ def against_the_bound(name: str, look: Look, frames: int, bounds: int, seed: int
     rms, bound = np.sqrt(np.mean(off**2, axis=0)), np.sqrt(np.mean(limits, axis=0))
     covered = 100 * np.mean(np.abs(off) < np.array(sigmas), axis=0)
     spread = np.quantile(np.abs(off), 0.683, axis=0)
-    columns = [
-        " ".join(f"{1e6 * value:.0f}" for value in rms),
-        " ".join(f"{1e6 * value:.0f}" for value in bound),
-        " ".join(f"{ratio:.2f}" for ratio in rms / bound),
-        " ".join(f"{ratio:.2f}" for ratio in spread / bound),
-        " ".join(f"{share:.0f}" for share in covered),
-    ]
-    print(f"| {name} | {' | '.join(columns)} | {len(off)} of {frames} |")
+    table.add(name, 1e6 * rms, 1e6 * bound, rms / bound, spread / bound, covered, [len(off), frames])
 
 
 def main() -> None:
@@ -184,20 +175,33 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=400, help="images of each kind")
     parser.add_argument("--bounds", type=int, default=12, help="frames whose bound is computed")
     parser.add_argument("--seed", type=int, default=1)
+    tables_option(parser)
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
-    print(
-        "| scene | detector | RMS [px] | median [px] | 99 % [px] | bias [px] | found [%] | ms |\n" + "| --- " * 8 + "|"
-    )
+    px = [Column(name, "px", "{:.3f}") for name in ("RMS", "median", "99 %", "bias")]
+    costs = Column("found", "%", "{:.1f}"), Column("time", "ms", "{:.2f}")
+    centres = Table("ball_centres", [Column("scene, detector"), *px, *costs])
     for name, look in LOOKS.items():
-        compare_centres(name, look, arguments.frames, arguments.seed)
-    print(
-        "\n| at 1 m | RMS x y z [µm] | bound [µm] | RMS / bound | 68 % / bound | within 1 sigma [%] | fixes |\n"
-        + "| --- " * 7
-        + "|"
+        compare_centres(centres, name, look, arguments.frames, arguments.seed)
+    centres.save(arguments.tables)
+    whole, ratio = "{:.0f} {:.0f} {:.0f}", "{:.2f} {:.2f} {:.2f}"
+    at_one_metre = Table(
+        "ball_bound",
+        [
+            Column("at 1 m"),
+            Column("RMS x y z", "µm", whole),
+            Column("bound", "µm", whole),
+            Column("RMS / bound", "", ratio),
+            Column("68 % / bound", "", ratio),
+            Column("within 1 sigma", "%", whole),
+            Column("fixes", "", "{} of {}"),
+        ],
     )
+    print()
     for name in ("even wall", "clutter"):
-        against_the_bound(name, LOOKS[name], arguments.frames // 2, arguments.bounds, arguments.seed)
+        look, frames = LOOKS[name], arguments.frames // 2
+        against_the_bound(at_one_metre, name, look, frames, arguments.bounds, arguments.seed)
+    at_one_metre.save(arguments.tables)
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from benchmarks.tables import Column, Table, tables_option
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray, MarkerFix, StereoFrame
 from bodyschema.vision.ball.tracker import StereoTracker
@@ -80,6 +81,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--pairs", type=int, default=30, help="of each film")
     parser.add_argument("--rounds", type=int, default=5)
+    tables_option(parser)
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     films = {
@@ -95,14 +97,23 @@ def main() -> None:
             for column, forget in enumerate((False, True)):
                 seconds, fixes[key][column] = tracked(calibration, frames, forget=forget)
                 times[key][column].append(seconds)
-    print("| images | radius | followed [ms] | pairs/s | whole images [ms] | fixes |\n" + "| --- " * 6 + "|")
+    table = Table(
+        "ball_speed",
+        [
+            Column("images"),
+            Column("radius"),
+            Column("followed", "ms", "{:.1f}"),
+            Column("pairs/s", "", "{:.0f}"),
+            Column("whole images", "ms", "{:.1f}"),
+            Column("fixes", "", "{0} of {2} and {1} of {2}"),
+        ],
+    )
     for (name, radius_px, brick), columns in times.items():
         followed, whole = (1e3 * float(np.min(rounds, axis=0).mean()) for rounds in columns)
         beside = ", brick beside it" if brick else ""
-        found = " and ".join(f"{count} of {arguments.pairs}" for count in fixes[name, radius_px, brick])
-        print(
-            f"| {name} | {radius_px:.0f} px{beside} | {followed:.1f} | {1e3 / followed:.0f} | {whole:.1f} | {found} |"
-        )
+        found = *fixes[name, radius_px, brick], arguments.pairs
+        table.add(name, f"{radius_px:.0f} px{beside}", followed, 1e3 / followed, whole, found)
+    table.save(arguments.tables)
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from benchmarks.tables import Column, Table, tables_option
 from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, StereoFrame
 from bodyschema.vision.ball.settings import PatchSettings
 from bodyschema.vision.ball.sphere import Pinhole
@@ -196,6 +197,7 @@ def main() -> None:
     parser.add_argument("--list", action="store_true", help="name the scenes of wrong fixes and of good balls refused")
     parser.add_argument("--first", type=int, default=0, help="the number of the first scene, to go on with a storm")
     parser.add_argument("--only", type=int, help="the number of one scene")
+    tables_option(parser)
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     counts = {kind: Count() for kind in KINDS}
@@ -206,13 +208,15 @@ def main() -> None:
             run_scene(number, arguments.seed, counts[KINDS[number % len(KINDS)]], listed=arguments.list)
     except KeyboardInterrupt:
         print("Stopped; so far:")
-    print(
-        "| scene | frames | fixes | wrong | of other things | good balls | kept | rejected as |\n" + "| --- " * 8 + "|"
-    )
+    numbers = {name: name for name in ("frames", "fixes", "wrong")}
+    numbers |= {"of other things": "elsewhere", "good balls": "good", "kept": "kept"}
+    table = Table("ball_storm", [Column("scene"), *(Column(name, "", "{:,}") for name in numbers)])
     for kind, count in counts.items():
-        said = ", ".join(f"{number} {reason}" for reason, number in count.reasons.most_common())
-        told = count.frames, count.fixes, count.wrong, count.elsewhere, count.good, count.kept
-        print(f"| {kind} | {' | '.join(map(str, told))} | {said} |")
+        table.add(kind, *(getattr(count, part) for part in numbers.values()))
+    table.add("all", *(sum(getattr(count, part) for count in counts.values()) for part in numbers.values()))
+    for kind, count in counts.items():
+        print(f"{kind}: {', '.join(f'{number} {reason}' for reason, number in count.reasons.most_common())}")
+    table.save(arguments.tables)
     frames, wrong, elsewhere, good, kept = (
         sum(getattr(count, part) for count in counts.values())
         for part in ("frames", "wrong", "elsewhere", "good", "kept")

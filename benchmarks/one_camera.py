@@ -24,6 +24,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks.tables import Column, Table, tables_option
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray, ImageArray, MarkerFix, StereoFrame
 from bodyschema.robot.description import RobotDescription
@@ -201,6 +202,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--pairs", type=int, default=300)
+    tables_option(parser)
     given = parser.parse_args()
     errors, claims, rows = [], [], []
     for seed in range(given.seeds):
@@ -228,7 +230,12 @@ def main() -> None:
     error, claim, table = np.concatenate(errors), np.concatenate(claims), np.array(rows)
     rms, said = np.sqrt(np.square(error).mean(axis=0)), np.sqrt(np.square(claim).mean(axis=0))
     share = 100.0 * (np.abs(error) < claim).mean(axis=0)
-    print(f"fixes: RMS x y z {1e6 * rms} µm, claimed {1e6 * said} µm, within 1 sigma {share} %, n = {len(error)}")
+    three = "{:.0f} {:.0f} {:.0f}"
+    micrometres = [Column(what, "µm", three) for what in ("RMS error of a fix: across, down, depth", "claimed")]
+    columns = Column("arms"), Column("fixes", "", "{:,}"), *micrometres, Column("within 1 sigma", "%", three)
+    shown = Table("webcam_fixes", columns)
+    shown.add(str(given.seeds), len(error), 1e6 * rms, 1e6 * said, share)
+    shown.save(given.tables)
     together = np.sqrt(np.square(table).mean(axis=0))
     print(
         f"arm: {1e6 * together[0]:.0f} µm RMS, {together[0] / together[2]:.2f} times the bound (all directions alike "

@@ -12,6 +12,7 @@ import time
 
 import numpy as np
 
+from benchmarks.tables import Column, Table, tables_option
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.description import RobotDescription
@@ -48,8 +49,8 @@ def guide(
 
 def report_guiding(
     robot: RobotDescription, calibration: StereoCalibration, seeds: int, seconds: float, tool: FloatArray
-) -> None:
-    """Print one line a seed, and the mean."""
+) -> FloatArray:
+    """Print one line a seed, and the mean; return the figures (seeds, 7)."""
     print("seed   1..3 deg   < 1 deg   > 3 deg   visible   least covered   nominal error   times real time")
     rows = []
     for seed in range(1, seeds + 1):
@@ -63,6 +64,7 @@ def report_guiding(
         rows.append([good, short, far, visible, covered.min(), error_mm.mean(), speed])
         _print_row(f"{seed:4}", rows[-1])
     _print_row("mean", list(np.mean(rows, axis=0)))
+    return np.array(rows)
 
 
 def report_frames(robot: RobotDescription, frames: int) -> None:
@@ -91,12 +93,27 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10, help="number of seeds, from 1")
     parser.add_argument("--seconds", type=float, default=60.0, help="simulated seconds of each")
     parser.add_argument("--frames", type=int, default=200, help="stereo frames to time")
+    tables_option(parser)
     arguments = parser.parse_args()
     robot = RobotDescription.load(model_file("upper_body"))
     assert robot.calibration is not None
+    columns = [
+        Column("guided with"),
+        Column("frames 1° to 3° after their predecessor, mean (worst)", "%", "{:.1f} ({:.1f})"),
+        Column("farther than 3°", "%", "{:.1f}"),
+        Column("ball visible to both cameras, mean (worst)", "%", "{:.1f} ({:.1f})"),
+        Column("nominal model's error, mean (range)", "mm", "{:.1f} ({:.0f} to {:.0f})"),
+        Column("times real time", "", "{:.1f}"),
+    ]
+    table = Table("simulated_robot", columns)
     for name, tool in (("the shipped tool", robot.robot.marker_xyz), ("a tool 250 mm longer", LONG_TOOL)):
         print(f"guided with {name} for {arguments.seconds:g} s")
-        report_guiding(robot, robot.calibration, arguments.seeds, arguments.seconds, np.array(tool))
+        found = report_guiding(robot, robot.calibration, arguments.seeds, arguments.seconds, np.array(tool))
+        good, _, far, visible, _, error_mm, speed = found.T
+        shares = [[100.0 * each.mean(), 100.0 * each.min()] for each in (good, visible)]
+        errors_mm = [error_mm.mean(), error_mm.min(), error_mm.max()]
+        table.add(name, shares[0], 100.0 * far.mean(), shares[1], errors_mm, speed.mean())
+    table.save(arguments.tables)
     report_frames(robot, arguments.frames)
 
 

@@ -25,11 +25,19 @@ import cv2
 import numpy as np
 from scipy.optimize import least_squares
 
+from benchmarks.tables import Column, Table, tables_option
 from bodyschema.interfaces.records import FloatArray, ImageArray
 from bodyschema.vision.tags import image
 from bodyschema.vision.tags.config import TagConfig
 
 FEWEST, LONGEST_PX = 6, 2048
+OPENCV = ("SUBPIX", "CONTOUR", "APRILTAG")
+DETECTORS = (
+    "tracker",
+    "tracker, bleeding not corrected",
+    "pupil_apriltags",
+    *(f"cv2.aruco, {name}" for name in OPENCV),
+)
 # Script run by the interpreter that has pupil_apriltags: an image in, the tags' numbers and corners out.
 ASKED = """
 import json, os, sys
@@ -162,9 +170,8 @@ def photograph(path: Path, grid: Grid, lens: int, pupil: str | None) -> dict[str
     rough = grid.opencv(grey, cv2.aruco.CORNER_REFINE_NONE)
     corrected, covariances = ours(grey, grid, rough, bleeding=True)
     answers = {"tracker": corrected, "tracker, bleeding not corrected": ours(grey, grid, rough, bleeding=False)[0]}
-    refinements = {"SUBPIX": cv2.aruco.CORNER_REFINE_SUBPIX, "CONTOUR": cv2.aruco.CORNER_REFINE_CONTOUR}
-    refinements["APRILTAG"] = cv2.aruco.CORNER_REFINE_APRILTAG
-    answers |= {f"cv2.aruco, {name}": grid.opencv(grey, number) for name, number in refinements.items()}
+    for name in OPENCV:
+        answers[f"cv2.aruco, {name}"] = grid.opencv(grey, getattr(cv2.aruco, f"CORNER_REFINE_{name}"))
     if pupil is not None:
         answers["pupil_apriltags"] = april_tag(pupil, grey, grid.border)
     answers = {name: corners for name, corners in answers.items() if len(corners) >= FEWEST}
@@ -209,12 +216,18 @@ def main() -> None:
     parser.add_argument("--border", type=int, default=1)
     parser.add_argument("--pupil")
     parser.add_argument("--lens", type=int, default=5, choices=range(6))
+    tables_option(parser)
     asked = parser.parse_args()
     cv2.setNumThreads(1)
     grid = Grid(asked.dictionary, asked.columns, asked.pitch, asked.border)
     rows = map(partial(photograph, grid=grid, lens=asked.lens, pupil=asked.pupil), sorted(asked.folder.iterdir()))
+    each = [Column(name, "px", "{:.2f}, {:+.2f}") for name in DETECTORS]
+    within = Column("within 1 sigma, 2 sigma, tracker", "%", "{:.0f}, {:.0f}")
+    table = Table("tag_grids", [Column("photograph"), Column("tags", "", "{} of {}"), *each, within])
     for row in filter(None, rows):
-        print(json.dumps(row))
+        figures = [(row[name]["rms_px"], row[name]["edge_outward_px"]) if name in row else None for name in DETECTORS]
+        table.add(row["photograph"], row["tags"], *figures, [100.0 * share for share in row["within"]])
+    table.save(asked.tables)
 
 
 if __name__ == "__main__":

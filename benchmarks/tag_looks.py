@@ -23,6 +23,7 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "vision"))
 from ball_renderer import SMALL, VGA, Look
 from tag_renderer import Sheet, photograph
 
+from benchmarks.tables import Column, Table, tables_option
 from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss
 from bodyschema.vision.tags.body import TagBody
 from bodyschema.vision.tags.config import TagConfig
@@ -33,9 +34,9 @@ TAG = TagConfig(side_m=SIDE_M)
 # What the tracker is given: the readout, and the RMS of one that is not known at 30 frames a second.
 TOLD = {
     "0": (0.0, 0.0),
-    "as it is": (READOUT_S, 0.0),
-    "1.3 times": (1.3 * READOUT_S, 0.0),
-    "not known": (0.0, 1.0 / 30.0 / 3.0**0.5),
+    "20 ms": (READOUT_S, 0.0),
+    "26 ms, wrong by 30 %": (1.3 * READOUT_S, 0.0),
+    "absent": (0.0, 1.0 / 30.0 / 3.0**0.5),
 }
 # Luminance of red, green and blue stripes is left of a pixel's middle by this share of it.
 LEFT = 0.062
@@ -58,18 +59,26 @@ class Judged:
         self.errors.append(np.array([*(found.x - x), *turn]))
         self.sigmas.append(np.sqrt([*np.diag(found.cov), *np.diag(found.cov_R)]))
 
-    def __str__(self) -> str:
+    def cells(self) -> list[object]:
+        """Return the cells under `COLUMNS`."""
+        misses = "".join(f", {number} `{reason}`" for reason, number in self.misses.items())
+        fixes = f"{len(self.errors)}{misses}"
         if not self.errors:
-            return f"no fix {dict(self.misses)}"
+            return [fixes, None, None, None, None]
         off, sigma = np.array(self.errors), np.array(self.sigmas)
         rms = [np.sqrt(np.square(each).mean(axis=0)) for each in (off, sigma)]
-        place, turn = (
-            (" ".join(f"{1e3 * value:.3f}" for value in each[:3]) for each in rms),
-            [f"{np.degrees(np.sqrt(np.square(each[3:]).mean())):.3f}" for each in rms],
-        )
-        within = [f"{100.0 * (np.abs(off) < times * sigma).mean():.0f}" for times in (1.0, 2.0)]
-        claims = f"{' | '.join(place)} mm | {' | '.join(turn)}° | {' '.join(within)} %"
-        return f"{len(off)} fixes {dict(self.misses)} | {claims}"
+        place = [1e3 * each[:3] for each in rms]
+        turn = [np.degrees(np.sqrt(np.square(each[3:]).mean())) for each in rms]
+        return [fixes, *place, turn, [100.0 * (np.abs(off) < times * sigma).mean() for times in (1.0, 2.0)]]
+
+
+COLUMNS = (
+    Column("fixes"),
+    Column("RMS error x y z", "mm", "{:.3f} {:.3f} {:.3f}"),
+    Column("claimed", "mm", "{:.3f} {:.3f} {:.3f}"),
+    Column("of the turn, claimed", "°", "{:.3f}, {:.3f}"),
+    Column("within 1 sigma, 2 sigma", "%", "{:.0f}, {:.0f}"),
+)
 
 
 def some_rotation(rng: np.random.Generator) -> Rotation:
@@ -80,8 +89,9 @@ def some_rotation(rng: np.random.Generator) -> Rotation:
     return tilt * Rotation.from_matrix(np.diag([1.0, -1.0, -1.0])) * spin
 
 
-def moving(tags: int, eyes: int) -> None:
-    """Print how moving tags fare, with and without a known readout."""
+def moving(tags: int, eyes: int) -> Table:
+    """Return how moving tags fare, with and without a known readout."""
+    table = Table("tag_moving", [Column("speed"), Column("`readout_s`"), *COLUMNS])
     camera = VGA if eyes == 2 else replace(VGA, baseline_m=0.0)
     look = Look(samples=6, noise_sd=2.0, blur_px=0.6, wall=0.5)
     for speed, spin_deg in ((0.02, 3.0), (0.05, 6.0), (0.1, 12.0), (0.3, 30.0)):
@@ -108,11 +118,13 @@ def moving(tags: int, eyes: int) -> None:
                     if t > 0.0:
                         judged[told].add(found, *at(t + late_s))
         for told, each in judged.items():
-            print(f"{speed:g} m/s {spin_deg:g} °/s, readout {told}: {each}", flush=True)
+            table.add(f"{speed:g} m/s, {spin_deg:g} °/s", told, *each.cells())
+    return table
 
 
-def display(tags: int) -> None:
-    """Print how tags on a display fare, by display pixels a camera pixel; 0 is paper."""
+def display(tags: int) -> Table:
+    """Return how tags on a display fare, by display pixels a camera pixel."""
+    table = Table("tag_display", [Column("camera"), Column("display pixels a camera pixel"), *COLUMNS])
     camera = replace(SMALL, baseline_m=0.0)
     phone = {"bayer": True, "tone": 1.0 / 2.2, "jpeg": 85}
     for name, kind in (("linear", {}), ("colour mosaic, tone curve, JPEG 85", phone)):
@@ -133,7 +145,8 @@ def display(tags: int) -> None:
                 found = TagTracker(camera, TagBody.single(TAG), TAG).track(replace(frame, right=None))
                 left = LEFT * SIDE_M / 8.0 / screen if screen else 0.0
                 judged.add(found, rotation, x - left * rotation.as_matrix()[:, 0])
-            print(f"{name}, {ratio:g}: {judged}", flush=True)
+            table.add(name, f"{ratio:g}" if ratio else "paper", *judged.cells())
+    return table
 
 
 def main() -> None:
@@ -142,12 +155,11 @@ def main() -> None:
     parser.add_argument("look", choices=("moving", "display"))
     parser.add_argument("--tags", type=int, default=20)
     parser.add_argument("--eyes", type=int, choices=(1, 2), default=1)
+    tables_option(parser)
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
-    if arguments.look == "moving":
-        moving(arguments.tags, arguments.eyes)
-    else:
-        display(arguments.tags)
+    table = moving(arguments.tags, arguments.eyes) if arguments.look == "moving" else display(arguments.tags)
+    table.save(arguments.tables)
 
 
 if __name__ == "__main__":

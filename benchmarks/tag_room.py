@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from benchmarks.tables import Column, Table, tables_option
 from bodyschema.interfaces.records import FloatArray
 
 from .tag_grids import Corners, Grid, april_tag, in_order, ours
@@ -226,6 +227,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--focal", type=float, default=760.0, help="about the focal length [px]")
     parser.add_argument("--pupil")
+    tables_option(parser)
     asked = parser.parse_args()
     cv2.setNumThreads(1)
     found, size_px = detections(asked.folder, asked.pupil)
@@ -240,13 +242,12 @@ def main() -> None:
         found = [seen for seen, stays in zip(found, still, strict=True) if stays]
     cameras, tags = room.counts
     print(json.dumps({"photographs": cameras, "tags": tags, "detections": len(found), "of": all_found}))
+    columns = Column("corners"), *(Column(name, "px", "{:.3f}") for name in ("RMS residual", "median"))
+    table = Table("tag_room", columns)
     for name, measured in corners.items():
-        fit = fitted(room, measured, start)
-        row = {
-            "rms_px": float(np.sqrt(np.square(fit.per_tag_px).mean())),
-            "median_px": float(np.median(fit.per_tag_px)),
-        }
-        print(json.dumps({"detector": name, **row}))
+        per_tag_px = fitted(room, measured, start).per_tag_px
+        table.add(name, np.sqrt(np.square(per_tag_px).mean()), np.median(per_tag_px))
+    table.save(asked.tables)
     plain = corners["tracker, bleeding not corrected"]
     correction = corners["tracker"] - plain
     fit = fitted(room, plain, start, correction)

@@ -20,6 +20,8 @@ from hypothesis import HealthCheck, settings
 from hypothesis.internal.conjecture import providers
 from skip_remedies import Report, with_remedy
 
+from benchmarks.tables import OPTION
+
 # No time limits: a busy machine is no failure. The same examples in every run, so that a red test is red again;
 # `make soak` generates other and more examples (its profile), and keeps failures in .hypothesis.
 TIMELESS = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -44,6 +46,11 @@ def has_room() -> bool:
 
 ALL_SOAK = "\npytestmark = pytest.mark.soak"
 QUICK = ("kbmaps/", "tests/interfaces/", "tests/kbmaps/")
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Add the option of benchmarks that writes tables for docs/results."""
+    parser.addoption(OPTION, type=Path, metavar="FOLDER", help="write each table to a file there")
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -142,6 +149,12 @@ def free_endpoint() -> Callable[[], str]:
 def endpoint(free_endpoint: Callable[[], str]) -> str:
     """Return an unused zenoh endpoint on this machine."""
     return free_endpoint()
+
+
+@pytest.fixture(scope="session")
+def tables_folder(pytestconfig: pytest.Config) -> Path | None:
+    """Return the folder that tables go to, if there is one."""
+    return pytestconfig.getoption(OPTION)
 
 
 @pytest.fixture(scope="session")

@@ -24,14 +24,10 @@ from benchmarks.goals.results import Results
 from benchmarks.goals.study import NotHereError, Study
 from benchmarks.goals.table import overview, table
 from benchmarks.peers.__main__ import DATA_VARIABLE
+from benchmarks.tables import tables_option
 
 FIRST_SEED = 1000
 _SAVE_EVERY_S = 10.0
-_BEGIN, _END = "<!-- written by python -m benchmarks.goals --docs -->\n", "<!-- end of what it writes -->\n"
-_TABLE_HEAD = """# Goals: all figures
-
-[Back to the summary](goals.md). This page is written by `python -m benchmarks.goals --docs docs/results`.
-"""
 
 
 def main() -> None:
@@ -47,21 +43,10 @@ def main() -> None:
         results.forget({study for row in chosen for study in row.studies})
     if not arguments.print:
         measure(chosen, results, arguments.seeds, time.monotonic() + arguments.budget_s)
-    if arguments.docs is not None:
-        write_docs(arguments.docs, chosen, results)
-    print(table(chosen, results.values()))
-
-
-def write_docs(folder: Path, chosen: Sequence[Row], results: Results) -> None:
-    """Write goals_table.md into a folder, and the overview between the markers of its goals.md."""
-    (folder / "goals_table.md").write_text(f"{_TABLE_HEAD}\n{table(chosen, results.values())}\n", encoding="utf-8")
-    page = folder / "goals.md"
-    before, begin, rest = page.read_text(encoding="utf-8").partition(_BEGIN)
-    _, end, after = rest.partition(_END)
-    if not begin or not end:
-        sys.exit(f"{page} lacks the markers {_BEGIN.strip()} and {_END.strip()}")
-    text = f"{before}{begin}\n{overview(chosen, results.values())}\n\n{end}{after}"
-    page.write_text(text, encoding="utf-8")
+    shown = table(chosen, results.values())
+    for each in (overview(chosen, results.values()), shown):
+        each.save(arguments.tables)
+    print(shown.markdown())
 
 
 def measure(chosen: Sequence[Row], results: Results, most_seeds: int | None, deadline: float) -> None:
@@ -101,9 +86,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--budget-s", type=float, default=float("inf"), help="begin nothing after so many seconds")
     parser.add_argument("--again", action="store_true", help="forget what was measured of these rows")
     parser.add_argument("--print", action="store_true", help="print the table of what is known, measure nothing")
-    parser.add_argument(
-        "--docs", type=Path, metavar="FOLDER", help="write goals_table.md and goals.md's overview there"
-    )
+    tables_option(parser)
     parser.add_argument("--data", type=Path, help=f"folder with recordings; else {DATA_VARIABLE}")
     return parser
 

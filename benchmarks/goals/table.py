@@ -1,4 +1,4 @@
-"""The table in Markdown."""
+"""The tables of docs/results/goals.md and goals_table.md."""
 
 from __future__ import annotations
 
@@ -6,45 +6,42 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 from benchmarks.goals.goal import Cell, Measured, Row, Verdict, judged, number
 from benchmarks.goals.study import Values
+from benchmarks.tables import Column, Table
 
 # Values between these are shown with all three digits. Standard errors below this share of the value are not shown.
 _LEAST_PLAIN, _LARGEST_PLAIN = 1e-3, 1e3
 _NEGLIGIBLE = 1e-3
-OVERVIEW_HEADER = "| goal | figures met | |\n| --- | ---: | --- |"
-HEADER = "| what | goal | measured | bound | seeds | |\n| --- | --- | --- | --- | --- | --- |"
+COMMAND = "python -m benchmarks.goals --json goals.json --data FOLDER"
 
 
-def overview(rows: Iterable[Row], results: Mapping[str, Sequence[Values]]) -> str:
-    """Format the totals, and one line for each row: how many of its figures are met, and the verdict."""
+def overview(rows: Iterable[Row], results: Mapping[str, Sequence[Values]]) -> Table:
+    """Return one line for each row, how many of its figures are met and the verdict, and the totals."""
     judgements = [(row, [judged(figure, results) for figure in row.figures]) for row in rows]
     met, goals = sum(_met(cells) for _, cells in judgements), len(judgements)
     reached = sum(_standing(cells) == Verdict.MET.value for _, cells in judgements)
     figures = sum(len(cells) for _, cells in judgements)
-    lines = [
-        f"| **{row.name}**: {row.what} | {_met(cells)} of {len(cells)} | {_standing(cells)} |"
-        for row, cells in judgements
-    ]
-    totals = f"{met} of {figures} figures and {reached} of {goals} goals are met."
-    return "\n".join([totals, "", OVERVIEW_HEADER, *lines])
+    lines = [(f"**{row.name}**: {row.what}", [_met(cells), len(cells)], _standing(cells)) for row, cells in judgements]
+    totals = "all", [met, figures], f"{reached} of {goals} met"
+    columns = Column("goal"), Column("figures met", "", "{} of {}"), Column("verdict")
+    return Table.of("goals", columns, [*lines, totals], COMMAND)
 
 
-def table(rows: Iterable[Row], results: Mapping[str, Sequence[Values]]) -> str:
-    """Format all rows: each with its name and subject, and a line for each figure."""
-    return "\n".join([HEADER, *(line for row in rows for line in _lines(row, results))])
+def table(rows: Iterable[Row], results: Mapping[str, Sequence[Values]]) -> Table:
+    """Return all rows: each with its name and subject, and a line for each figure."""
+    columns = [Column(name) for name in ("what", "goal", "measured", "bound", "seeds", "")]
+    return Table.of("goals_figures", columns, (line for row in rows for line in _lines(row, results)), COMMAND)
 
 
 def _met(cells: Sequence[Cell]) -> int:
     return sum(cell.verdict is Verdict.MET for cell in cells)
 
 
-def _lines(row: Row, results: Mapping[str, Sequence[Values]]) -> Iterator[str]:
+def _lines(row: Row, results: Mapping[str, Sequence[Values]]) -> Iterator[list[str]]:
     cells = [judged(figure, results) for figure in row.figures]
-    yield f"| **{row.name}**: {row.what} | | | | | {_standing(cells)} |"
+    yield [f"**{row.name}**: {row.what}", "", "", "", "", _standing(cells)]
     for cell in cells:
-        yield (
-            f"| – {cell.figure.what} | {_goal(cell)} | {_shown(cell.measured)} | {_shown(cell.bound)} | "
-            f"{cell.seeds} of {cell.wanted} | {_mark(cell)} |"
-        )
+        seeds = f"{cell.seeds} of {cell.wanted}"
+        yield [f"– {cell.figure.what}", _goal(cell), _shown(cell.measured), _shown(cell.bound), seeds, _mark(cell)]
 
 
 def _standing(cells: Sequence[Cell]) -> str:

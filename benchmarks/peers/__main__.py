@@ -26,6 +26,7 @@ from benchmarks.peers.results import Outcome, Results, machine
 from benchmarks.peers.runner import Job, Plan, run
 from benchmarks.peers.summary import summary
 from benchmarks.peers.tasks import simulated_tasks
+from benchmarks.tables import tables_option
 
 DATA_VARIABLE = "BODYSCHEMA_DATA"
 _SAVE_EVERY_S = 20.0
@@ -79,8 +80,8 @@ def main() -> None:
     )
     results.save(arguments.json)
     write_page(arguments.out, results, tasks, COMPETITORS)
-    if arguments.markdown is not None:
-        arguments.markdown.write_text(summary(results, tasks, plan.competitors))
+    for table in summary(results, tasks, plan.competitors):
+        table.save(arguments.tables)
     print(f"{'all done' if done else 'the time was up, run again to go on'}: {arguments.out}, {arguments.json}")
 
 
@@ -99,7 +100,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--growth", action=argparse.BooleanOptionalAction, default=True, help="time against size")
     parser.add_argument("--data", type=Path, help=f"folder with recordings; else {DATA_VARIABLE}")
     parser.add_argument("--out", type=Path, default=Path("peers.html"))
-    parser.add_argument("--markdown", type=Path, help="write the means of the --models as tables, too")
+    tables_option(parser)
     parser.add_argument("--json", type=Path, default=Path("peers.json"))
     return parser
 

@@ -1,4 +1,4 @@
-"""The page's figures as Markdown: a table for each number of pairs, a row for each task."""
+"""The tables of docs/results/peers_tables.md: one for each number of pairs, a row for each task."""
 
 from __future__ import annotations
 
@@ -8,26 +8,27 @@ from benchmarks.peers.page import tests_of
 from benchmarks.peers.problem import Competitor
 from benchmarks.peers.results import Results, cell
 from benchmarks.peers.tasks import Task
+from benchmarks.tables import Column, Table
 
+COMMAND = "python -m benchmarks.peers --seeds 50 --data FOLDER --json peers.json"
 SIZES = (30, 100, 300, 1000, 3000)
 
 
-def summary(results: Results, tasks: Sequence[Task], competitors: Sequence[Competitor]) -> str:
+def summary(results: Results, tasks: Sequence[Task], competitors: Sequence[Competitor]) -> list[Table]:
     """Return the mean errors [mm] of the last test of each task, the best of a row in bold."""
-    return "\n\n".join(_table(results, tasks, competitors, pairs) for pairs in SIZES) + "\n"
+    tables = (_table(results, tasks, competitors, pairs) for pairs in SIZES)
+    return [table for table in tables if table.rows]
 
 
-def _table(results: Results, tasks: Sequence[Task], competitors: Sequence[Competitor], pairs: int) -> str:
+def _table(results: Results, tasks: Sequence[Task], competitors: Sequence[Competitor], pairs: int) -> Table:
     ran = [(task, row) for task in tasks if (row := _row(results, task, competitors, pairs))]
     seeds = sorted(
         {len({key[3] for key in results.outcomes if key[0] == task.key and key[2] == pairs}) for task, _ in ran}
     )
-    if not ran:
-        return f"## {pairs:,} pairs\n\nNot run yet."
-    count = f"{seeds[0]} seeds" if len(seeds) == 1 else f"{seeds[0]} to {seeds[-1]} seeds"
-    head = ["task", "floor", *(f"`{competitor.key}`" for competitor in competitors)]
-    lines = [f"## {pairs:,} pairs, {count}", "", f"| {' | '.join(head)} |", f"| --- {'| ---: ' * (len(head) - 1)}|"]
-    return "\n".join([*lines, *(f"| {' | '.join([task.title, *row])} |" for task, row in ran)])
+    arms = " to ".join(str(count) for count in sorted({*seeds[:1], *seeds[-1:]}))
+    learners = [Column(name, "", "{}") for name in ("floor", *(f"`{competitor.key}`" for competitor in competitors))]
+    rows = [[task.title, *row] for task, row in ran]
+    return Table.of(f"peers_{pairs}", [Column(f"task, {arms} arms"), *learners], rows, COMMAND)
 
 
 def _seeds(results: Results, task: Task, pairs: int) -> int:

@@ -164,6 +164,7 @@ def test_tables_show_task_means_with_best_bold():
         for seed in range(2):
             outcome = Outcome("tiny", key, 30, seed, "ok", {"drawn alike": error_m})
             results.outcomes[outcome.key] = outcome
-    said = summary(results, [TASK], [drawing, psom])
-    assert "## 30 pairs, 2 seeds" in said
-    assert "| A tiny task |  | **4.0** | 120 |" in said
+    [said] = summary(results, [TASK], [drawing, psom])
+    assert said.name == "peers_30"
+    assert "| task, 2 arms | floor |" in said.markdown()
+    assert "| A tiny task |  | **4.0** | 120 |" in said.markdown()

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from benchmarks.reproduced import models, readings
 from bodyschema.cli.main import app
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.learning.online_learner import OnlineLearner
@@ -235,6 +236,14 @@ def test_the_command_gives_everything_as_json(printed) -> None:
     parsed = msgspec.convert({name: found[name] for name in Experiment.__dataclass_fields__}, Experiment)
     assert parsed.readings
     assert (told["schema"], told["seed"], told["real"], found["plot"]) == (3, 0, False, str(folder / "fig7.png"))
+
+
+def test_the_json_becomes_the_tables_of_the_page(printed) -> None:
+    [experiment] = printed[0]["experiments"]
+    figures, others = readings(experiment), models(experiment)
+    assert (figures.name, others.name) == ("reproduced_fig7", "reproduced_fig7_models")
+    assert len(figures.rows) == len(experiment["readings"])
+    assert [column.name for column in others.columns[1:]] == list(experiment["comparison"]["rows"])
 
 
 def test_the_page_documents_every_field_of_the_json(printed) -> None:

@@ -21,8 +21,10 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from benchmarks.tables import tables_option
+
 from .dense_hide import DenseCase, hide_dense, sealed
-from .dense_judge import DenseJudgement, inside, line, name, outcome, placed, rms_mm, table
+from .dense_judge import DenseJudgement, inside, line, name, outcome, page_table, placed, rms_mm, table
 
 HERE = Path(__file__).resolve().parent
 LIMIT_S = 300.0
@@ -103,6 +105,7 @@ def main() -> None:
     parser.add_argument("--limit", type=float, default=LIMIT_S, help="seconds for each diagnosis")
     parser.add_argument("--json", type=Path, help="one record a line; what is there already is not run again")
     parser.add_argument("--keep", type=Path, help="folder in which cases and diagnoses stay")
+    tables_option(parser)
     given = parser.parse_args()
     records = _read(given.json)
     done = {record.seed for record in records}
@@ -122,7 +125,8 @@ def main() -> None:
             if given.json is not None:
                 with given.json.open("ab") as file:
                     file.write(msgspec.json.encode(record) + b"\n")
-    print("\n" + table(records))
+    print("\n" + table(records) + "\n")
+    page_table(records).save(given.tables)
 
 
 def run(

@@ -13,6 +13,8 @@ import msgspec
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from benchmarks.tables import Column, Table
+
 from .arrays import FloatArray
 from .dense_chain import Built, Posture
 
@@ -20,6 +22,9 @@ Outcome = Literal["right", "honest", "vague", "wrong", "crashed"]
 OUTCOMES: tuple[Outcome, ...] = ("right", "honest", "vague", "wrong", "crashed")
 LARGE_SHARE = 15.0  # percent of the gain, from which a false cause counts
 SURE = 0.9
+GOALS = {0: 97, 1: 97, 2: 95, 3: 93, 5: 80}  # percent right, by the number of causes
+NUMERALS = ("none", "one", "two", "three", "four", "five", "six", "seven", "eight")
+OUTCOME_COLUMNS = [Column(name, "", "{}") for name in ("right", "honest", "vague", "wrong")]
 NO_WORSE = 1.02  # times the error of the placed nominal model
 ROUNDED_MM = 1e-6
 ROUNDS = 30
@@ -224,6 +229,39 @@ def table(records: Sequence[DenseJudgement]) -> str:
             rows.append([group, str(len(chosen)), *(str(sum(r.outcome == o for r in chosen)) for o in OUTCOMES)])
     rows.insert(1, ["---"] * len(rows[0]))
     return "\n".join(["| " + " | ".join(row) + " |" for row in rows] + ["", *_figures(records)])
+
+
+def page_table(records: Sequence[DenseJudgement]) -> Table:
+    """Return the table of docs/results/diagnosis.md; a crash counts as wrong."""
+    seeds = runs(record.seed for record in records)
+    commands = [f"python -m tests.blind.dense --cases {len(run)} --first-seed {run[0]}" for run in seeds]
+    columns = [Column("causes hidden"), Column("cases", "", "{}"), *OUTCOME_COLUMNS, Column("goal (right)", "%", "{}")]
+    shown = Table("diagnosis_tolerances", columns, commands)
+    for count, numeral in enumerate(NUMERALS):
+        chosen = [record for record in records if record.decidable and len(record.truth) == count]
+        if chosen:
+            shown.add(numeral, len(chosen), *outcomes([record.outcome for record in chosen]), GOALS.get(count))
+    hard = [record.outcome for record in records if not record.decidable]
+    if hard:
+        shown.add("cannot be decided", len(hard), *outcomes(hard), None)
+    shown.add("all", len(records), *outcomes([record.outcome for record in records]), None)
+    return shown
+
+
+def outcomes(found: Sequence[Outcome]) -> list[int]:
+    """Return how many are right, honest, vague, and wrong or crashed."""
+    return [found.count("right"), found.count("honest"), found.count("vague"), sum(o in OUTCOMES[3:] for o in found)]
+
+
+def runs(seeds: Iterable[int]) -> list[range]:
+    """Return the runs of consecutive numbers in some."""
+    found: list[range] = []
+    for seed in sorted(set(seeds)):
+        if found and found[-1].stop == seed:
+            found[-1] = range(found[-1].start, seed + 1)
+        else:
+            found.append(range(seed, seed + 1))
+    return found
 
 
 def _figures(records: Sequence[DenseJudgement]) -> list[str]:

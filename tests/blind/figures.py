@@ -8,6 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from benchmarks.tables import Column, Table
+
+from .dense_judge import runs
 from .judge import FEWEST_FALSE_FIXES, TOLD
 from .judgement import CauseJudged, Crash, Judgement, TruthJudged, written
 
@@ -154,6 +157,30 @@ def share_of_gain(case: Judgement) -> float:
 def gains_enough(case: Judgement) -> bool:
     """Return True if the diagnosis has nearly all the gain that the true causes give."""
     return share_of_gain(case) >= GAIN_WANTED
+
+
+def page_table(cases: Sequence[Judgement | Crash]) -> Table:
+    """Return the table of docs/results/diagnosis.md; *told*: an oracle distinguishes the causes from any other."""
+    commands = []
+    by_scenario = {
+        name: [case for case in cases if case.scenario == name] for name in (case.scenario for case in cases)
+    }
+    names_of: dict[tuple[range, ...], list[str]] = defaultdict(list)
+    for name, chosen in by_scenario.items():
+        names_of[tuple(runs(case.seed for case in chosen))].append(name)
+    for seeds, names in names_of.items():
+        command = f"python -m tests.blind.sealed --scenario {' '.join(names)}"
+        commands += [f"{command} --seeds {len(run)} --first-seed {run[0]}" for run in seeds]
+    counts = [Column(name, "", "{} of {}") for name in ("told: right", "all: right")]
+    columns = [Column("causes"), *counts, Column("wrong", "", "{}"), Column("goal (told: right)", "%", "{:.0f}")]
+    shown = Table("diagnosis_exact", columns, commands)
+    for name, chosen in by_scenario.items():
+        judged = [case for case in chosen if isinstance(case, Judgement)]
+        wrong = len(chosen) - len(judged) + sum(is_wrong(case) for case in judged)
+        told = [case for case in judged if case.told_chi2 >= TOLD]
+        right = [Rate.over(some, lambda case: case.outcome == "right") for some in (told, judged)]
+        shown.add(name, *([rate.hits, rate.of] for rate in right), wrong, 100.0 * NAMED_WANTED.get(name, 0.97))
+    return shown
 
 
 def confusion(cases: Sequence[Judgement]) -> str:

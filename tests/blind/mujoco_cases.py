@@ -22,9 +22,24 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from benchmarks.tables import Column, Table, tables_option
+
 from .arrays import FloatArray
 from .dense import HERE, LIMIT_S, Checkout, Ran
-from .dense_judge import LARGE_SHARE, NO_WORSE, OUTCOMES, ROUNDED_MM, SURE, Outcome, name, rms_mm, shares_of_causes
+from .dense_judge import (
+    LARGE_SHARE,
+    NO_WORSE,
+    OUTCOME_COLUMNS,
+    OUTCOMES,
+    ROUNDED_MM,
+    SURE,
+    Outcome,
+    name,
+    outcomes,
+    rms_mm,
+    runs,
+    shares_of_causes,
+)
 from .mujoco_hide import KINDS, STYLES, Case, Style, Truth, hide
 from .mujoco_urdf import MODELS, Model, longest_arm
 
@@ -255,6 +270,15 @@ def table(records: Sequence[Judgement]) -> str:
     )
 
 
+def page_table(records: Sequence[Judgement]) -> Table:
+    """Return the table of docs/results/diagnosis.md; a crash counts as wrong."""
+    seeds = runs(record.seed for record in records)
+    commands = [f"python -m tests.blind.mujoco_cases --cases {len(run)} --first-seed {run[0]}" for run in seeds]
+    shown = Table("diagnosis_mujoco", [Column("arms"), Column("recordings", "", "{}"), *OUTCOME_COLUMNS], commands)
+    shown.add(", ".join(sorted({r.model for r in records})), len(records), *outcomes([r.outcome for r in records]))
+    return shown
+
+
 def main() -> None:
     """Run the command."""
     parser = argparse.ArgumentParser(prog="python -m tests.blind.mujoco_cases", description=__doc__)
@@ -268,6 +292,7 @@ def main() -> None:
     parser.add_argument("--limit", type=float, default=LIMIT_S, help="seconds for each diagnosis")
     parser.add_argument("--json", type=Path, help="one record a line; cases in it are not run again")
     parser.add_argument("--keep", type=Path, help="folder in which cases and diagnoses stay")
+    tables_option(parser)
     given = parser.parse_args()
     records = _read(given.json)
     done = {(record.seed, record.style) for record in records}
@@ -293,7 +318,8 @@ def main() -> None:
             if given.json is not None:
                 with given.json.open("ab") as file:
                     file.write(msgspec.json.encode(record) + b"\n")
-    print("\n" + table(records))
+    print("\n" + table(records) + "\n")
+    page_table(records).save(given.tables)
 
 
 def _read(file: Path | None) -> list[Judgement]:

@@ -20,8 +20,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # one thread for each proces
 import msgspec
 import numpy as np
 
+from benchmarks.tables import tables_option
+
 from .cases import hide
-from .figures import markdown
+from .figures import markdown, page_table
 from .judge import judge
 from .judgement import Crash, Judgement, told
 from .sizing import NoEffect
@@ -105,7 +107,8 @@ def main() -> None:
     if given.show:
         for record in chosen:
             print(msgspec.json.format(encoded(record)).decode())
-    print(markdown(chosen))
+    print(markdown(chosen) + "\n")
+    page_table(chosen).save(given.tables)
 
 
 def judged(cases: Iterable[Case], processes: int = 1) -> Iterator[Record]:
@@ -167,6 +170,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--json", type=Path, help="one record a line; what is there already is not run again")
     parser.add_argument("--show", action="store_true", help="print the records in full")
+    tables_option(parser)
     return parser.parse_args()
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from .dense import Checkout
 from .dense_hide import hide_dense
-from .dense_judge import DenseJudgement, inside, line, outcome, placed, rms_mm, table
+from .dense_judge import DenseJudgement, inside, line, outcome, page_table, placed, rms_mm, runs, table
 
 ZERO, LINK, PLAY = "joint_offset@elbow", "link_geometry@elbow", "backlash@wrist"
 
@@ -155,6 +155,22 @@ def test_cases_that_no_observer_decides_stand_apart() -> None:
     shown = table([_record(), _record(decidable=False, outcome="vague")])
     assert "| all decidable | 1 | 1 | 0 | 0 | 0 | 0 |" in shown
     assert "| not decidable | 1 | 0 | 0 | 1 | 0 | 0 |" in shown
+
+
+def test_the_page_s_table_counts_a_crash_as_wrong() -> None:
+    several = _record(seed=3, truth=(ZERO, "a"), outcome="crashed"), _record(seed=2, decidable=False, outcome="honest")
+    shown = page_table([_record(), *several])
+    assert shown.rows == [
+        ["one", 1, 1, 0, 0, 0, 97],
+        ["two", 1, 0, 0, 0, 1, 95],
+        ["cannot be decided", 1, 0, 1, 0, 0, None],
+        ["all", 3, 1, 1, 0, 1, None],
+    ]
+    assert shown.commands == ["python -m tests.blind.dense --cases 3 --first-seed 1"]
+
+
+def test_seeds_are_told_by_their_runs() -> None:
+    assert runs([7, 3, 4, 4, 5]) == [range(3, 6), range(7, 8)]
 
 
 def test_line_reports_the_crash_error() -> None:

@@ -10,6 +10,7 @@ import pytest
 from scipy.interpolate import PchipInterpolator
 from scipy.optimize import minimize_scalar
 
+from benchmarks.tables import Column, Table
 from bodyschema.calibration.latency import EARLIEST_S, LATEST_S, STEP_S, Latency, LatencyError, Wiggle, latency_of
 from bodyschema.cli.hardware.wiggling import read_wiggle, wiggle_of, write_wiggle
 from bodyschema.interfaces.errors import RecordingError
@@ -146,7 +147,7 @@ def test_angles_between_readings_are_neither_early_nor_late() -> None:
 
 
 @pytest.mark.soak
-def test_latency_estimate_beats_speed_correlation_over_many_seeds() -> None:
+def test_latency_estimate_beats_speed_correlation_over_many_seeds(tables_folder: Path | None) -> None:
     hidden = np.random.default_rng(6).uniform(0, 0.12, 200)
     errors, by_speed, claimed, refused = [], [], [], 0
     for seed, latency in enumerate(hidden.tolist()):
@@ -162,8 +163,15 @@ def test_latency_estimate_beats_speed_correlation_over_many_seeds() -> None:
     rms, rms_by_speed = (1e3 * np.sqrt(np.mean(np.square(each))) for each in (errors, by_speed))
     within = np.mean(np.abs(errors) < np.array(claimed))
     worst = 1e3 * np.abs(errors).max()
-    print(f"{refused} refused; rms {rms:.2f} ms, worst {worst:.2f} ms, 1 sigma covers {within:.0%}")
-    print(f"by speeds alone: rms {rms_by_speed:.2f} ms")
+    columns = (
+        Column("RMS error", "ms", "{:.2f}"),
+        Column("largest", "ms", "{:.2f}"),
+        Column("within 1 sigma", "%", "{:.0f}"),
+    )
+    table = Table("latency", [Column("method"), *columns, Column("refused", "", "{} of {}")])
+    table.add("`calibrate latency`", rms, worst, 100.0 * within, [refused, len(hidden)])
+    table.add("correlation of the speeds (nominal arm against marker)", rms_by_speed, None, None, None)
+    table.save(tables_folder)
     assert refused < 0.05 * len(hidden)
     assert worst < 2.5
     assert rms < rms_by_speed

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from ball_renderer import VGA, Look, backdrop
 from scipy.spatial.transform import Rotation
 from tag_renderer import Sheet, photograph
 
+from benchmarks.tables import Column, Table
 from bodyschema.interfaces.records import FloatArray, MarkerFix
 from bodyschema.vision.tags.body import TagBody
 from bodyschema.vision.tags.config import TagConfig
@@ -43,8 +46,25 @@ def pose(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     return Rotation.from_rotvec(tilt).as_matrix() @ np.diag([1.0, -1.0, -1.0]) @ spin, x
 
 
+@pytest.fixture(scope="module")
+def table(tables_folder: Path | None) -> Iterator[Table]:
+    """Yield the table in docs/results/vision.md."""
+    six = "{:.0f} {:.0f} {:.0f} {:.0f} {:.0f} {:.0f}"
+    columns = [
+        Column("look"),
+        Column("median error x y z", "mm", "{:.3f} {:.3f} {:.3f}"),
+        Column("of the turn about x y z", "°", "{:.3f} {:.3f} {:.3f}"),
+        Column("within 1 sigma, place and turn", "%", six),
+        Column("within 2 sigma", "%", six),
+        Column("no fix", "%", "{:.1f}"),
+    ]
+    table = Table("tag_accuracy", columns)
+    yield table
+    table.save(tables_folder)
+
+
 @pytest.mark.parametrize("name", LOOKS)
-def test_tag_pose_errors_match_claimed_sigmas(name, capsys) -> None:
+def test_tag_pose_errors_match_claimed_sigmas(name, table, capsys) -> None:
     config = TagConfig(side_m=SIDE_M)
     tracker, rng = TagTracker(VGA, TagBody.single(config), config), np.random.default_rng(0)
     pictures = [[backdrop(rng, VGA.image_size_px, None) for _ in range(2)] for _ in range(8)]
@@ -66,12 +86,7 @@ def test_tag_pose_errors_match_claimed_sigmas(name, capsys) -> None:
     within = 100.0 * (np.abs(off) < claimed).mean(axis=0)
     twice = 100.0 * (np.abs(off) < 2.0 * claimed).mean(axis=0)
     with capsys.disabled():
-        print(
-            f"\n| {name} | {' '.join(f'{1e3 * value:.3f}' for value in median[:3])} | "
-            f"{' '.join(f'{np.degrees(value):.3f}' for value in median[3:])} | "
-            f"{' '.join(f'{value:.0f}' for value in within)} | {' '.join(f'{value:.0f}' for value in twice)} | "
-            f"{dict(misses)} |"
-        )
+        table.add(name, 1e3 * median[:3], np.degrees(median[3:]), within, twice, 100.0 * misses.total() / FRAMES)
     # With a blur of a third of a module or more, as of far and oblique tags here, edges cannot be resolved.
     assert len(errors) > (0.80 if name == "blurred" else 0.85) * FRAMES
     # Two standard errors of the mean of six that are not independent are 6.
