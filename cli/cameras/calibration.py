@@ -32,10 +32,10 @@ from bodyschema.vision.calibration.image_pairs import ImagePair, Images, read_pa
 from bodyschema.vision.calibration.live import LiveViews
 from bodyschema.vision.calibration.refocus import refocused
 from bodyschema.vision.calibration.report import page as report_page
-from bodyschema.vision.calibration.report.page import to_its_interval
+from bodyschema.vision.calibration.report.page import NORMAL_95, to_its_interval
 from bodyschema.vision.calibration.view import EYES, ONE_EYE
 from bodyschema.vision.printing.sheet import rulers_mm
-from bodyschema.vision.rig.common_error import AHEAD_M, CommonError
+from bodyschema.vision.rig.common_error import CommonError, CommonErrorSettings
 from bodyschema.vision.rig.rectified import Rectification
 from bodyschema.vision.rig.rig_file import read_rig, write_rig
 from bodyschema.vision.rig.stereo_rig import CalibrationError, OneEyeRig, StereoRig
@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     from bodyschema.cli.commands.calibrate.calibrate_cameras import KnownCameras
 
 REPORT = "report.html"
-NORMAL_95 = 1.96
 _SQUARES = re.compile(r"(\d{1,9})\s*[xX×]\s*(\d{1,9})")
 
 Tell = Callable[[str], None]
@@ -363,8 +362,8 @@ def _sentences(found: CamerasFile) -> list[str]:
     across, down, ahead = found.position_half_widths_mm
     marker = "Positions" if found.baseline_mm is not None else "Tags of exactly known size"
     said.append(
-        f"{marker} {AHEAD_M:g} m ahead are known to ± {across:.2f} mm across, {down:.2f} down, {ahead:.2f} in depth "
-        "(95 %), as far as the calibration goes."
+        f"{marker} {CommonErrorSettings.ahead_m:g} m ahead are known to ± {across:.2f} mm across, {down:.2f} down, "
+        f"{ahead:.2f} in depth (95 %), as far as the calibration goes."
     )
     said.append(
         f"Views that were not fitted are foretold to {found.held_out_px:.3f} px (RMS per coordinate; fitted "
