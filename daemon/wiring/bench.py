@@ -21,7 +21,7 @@ from bodyschema.drivers.bench.device import Angle
 from bodyschema.drivers.bench.dry_run import BenchArm, DryRun
 from bodyschema.drivers.bench.faults import AskedFault
 from bodyschema.drivers.bench.servo_arm import played, swinging
-from bodyschema.drivers.bench.through_driver import LATENCY_MS, READ_S, Behind, ThroughDriver
+from bodyschema.drivers.bench.through_driver import Behind, ThroughDriver, ThroughDriverSettings
 from bodyschema.drivers.dynamixel.config import DynamixelConfig
 from bodyschema.drivers.feetech.config import FeetechConfig
 from bodyschema.drivers.ros2.config import Ros2Config
@@ -217,10 +217,13 @@ def through_bench(config: Config, joints: JointSource, open_driver: OpenDriver) 
 def _looking_at_servos(
     hardware: DynamixelConfig | FeetechConfig, angles: Mapping[str, Angle], open_driver: OpenDriver
 ) -> Iterator[Behind]:
-    buses = {name: msgspec.structs.replace(bus, latency_ms=LATENCY_MS) for name, bus in hardware.buses.items()}
+    buses = {
+        name: msgspec.structs.replace(bus, latency_ms=ThroughDriverSettings.latency_ms)
+        for name, bus in hardware.buses.items()
+    }
     patient = msgspec.structs.replace(hardware, buses=buses)
     with _on_a_bench(_arm_of(patient)(patient, angles)) as bench, open_driver(bench.config) as servos:
-        yield Behind(servos, lambda: servos.read(READ_S))
+        yield Behind(servos, lambda: servos.read(ThroughDriverSettings.read_s))
 
 
 @contextmanager
@@ -234,7 +237,7 @@ def _looking_at_lines(
     quick = msgspec.structs.replace(hardware, baud=BOARD_BAUD, delay_ms=0.0, native_usb=False)
     arm = _arm_of(quick)(quick, angles, rate_hz=BOARD_RATE_HZ)
     with _on_a_bench(arm) as bench, open_driver(bench.config) as encoders, Listener(encoders) as listener:
-        yield Behind(encoders, lambda: listener.after(clock.now() + SETTLED_S, READ_S))
+        yield Behind(encoders, lambda: listener.after(clock.now() + SETTLED_S, ThroughDriverSettings.read_s))
 
 
 @contextmanager
@@ -254,7 +257,7 @@ def _looking_at_messages(
 
         def look() -> JointReading | None:
             robot.publish(node, clock.now())
-            return joints.read(READ_S)
+            return joints.read(ThroughDriverSettings.read_s)
 
         yield Behind(joints, look)
 

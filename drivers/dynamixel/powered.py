@@ -15,7 +15,7 @@ import numpy as np
 
 from bodyschema.drivers.servos.bus import Bus as ServoBus
 from bodyschema.drivers.servos.channel import Sample
-from bodyschema.drivers.servos.handshake import ATTEMPTS, switch_torque_off
+from bodyschema.drivers.servos.handshake import HandshakeSettings, switch_torque_off
 from bodyschema.drivers.servos.model import Register
 from bodyschema.drivers.servos.servo import IdentifiedServo
 from bodyschema.interfaces.errors import RequestError
@@ -274,7 +274,7 @@ class PoweredJoints(ABC):
         exchange = bus.ask(bus.read_request(servo.model, servo.id, span))
         if exchange.trouble is not None:
             self._missed[servo.joint] = self._missed.get(servo.joint, 0) + 1
-            if self._missed[servo.joint] >= ATTEMPTS:
+            if self._missed[servo.joint] >= HandshakeSettings.attempts:
                 raise Drop(f"joint {servo.joint!r}: its servo does not report its state: {exchange.trouble}")
             return
         self._missed[servo.joint] = 0
@@ -304,7 +304,7 @@ class PoweredJoints(ABC):
         """Write a register and read it back. Raise RequestError if the value differs."""
         register = servo.model.layout[name]
         found = None
-        for _ in range(ATTEMPTS):
+        for _ in range(HandshakeSettings.attempts):
             self._buses[servo.bus].write(servo.model, servo.id, register, register.bytes(value))
             found = self._read(servo, name)
             if found == value:
@@ -315,7 +315,7 @@ class PoweredJoints(ABC):
         """Return the value of a register. Raise RequestError without an answer."""
         bus, register = self._buses[servo.bus], servo.model.layout[name]
         exchange = None
-        for _ in range(ATTEMPTS):
+        for _ in range(HandshakeSettings.attempts):
             exchange = bus.ask(bus.read_request(servo.model, servo.id, register))
             if exchange.trouble is None:
                 return register.value(exchange.answers[0].status.data)

@@ -7,7 +7,7 @@ from contextlib import closing
 from dataclasses import dataclass, field, replace
 
 from bodyschema.drivers.echo import BITS_PER_BYTE, HOST_S, Port, without_echo
-from bodyschema.drivers.serial_line import DEFAULT_LATENCY_S, SerialLine
+from bodyschema.drivers.serial_line import SerialLine, SerialLineSettings
 from bodyschema.drivers.servos.handshake import ask_again
 from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.protocols import Clock
@@ -225,7 +225,7 @@ def scan_port(
     tell: Tell,
     *,
     bauds: Sequence[int] = (),
-    latency_s: float = DEFAULT_LATENCY_S,
+    latency_s: float = SerialLineSettings.default_latency_s,
     open_port: Callable[[str, int, Clock], Port] = lambda port, baud, clock: SerialLine.open(port, baud, clock.now),
 ) -> ScannedBus:
     """Find the servos on a port at all rates, or at `bauds`.

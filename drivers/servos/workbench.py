@@ -14,7 +14,7 @@ from bodyschema.interfaces.protocols import Clock
 
 from .bus import Bus, Trouble
 from .config import ServoConfig
-from .handshake import ATTEMPTS, identify, read_register, switch_torque_off
+from .handshake import HandshakeSettings, identify, read_register, switch_torque_off
 from .model import Model, Register
 from .servo import IdentifiedServo
 from .settings import ID, Setting
@@ -135,7 +135,7 @@ class EepromEditor:
         """Write it, and read it back. Not for rates, see `write_bauds`. Torque has to be off."""
         self._unlock(bus, change.servo)
         done = self._tried(bus, change)
-        for _ in range(ATTEMPTS - 1):
+        for _ in range(HandshakeSettings.attempts - 1):
             if done.outcome is Outcome.KEPT:
                 done = self._tried(bus, change)
         return self._locked(bus, done)
