@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.service.notify import START_LIMIT_S
+from bodyschema.daemon.service.notify import NotifySettings
 from bodyschema.daemon.transport.identity import is_local
 from bodyschema.daemon.wiring.servos import configured_ports
 from bodyschema.interfaces.errors import ConfigError
@@ -285,7 +285,7 @@ def _kept_running(installed: Installed) -> str:
     steps = ["RestartSec=5"]
     if installed.systemd >= WITH_RESTART_STEPS:
         steps = ["RestartSec=1", "RestartSteps=6", "RestartMaxDelaySec=60"]
-    times = [f"TimeoutStartSec={START_LIMIT_S}", "TimeoutStopSec=30"]
+    times = [f"TimeoutStartSec={NotifySettings.start_limit_s}", "TimeoutStopSec=30"]
     return "\n".join(["WatchdogSignal=SIGABRT", *times, "KillMode=mixed", "Restart=on-failure", *steps])
 
 

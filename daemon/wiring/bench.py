@@ -38,11 +38,15 @@ from bodyschema.robot.toml_text import toml_text
 
 from .simulation import simulation_settings
 
-PATH_S = 40.0  # of guided motion, played to and fro
+
+class _Settings:
+    path_s: float = 40.0  # of guided motion, played to and fro
+    board_rate_hz, board_baud = 500.0, 921_600  # of a board in the simulation's place, which waits for each line
+    settled_s: float = 2e-3  # how far off the time of a line may be
+
+
 MARK = "# Written by `bodyschema bench`, which removes it when it ends."
 PSEUDO_TERMINALS = "/dev/pts/"
-BOARD_RATE_HZ, BOARD_BAUD = 500.0, 921_600  # of a board in the simulation's place, which waits for each line
-SETTLED_S = 2e-3  # how far off the time of a line may be
 
 OnPorts = DynamixelConfig | FeetechConfig | SerialLinesConfig
 
@@ -82,9 +86,11 @@ def bench_motion(config: Config, tell: Callable[[float], None]) -> Motion:
     from bodyschema.sim_backend.world import guided_path
 
     sim = simulation_settings(config)
-    path = guided_path(config.robot, sim, PATH_S, config.simulation, lambda done_s: tell(done_s / PATH_S))
+    path = guided_path(
+        config.robot, sim, _Settings.path_s, config.simulation, lambda done_s: tell(done_s / _Settings.path_s)
+    )
     angles = played(path, sim.encoders.rate_hz, monotonic())
-    words = f"guided by the simulated hand, {PATH_S:.0f} s of path to and fro"
+    words = f"guided by the simulated hand, {_Settings.path_s:.0f} s of path to and fro"
     return Motion(dict(zip(joints, angles, strict=True)), words)
 
 
@@ -234,10 +240,10 @@ def _looking_at_lines(
     from bodyschema.drivers.serial_lines.bench.board import Listener
 
     clock = SystemClock()
-    quick = msgspec.structs.replace(hardware, baud=BOARD_BAUD, delay_ms=0.0, native_usb=False)
-    arm = _arm_of(quick)(quick, angles, rate_hz=BOARD_RATE_HZ)
+    quick = msgspec.structs.replace(hardware, baud=_Settings.board_baud, delay_ms=0.0, native_usb=False)
+    arm = _arm_of(quick)(quick, angles, rate_hz=_Settings.board_rate_hz)
     with _on_a_bench(arm) as bench, open_driver(bench.config) as encoders, Listener(encoders) as listener:
-        yield Behind(encoders, lambda: listener.after(clock.now() + SETTLED_S, ThroughDriverSettings.read_s))
+        yield Behind(encoders, lambda: listener.after(clock.now() + _Settings.settled_s, ThroughDriverSettings.read_s))
 
 
 @contextmanager

@@ -17,7 +17,7 @@ import numpy as np
 from bodyschema.interfaces.records import FloatArray, ImageArray
 from bodyschema.sim_backend.bullet import Body
 from bodyschema.sim_backend.geometry import turn_of_z
-from bodyschema.sim_backend.physics_urdf import ROD_RADIUS_M, SHORTEST_ROD_M
+from bodyschema.sim_backend.physics_urdf import UrdfSettings
 from kbmaps.rotations import quaternions
 
 from .eye import TO_LIGHT, StereoEyes
@@ -43,11 +43,11 @@ class Stick:
             self._id = -1
         length = float(np.linalg.norm(tip))
         # What stands in the world, before a camera that the arm carries, is on no stick.
-        if length < SHORTEST_ROD_M or self._body.stands(self._link):
+        if length < UrdfSettings.shortest_rod_m or self._body.stands(self._link):
             return
         shape = bullet.createVisualShape(
             bullet.GEOM_CYLINDER,
-            radius=ROD_RADIUS_M,
+            radius=UrdfSettings.rod_radius_m,
             length=length,
             rgbaColor=[0.16, 0.17, 0.18, 1],
             physicsClientId=client,

@@ -165,8 +165,8 @@ def test_a_flood_that_differs_in_its_numbers_is_cut_off() -> None:
         journal.say(f"pair {number} was refused")
     journal.handler.close()
     assert journal.lines[:2] == ["<4>bus: pair 0 was refused", "<4>bus: pair 1 was refused"]
-    assert len(journal.lines) == logs.OFTEN + 1
-    assert journal.lines[-1] == f"<4>bus: {500 - logs.OFTEN} more times in 0 s: pair # was refused"
+    assert len(journal.lines) == logs.RepeatSettings.often + 1
+    assert journal.lines[-1] == f"<4>bus: {500 - logs.RepeatSettings.often} more times in 0 s: pair # was refused"
 
 
 def test_two_joints_with_the_same_trouble_are_both_named() -> None:
@@ -187,7 +187,7 @@ def test_what_was_said_is_forgotten_before_it_fills_the_memory() -> None:
     journal = Journal()
     for k in range(5000):
         journal.say("x" * (k % 1000))
-    assert len(journal.handler._said) <= logs.REMEMBERED
+    assert len(journal.handler._said) <= logs.RepeatSettings.remembered
 
 
 def test_a_signal_calls_for_an_orderly_end() -> None:

@@ -95,7 +95,7 @@ def test_progress_is_a_line_for_each_that_is_done(told: tuple[object, str, str])
 
 def test_a_scheduler_that_does_not_answer_is_told_with_its_address(folder: Path, endpoint: str) -> None:
     address = endpoint.replace("tcp/", "tcp://")
-    with mock.patch("bodyschema.fleet.diagnosing.CONNECT_LIMIT_S", 0.5):
+    with mock.patch("bodyschema.fleet.diagnosing._Settings.connect_limit_s", 0.5):
         code, _, err = fleet(folder / "left.csv", "--robot", DESK_ARM, "--scheduler", address)
     assert code == 1
     assert f"no Dask scheduler answers on {address}" in err
