@@ -316,9 +316,6 @@ def _metres(mm: float | None) -> float | None:
     return None if mm is None else 1e-3 * mm
 
 
-_WISHES = 3
-
-
 def cameras_view(found: CamerasFile) -> Group:
     """Return a table of the eyes' parameters, followed by sentences on their accuracy."""
     width, height = found.image_size_px
@@ -355,7 +352,7 @@ def check_view(found: CheckFile, name: str) -> Group:
     return Group(table, *(Padding(Text(text), (1, 0, 0, 0), expand=False) for text in texts))
 
 
-def _sentences(found: CamerasFile) -> list[str]:
+def _sentences(found: CamerasFile, wishes: int = 3) -> list[str]:
     said: list[str] = []
     if found.baseline_mm is not None:
         said.append(f"Baseline {found.baseline_mm:.2f} ± {found.baseline_half_width_mm:.2f} mm (95 %).")
@@ -382,8 +379,8 @@ def _sentences(found: CamerasFile) -> list[str]:
             "or the distance of the lenses and give --baseline-mm."
         )
     if found.missing:
-        more = "" if len(found.missing) <= _WISHES else f"; and {len(found.missing) - _WISHES} more, in the report"
-        said.append(f"It would be better with: {'; '.join(found.missing[:_WISHES])}{more}.")
+        more = "" if len(found.missing) <= wishes else f"; and {len(found.missing) - wishes} more, in the report"
+        said.append(f"It would be better with: {'; '.join(found.missing[:wishes])}{more}.")
     return said
 
 

@@ -10,7 +10,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from bodyschema.cli.terminal.screen import BAR_WIDTH
+from bodyschema.cli.terminal.screen import ScreenSettings
 from bodyschema.diagnosis.report.numbers import chance, mm, numbers_of, percent, place, share, telling
 from bodyschema.diagnosis.report.presenters.registry import named, rival_named
 from bodyschema.diagnosis.report.result import SMALL, DiagnosisFile, Indistinguishable, Verdict
@@ -127,7 +127,7 @@ def _errors(diagnosis: DiagnosisFile) -> Table:
 
 
 def _bar(part: float) -> str:
-    return "█" * max(round(BAR_WIDTH * min(part, 1.0)), 1) + ("…" if part > 1.001 else "")
+    return "█" * max(round(ScreenSettings.bar_width * min(part, 1.0)), 1) + ("…" if part > 1.001 else "")
 
 
 def _causes(diagnosis: DiagnosisFile, timed: bool) -> Table:
