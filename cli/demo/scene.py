@@ -94,8 +94,6 @@ MARK = ".bodyschema-demo"
 Bus = Literal["dynamixel", "feetech", "serial", "ros2"]
 Marker = Literal["ball", "tag", "cluster"]
 Camera = Literal["stereo", "mono"]
-# Of the simulation's ball.
-BALL_RADIUS_M = 0.02
 # Light ones in the neck, strong ones in the shoulder.
 DYNAMIXEL = {
     "neck_yaw": "XL330-M288",
@@ -173,7 +171,7 @@ def _marker(marker: Marker, model: Path) -> str:
     towards_hand = -np.array(RobotDescription.load(model).robot.marker_xyz)
     match marker:
         case "ball":
-            return f"\n[vision]\nradius_m = {BALL_RADIUS_M}\n"
+            return "\n[vision]\nradius_m = 0.02\n"  # of the simulation's ball
         case "tag":
             return tag_tables(towards_hand)
         case "cluster":

@@ -40,7 +40,6 @@ from bodyschema.recordings.store.file import LOW_DISK_BYTES
 from bodyschema.recordings.store.store import PairReader
 
 TIME_ERROR = 5  # adjtimex(2): the clock is not synchronised
-TIMEX_BYTES = 512  # more than struct timex has
 
 
 class _Settings:
@@ -228,7 +227,7 @@ def unit_checks(root: Path = Path("/")) -> Iterator[Check]:
 
 def _is_synchronised() -> bool | None:
     try:
-        state = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(TIMEX_BYTES))
+        state = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(512))  # more than struct timex has
     except (OSError, AttributeError):
         return None
     return None if state < 0 else state != TIME_ERROR

@@ -39,7 +39,6 @@ class SessionSettings:
 
 # Default encodings of clients that set none; treated as JSON.
 PLAIN = ("zenoh/", "text/")
-RETRY_MS = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2}
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,7 +219,7 @@ class ZenohSession:
             "listen/endpoints": [self._listen] if self._listen else [],
             "scouting/delay": SessionSettings.first_try_ms,
             "connect/endpoints": list(self._route.endpoints) if self._route else [],
-            "connect/retry": RETRY_MS,
+            "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
             "timestamping/enabled": True,
             "transport/link/tx/lease": SessionSettings.lease_ms,
             "transport/link/rx/max_message_size": largest_bytes,

@@ -18,6 +18,7 @@ class GuardSettings:
     current_slack, current_slack_a = 0.15, 0.05  # allowance for the servo's own current regulation
     refusals: int = 3  # consecutive goals that a servo ignored
     doubtful_cycles: int = 10  # consecutive checks without a reading
+    look_every_s: float = 0.05  # period of reading one servo's torque, health, watchdog and goal
     ramp_s: float = 1.0  # duration of the ramp of the currents
     saturated_s: float = 1.0  # time at its current limit after which a joint is reported to sink
     overcurrent_s: float = 0.5  # time that a current exceeds its limit

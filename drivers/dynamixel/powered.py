@@ -23,13 +23,12 @@ from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import FloatArray, JointReading
 
 from .bus import Bus
-from .guard import Drop, Guard, Motion, ServoState
+from .guard import Drop, Guard, GuardSettings, Motion, ServoState
 from .models import HARDWARE_ERRORS
 from .powered_config import PoweredConfig
 
 log = logging.getLogger(__name__)
 
-LOOK_EVERY_S = 0.05  # period of reading one servo's torque, health, watchdog and goal
 
 State = Literal["off", "on", "dropped"]
 
@@ -266,7 +265,7 @@ class PoweredJoints(ABC):
 
     def _look_at_one(self, now: float) -> None:
         servo = self._servos[self._looked % len(self._servos)]
-        self._looked, self._next_look = self._looked + 1, now + LOOK_EVERY_S
+        self._looked, self._next_look = self._looked + 1, now + GuardSettings.look_every_s
         layout = servo.model.layout
         begin = layout["torque"].address
         span = Register(begin, layout["temperature"].end - begin)

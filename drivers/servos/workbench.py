@@ -20,7 +20,6 @@ from .servo import IdentifiedServo
 from .settings import ID, Setting
 from .vendor import ServoVendor
 
-EEPROM_S = 0.02  # a servo may be deaf so long while it writes
 LOCK = "lock"
 
 OpenAt = Callable[[str, int], tuple[Port, float]]
@@ -177,11 +176,11 @@ class EepromEditor:
             return self._locked(self.bus(port, baud), Done(change, Outcome.KEPT, register.value(data), said))
         return _lost(change, trouble)
 
-    def _tell(self, bus: Bus, servo: IdentifiedServo, register: Register, value: int) -> None:
+    def _tell(self, bus: Bus, servo: IdentifiedServo, register: Register, value: int, deaf_s: float = 0.02) -> None:
         """Write, whatever is answered: under which ID and at which rate it is answered depends on the firmware."""
         bus.write(servo.model, servo.id, register, register.bytes(value))
         bus.settle()
-        bus.listen(self._clock.now() + EEPROM_S)
+        bus.listen(self._clock.now() + deaf_s)  # while it writes
 
     def _unlock(self, bus: Bus, servo: IdentifiedServo) -> None:
         """Unlock the servo's EEPROM; values written while it is locked are lost at power-off."""

@@ -24,8 +24,6 @@ from .eye import TO_LIGHT, StereoEyes
 from .raster import Raster
 from .render_messages import SLOTS, Frame, Message, Setup, Tool, frame_bytes, receive, slot_images
 
-_PARENT_CHECK_S = 1.0
-
 
 class Stick:
     """The tool: a thin rod from the hand to the ball. It is seen, weighs nothing and touches nothing."""
@@ -95,10 +93,10 @@ def _paint(frame: Frame, body: Body, stick: Stick, eyes: StereoEyes, images: tup
     eyes.paint(frame.number, T_world_camera, x_eyes, np.array(frame.R_camera_marker).reshape(3, 3), images)
 
 
-def _next(pipe: Connection) -> Message | None:
+def _next(pipe: Connection, check_s: float = 1.0) -> Message | None:
     """Return the next request; None if the parent closed the pipe or is gone (its fork may keep the pipe open)."""
     parent = os.getppid()
-    while not pipe.poll(_PARENT_CHECK_S):
+    while not pipe.poll(check_s):
         if os.getppid() != parent:
             return None
     return receive(pipe)
