@@ -27,7 +27,7 @@ class _Settings:
     quickest_sigma_s: float = 1e-3 / math.sqrt(3)
     relearn_after_s: float = 30.0  # interval between two comparisons of the rates
     known_after_s: float = 1.0  # shortest comparison that changes the rate
-    longest_held_s: float = 0.5  # the clock of a message that is later, or at first so much earlier, was set
+    longest_held_s: float = 0.5  # longer after its stamp, or at first before it, no message belongs to it
 
 
 class DeviceClock:

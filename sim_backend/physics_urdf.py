@@ -34,8 +34,8 @@ WORLD_LINK = "bodyschema_world"
 class UrdfSettings:
     most_links: int = 120  # pybullet's messages hold 128 joints
     longest_name: int = 1000  # pybullet's messages hold 1024 bytes
-    farthest_m: float = 100.0  # coordinates beyond this are taken for faults of the URDF
-    heaviest_kg: float = 1e4  # and so are masses
+    farthest_m: float = 100.0  # larger coordinates are not in metres
+    heaviest_kg: float = 1e4  # the inertia of a heavier link is not believed
     # A rod in the place of a mesh: its radius as a share of its length, and within what; the shortest one [m].
     rod_share, rod_radius_m, widest_rod_m, shortest_rod_m = 0.1, 0.005, 0.04, 0.01
     # TinyRenderer takes 0.3 µs for a triangle, and a stereo frame is four pictures: 8,000 cost some 10 ms of CPU a

@@ -119,7 +119,7 @@ class _Settings:
     stall_limit_s: float = 60.0  # without a new pair
     glance_s: float = 0.5  # interval of looking at the learner
     tool_length_m: float = 0.25  # by which the tool changes
-    pairs_between_verdicts: int = 15  # whose errors the plot shows
+    pairs_between_verdicts: int = 15  # for the plot of the errors
 
 
 @dataclass(frozen=True, slots=True)

@@ -38,7 +38,7 @@ from bodyschema.recordings.store.file import lock
 
 class _Settings:
     idle_s: float = 0.02  # how often a thread without work looks for some
-    solve_when_idle_s: float = 0.5  # without new pairs for so long, background work goes on at full speed
+    solve_when_idle_s: float = 0.5  # after so long without work the solver starts on all pairs
     breath_s: float = 1e-4  # a thread that waits for a lock gets it between two pieces of work
     tick_s: float = 0.05  # period of the main loop
     # Fraction of one processor; the rest is left to new pairs and queries, which share the interpreter.

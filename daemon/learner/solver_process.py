@@ -33,7 +33,7 @@ from kbmaps import ChainBelief, ChainTolerances, KBMap, OrientedChain, ResidualM
 
 
 class _Settings:
-    longest_rest_s: float = 5.0  # between two solutions, each of which is followed by a rest as long as itself
+    longest_rest_s: float = 5.0  # after a solution, which is followed by a rest as long as it took
     # A child that owes an answer and uses no processor for this long is stopped or locked up: the learner's
     # `WatchdogSec`.
     hung_after_s: float = 60.0

@@ -30,7 +30,7 @@ class _Settings:
     most_shown: int = 12  # names in a message
     slack_rad, slack_m = 0.02, 2e-3  # on top of what the fastest joint moves between two messages
     most_gap_s: float = 0.1  # no position is interpolated between two messages of a joint that are farther apart
-    most_senders: int = 64  # that are told apart
+    most_senders: int = 64  # that are kept apart
     most_names: int = 256  # upper bound of the names kept for messages
     few_per_s: float = 20.0  # readings: fewer get a warning
 

@@ -18,7 +18,7 @@ from .view import EYES, ONE_EYE, Eye, View, image_of
 
 
 class _Settings:
-    most_names = 4  # of files in a message
+    most_names = 4  # of images in a message
     # Number of pairs after which another board is certain, and interval of progress messages.
     sure_pairs, told_pairs = 3, 10
 
