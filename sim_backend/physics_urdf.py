@@ -184,9 +184,8 @@ class _Writer:
             if joint.parent != link or length < UrdfSettings.shortest_rod_m or joint.child not in self._moving:
                 continue
             rod = _shape_at(kind, (end / 2).tolist(), rpy_of(turn_of_z(end / length)).tolist())
-            radius = float(
-                np.clip(UrdfSettings.rod_share * length, UrdfSettings.rod_radius_m, UrdfSettings.widest_rod_m)
-            )
+            thinnest, widest = UrdfSettings.rod_radius_m, UrdfSettings.widest_rod_m
+            radius = float(np.clip(UrdfSettings.rod_share * length, thinnest, widest))
             ElementTree.SubElement(
                 ElementTree.SubElement(rod, "geometry"), "cylinder", radius=repr(radius), length=repr(length)
             )

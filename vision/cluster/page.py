@@ -42,10 +42,8 @@ def shape_page(shape: Shape, ids: Sequence[int], dictionary: Dictionary, side_mm
     name = f"{shape.name[0].upper()}{shape.name[1:]}, {dictionary} {_listed(ids)}, black squares of {side_mm:g} mm"
     made = page((columns * width, rows * width), paper, name, black)
     if made is None:
-        room = (
-            max(min((w - Layout.around_mm) / columns, (h - Layout.around_mm) / rows) for w, h in sheets(paper))
-            / FACE_SIDES
-        )
+        around = Layout.around_mm
+        room = max(min((w - around) / columns, (h - around) / rows) for w, h in sheets(paper)) / FACE_SIDES
         raise _too_large(f"{shape.name} with tags of {side_mm:g} mm", paper, room)
     return made
 
@@ -100,10 +98,9 @@ def _between(cell: Cell, other: Cell, width: float, *, dashed: bool) -> list[Rec
     """Return the line between two neighbouring cells, centred on their common edge."""
     column, row = max(cell[0], other[0]), max(cell[1], other[1])
     x, y = column * width, row * width
-    count = math.floor(width / (2 * _Settings.dash_mm)) if dashed else 1
-    pieces = (
-        [((2 * k + 0.5) * _Settings.dash_mm, _Settings.dash_mm) for k in range(count)] if dashed else [(0.0, width)]
-    )
+    dash = _Settings.dash_mm
+    count = math.floor(width / (2 * dash)) if dashed else 1
+    pieces = [((2 * k + 0.5) * dash, dash) for k in range(count)] if dashed else [(0.0, width)]
     if cell[0] != other[0]:
         return [Rectangle(x - 0.5 * Layout.line_mm, y + at, Layout.line_mm, long) for at, long in pieces]
     return [Rectangle(x + at, y - 0.5 * Layout.line_mm, long, Layout.line_mm) for at, long in pieces]

@@ -81,9 +81,7 @@ def bleed(grey: ImageArray, corners_px: FloatArray, blur_px: float, modules: Flo
     bleeds = odds / (1.0 + odds)
     share = unseen[1] / usual
     moved *= share
-    variance = (
-        bleeds * (share * by_chance + (_Settings.different * moved) ** 2) + bleeds * (1.0 - bleeds) * moved * moved
-    )
+    variance = bleeds * (share * by_chance + (_Settings.unlike * moved) ** 2) + bleeds * (1.0 - bleeds) * moved * moved
     return bleeds * moved, variance
 
 

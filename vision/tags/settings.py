@@ -81,4 +81,4 @@ class BleedSettings:
     # Share of the samples that the pattern has to explain; the usual bleeding, in parts of the blur, where it does not.
     explained, usual = 0.9, 0.3
     # Relative error on nine photographed grids (RMS): modules inside are not drawn and lit exactly as the edges are.
-    different = 0.25
+    unlike = 0.25
