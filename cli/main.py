@@ -107,31 +107,29 @@ def __getattr__(name: str) -> cyclopts.App:
     return globals().setdefault(name, command_line())
 
 
-# A learner with two neighbours opens 26 files, one of fifty robots 200. Libraries abort when they cannot open more.
-FEWEST_FILES, ENOUGH_FILES = 64, 1024
+class _Settings:
+    # A learner with two neighbours opens 26 files, one of fifty robots 200. Libraries abort when they cannot open more.
+    fewest_files, enough_files = 64, 1024
+    longest_message: int = 4000  # a message may quote a file: a key in quotes, a name in a model
+    # Help pages put text beside names: where no column is left for the text, wrapping fails or never ends.
+    narrowest: int = 20
+
+
 RAISE_LIMIT = "`ulimit -n 1024` in the shell, or LimitNOFILE=1024 in the unit, allows more"
 
 
 def allow_enough_files() -> None:
-    """Raise this process's limit of open files to `ENOUGH_FILES`, as far as the system permits.
+    """Raise this process's limit of open files to `enough_files`, as far as the system permits.
 
     Raises:
-        ConfigError: the process may open fewer than `FEWEST_FILES`.
+        ConfigError: the process may open fewer than `fewest_files`.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    allowed = ENOUGH_FILES if hard == resource.RLIM_INFINITY else min(hard, ENOUGH_FILES)
-    if allowed < FEWEST_FILES:
-        raise ConfigError(f"this process may open {hard} files and needs {FEWEST_FILES}", remedy=RAISE_LIMIT)
+    allowed = _Settings.enough_files if hard == resource.RLIM_INFINITY else min(hard, _Settings.enough_files)
+    if allowed < _Settings.fewest_files:
+        raise ConfigError(f"this process may open {hard} files and needs {_Settings.fewest_files}", remedy=RAISE_LIMIT)
     if soft != resource.RLIM_INFINITY and soft < allowed:
         resource.setrlimit(resource.RLIMIT_NOFILE, (allowed, hard))
-
-
-# A message may quote a file: a key in quotes, a name in a model.
-LONGEST_MESSAGE = 4000
-
-
-# Help pages put text beside names: where no column is left for the text, wrapping fails or never ends.
-NARROWEST = 20
 
 
 def prepare_streams() -> None:
@@ -149,8 +147,8 @@ def prepare_streams() -> None:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace") if stream.isatty() else stream.reconfigure(encoding="utf-8")
     columns = shutil.get_terminal_size().columns
-    if columns < NARROWEST or os.environ.get("COLUMNS") == "0":
-        os.environ["COLUMNS"] = str(max(columns, NARROWEST))
+    if columns < _Settings.narrowest or os.environ.get("COLUMNS") == "0":
+        os.environ["COLUMNS"] = str(max(columns, _Settings.narrowest))
 
 
 def _print_front_page() -> None:
@@ -179,7 +177,7 @@ def _drop_output() -> None:
 
 def _fail(error: BodyschemaError) -> NoReturn:
     text = str(error)
-    shortened = text if len(text) <= LONGEST_MESSAGE else f"{text[:LONGEST_MESSAGE]}..."
+    shortened = text if len(text) <= _Settings.longest_message else f"{text[: _Settings.longest_message]}..."
     print(f"bodyschema: {as_typed(printable(shortened))}", file=sys.stderr)  # noqa: T201
     sys.exit(1)
 

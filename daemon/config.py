@@ -38,9 +38,13 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 ENVIRONMENT = "BODYSCHEMA_"
-# Control points of a map that the learner keeps up with: 12 joints that turn. Learning and replaying a pair take 25 ms
-# there, with 13 joints 57 ms, and from a camera pairs come every 33 ms.
-LARGEST_MAP = 3**12
+
+
+class _Settings:
+    # Control points of a map that the learner keeps up with: 12 joints that turn. Learning and replaying a pair take 25
+    # ms there, with 13 joints 57 ms, and from a camera pairs come every 33 ms.
+    largest_map: int = 3**12
+    largest_ball_m: float = 0.5  # a larger radius is one of another unit [m]
 
 
 class DaemonConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -89,8 +93,6 @@ RETIRED = {
     ("sim", "camera"): {"scene_step", "supersampling"},
     ("sim", "guide"): {"force_limit_n", "torque_limit_nm", "gaze_speed_rad_s"},
 }
-# A larger radius is one of another unit [m].
-LARGEST_BALL_M = 0.5
 
 
 class Tables(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -157,7 +159,7 @@ class Config:
             tables.vision.cameras.check(file, text)
             _require_colour(tables, file, text)
         _check_further_cameras(tables, file, text)
-        if tables.vision.radius_m > LARGEST_BALL_M:
+        if tables.vision.radius_m > _Settings.largest_ball_m:
             raise ConfigError(
                 f"vision.radius_m = {tables.vision.radius_m:g}: this looks like millimetres",
                 file=file,
@@ -178,12 +180,12 @@ class Config:
         """ConfigError when there are more joints than the learner can keep up with."""
         joints, slides = self.robot.robot.joints, self.robot.chain.prismatic
         size = math.prod(2 if sliding else 3 for sliding in slides.tolist())
-        if size <= LARGEST_MAP:
+        if size <= _Settings.largest_map:
             return
-        most = round(math.log(LARGEST_MAP, 3))
+        most = round(math.log(_Settings.largest_map, 3))
         raise ConfigError(
             f"{len(joints)} joints are too many for the learner: their map has {size:,} control points, and with more "
-            f"than {LARGEST_MAP:,} ({most} joints that turn) it would not keep up",
+            f"than {_Settings.largest_map:,} ({most} joints that turn) it would not keep up",
             file=self.file,
             line=line_of(read_toml(self.file)[1], ("robot", "joints")),
             remedy=(

@@ -78,18 +78,20 @@ def refusal(method: str, headers: Headers) -> str | None:
 
 
 STATIC = Path(__file__).parent / "static"
-LARGEST_BODY = 4096
-# Interval of keep-alive comments to an idle browser, so that proxies do not close the connection.
-HEARTBEAT_S = 10.0
-# Delay after which a browser reconnects.
-RETRY_MS = 1000
+
+
+class AppSettings:
+    largest_body: int = 4096  # bytes of a request
+    # Interval of keep-alive comments to an idle browser, so that proxies do not close the connection.
+    heartbeat_s: float = 10.0
+    retry_ms: int = 1000  # delay after which a browser reconnects
+    gzip_level: int = 5  # over a tunnel the page takes a quarter; higher levels take thrice the time for 3 % less
+    # Requests for shapes that take a thread at once: reading meshes takes minutes, and the others need threads too.
+    most_for_shapes: int = 2
+    most_digits: int = 9  # of a mesh's number
+
+
 _JSON, _EVENTS, _BYTES = "application/json", "text/event-stream", "application/octet-stream"
-# Over a tunnel the page takes a quarter; higher levels take thrice the time for 3 % less.
-_GZIP_LEVEL = 5
-# Requests for shapes that take a thread at once: reading meshes takes minutes, and the others need threads too.
-_MOST_FOR_SHAPES = 2
-# Digits of a mesh's number.
-_MOST_DIGITS = 9
 # The report is one file with its own style, and no script.
 _REPORT_POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src data:; frame-ancestors 'none'; sandbox"
 
@@ -108,7 +110,7 @@ class _Endpoints:
 
     def __init__(self, hub: Hub, processes: Watch, diagnoses: Diagnoses, shapes: Body) -> None:
         self._hub, self._processes, self._diagnoses, self._shapes = hub, processes, diagnoses, shapes
-        self._for_shapes = asyncio.Semaphore(_MOST_FOR_SHAPES)
+        self._for_shapes = asyncio.Semaphore(AppSettings.most_for_shapes)
 
     async def index(self, _: Request) -> Response:
         return FileResponse(STATIC / "index.html")
@@ -142,7 +144,7 @@ class _Endpoints:
 
     async def mesh(self, request: Request) -> Response:
         number = request.path_params["number"]
-        if not (number.isascii() and number.isdigit() and len(number) <= _MOST_DIGITS):
+        if not (number.isascii() and number.isdigit() and len(number) <= AppSettings.most_digits):
             return Response(status_code=404)
         async with self._for_shapes:
             found = await run_in_threadpool(self._shapes.mesh, int(number))
@@ -178,7 +180,7 @@ def application(hub: Hub, processes: Watch, diagnoses: Diagnoses, shapes: Body) 
         Route("/report", page.report),
         Mount("/static", StaticFiles(directory=STATIC)),
     ]
-    packed = Middleware(GZipMiddleware, compresslevel=_GZIP_LEVEL)
+    packed = Middleware(GZipMiddleware, compresslevel=AppSettings.gzip_level)
     app = Starlette(routes=routes, middleware=[Middleware(Guard), packed])
     app.router.redirect_slashes = False
     return app
@@ -204,8 +206,8 @@ async def _body(request: Request) -> bytes:
     body = b""
     async for part in request.stream():
         body += part
-        if len(body) > LARGEST_BODY:
-            raise RequestError(f"send at most {LARGEST_BODY} bytes")
+        if len(body) > AppSettings.largest_body:
+            raise RequestError(f"send at most {AppSettings.largest_body} bytes")
     return body
 
 
@@ -224,9 +226,9 @@ class _EventStream(StreamingResponse):
 
 
 async def _events(hub: Hub, follower: Follower) -> AsyncIterator[bytes]:
-    yield f"retry: {RETRY_MS}\n\n".encode()
+    yield f"retry: {AppSettings.retry_ms}\n\n".encode()
     while True:
-        news = await follower.take(HEARTBEAT_S)
+        news = await follower.take(AppSettings.heartbeat_s)
         if not news:
             yield b": still here\n\n"
         for topic, document in news.items():

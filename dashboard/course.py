@@ -7,12 +7,14 @@ from bodyschema.daemon.transport.status import LearnerStatus
 
 from .documents import Change, CourseDocument, OutlookDocument, SeriesDocument, Version
 
-LARGEST_SERIES = 600
-LARGEST_COURSE = 50
+
+class _Settings:
+    largest_series: int = 600  # figures
+    largest_course: int = 50  # changes, and versions
 
 
 class Series:
-    """Figures over time, at most `LARGEST_SERIES`, evenly spread."""
+    """Figures over time, at most `largest_series`, evenly spread."""
 
     def __init__(self) -> None:
         self._rows: list[tuple[float, float | None, float | None, float | None, float | None]] = []
@@ -33,7 +35,7 @@ class Series:
         if not is_kept:
             return
         self._rows.append((t, error_m, expected_m, pairs_per_s, predict_s))
-        if len(self._rows) > LARGEST_SERIES:
+        if len(self._rows) > _Settings.largest_series:
             self._stride *= 2
             self._rows = self._rows[::2]
 
@@ -79,7 +81,7 @@ class Course:
             self._changes[key] = _marked(last, self._changes[key].pairs, self._changes[key].t)
             return False
         before = [(each, mark) for each, mark in self._changes.items() if mark.pairs < at]
-        self._changes = dict([*before, (key, _marked(last, at, now))][-LARGEST_COURSE:])
+        self._changes = dict([*before, (key, _marked(last, at, now))][-_Settings.largest_course :])
         return True
 
     def _note_version(self, status: LearnerStatus, now: float, *, changed: bool) -> None:
@@ -95,7 +97,7 @@ class Course:
             after_change=last.after_change if goes_on and last else changed,
         )
         earlier = self._versions[:-1] if goes_on else self._versions
-        self._versions = [*earlier, version][-LARGEST_COURSE:]
+        self._versions = [*earlier, version][-_Settings.largest_course :]
 
 
 def _marked(last: LastChange | None, pairs: int, t: float) -> Change:

@@ -13,20 +13,22 @@ from bodyschema.interfaces.records import Pair
 
 from .documents import CloudDocument, Segment
 
-KEPT = 3000
-LARGEST_CLOUD = 800
-SHOWN_SEGMENTS = 40
-# Decimals of a coordinate [m] that is sent to the page: a micrometre.
-DECIMALS = 6
+
+class RecentSettings:
+    kept: int = 3000  # pairs
+    largest_cloud: int = 800  # pairs
+    shown_segments: int = 40  # the newest
+    decimals: int = 6  # of a coordinate [m] that is sent to the page: a micrometre
+
 
 NOTHING = CloudDocument("", [], [], [], None, None)
 
 
 class RecentPairs:
-    """At most `KEPT` pairs of one store, in order."""
+    """At most `kept` pairs of one store, in order."""
 
     def __init__(self) -> None:
-        self._pairs: deque[Pair] = deque(maxlen=KEPT)
+        self._pairs: deque[Pair] = deque(maxlen=RecentSettings.kept)
 
     def __len__(self) -> int:
         return len(self._pairs)
@@ -60,15 +62,15 @@ class RecentPairs:
                 lasted_s=max(run[-1].t - run[0].t, 0.0),
                 complete=begins == 1 or run[0].seq > begins,
             )
-            for run in runs[-SHOWN_SEGMENTS:]
+            for run in runs[-RecentSettings.shown_segments :]
         ]
 
     def chosen(self, after_seq: int, upto_seq: int) -> list[Pair]:
-        """Return at most `LARGEST_CLOUD` pairs after one sequence number and up to another, evenly spread."""
+        """Return at most `largest_cloud` pairs after one sequence number and up to another, evenly spread."""
         wanted = [pair for pair in self._pairs if after_seq < pair.seq <= upto_seq]
-        if len(wanted) <= LARGEST_CLOUD:
+        if len(wanted) <= RecentSettings.largest_cloud:
             return wanted
-        return [wanted[k] for k in np.linspace(0, len(wanted) - 1, LARGEST_CLOUD).round().astype(int)]
+        return [wanted[k] for k in np.linspace(0, len(wanted) - 1, RecentSettings.largest_cloud).round().astype(int)]
 
 
 def cloud(pairs: list[Pair], predict: Callable[[list[list[float]]], PredictReply]) -> CloudDocument:
@@ -91,8 +93,8 @@ def cloud(pairs: list[Pair], predict: Callable[[list[list[float]]], PredictReply
     lengths = np.linalg.norm(residual, axis=1)
     return CloudDocument(
         model=reply.model,
-        x=x.round(DECIMALS).tolist(),
-        residual=residual.round(DECIMALS).tolist(),
+        x=x.round(RecentSettings.decimals).tolist(),
+        residual=residual.round(RecentSettings.decimals).tolist(),
         segment=[pair.segment for pair in pairs],
         median_m=float(np.median(lengths)),
         p95_m=float(np.quantile(lengths, 0.95)),

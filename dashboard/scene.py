@@ -6,7 +6,7 @@ import numpy as np
 
 from bodyschema.daemon.transport.status import LearnerStatus
 from bodyschema.daemon.transport.wire import PredictReply
-from bodyschema.dashboard.recent import DECIMALS
+from bodyschema.dashboard.recent import RecentSettings
 from bodyschema.interfaces.records import FloatArray, Pair
 from bodyschema.robot.description import RobotDescription, link_poses
 from bodyschema.robot.hand_eye import MarkerPose
@@ -18,8 +18,6 @@ from .documents import ArmDocument
 # Half axes of the ellipsoid that holds 95 % of a normal distribution in space, in units of its 1-sigma: the root of the
 # chi-squared distribution's quantile for three degrees of freedom.
 _RADIUS_95 = 2.7955
-# Pairs before the newest whose measured positions are shown.
-TRAIL = 80
 
 
 def arm(
@@ -56,9 +54,9 @@ def arm(
         links=_pose_numbers(newest),
         camera=_pose_numbers(T_root_cameras[-1:])[0],
         hand=robot.tree.links.index(robot.robot.marker_link),
-        measured=measured[-1].round(DECIMALS).tolist(),
-        trail=measured[:-1].round(DECIMALS).tolist(),
-        predicted=None if predicted is None else predicted.round(DECIMALS).tolist(),
+        measured=measured[-1].round(RecentSettings.decimals).tolist(),
+        trail=measured[:-1].round(RecentSettings.decimals).tolist(),
+        predicted=None if predicted is None else predicted.round(RecentSettings.decimals).tolist(),
         measured_pose=MarkerPose.of(pairs[-1].x, pairs[-1].cov, pairs[-1].R, pairs[-1].cov_R),
         predicted_pose=None if reply is None or reply.poses is None else reply.poses[0],
         radii=radii,
@@ -69,4 +67,4 @@ def arm(
 
 def _pose_numbers(T: FloatArray) -> list[list[float]]:
     """Return poses (n, 4, 4) as x, y, z and the quaternion's x, y, z, w."""
-    return np.hstack([T[:, :3, 3], quaternions(T[:, :3, :3])]).round(DECIMALS).tolist()
+    return np.hstack([T[:, :3, 3], quaternions(T[:, :3, :3])]).round(RecentSettings.decimals).tolist()

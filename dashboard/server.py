@@ -20,8 +20,10 @@ from .hub import Hub
 from .shapes import Body
 from .watch import Watch
 
-MOST_CONNECTIONS = 100
-END_LIMIT_S = 3
+
+class _Settings:
+    most_connections: int = 100  # at once
+    end_limit_s: int = 3  # how long open requests may take to end
 
 
 class _Server(uvicorn.Server):
@@ -68,8 +70,8 @@ def serve(config: Config, port: int, ready: Callable[[str], None]) -> None:
                 log_config=None,
                 server_header=False,
                 proxy_headers=False,
-                limit_concurrency=MOST_CONNECTIONS,
-                timeout_graceful_shutdown=END_LIMIT_S,
+                limit_concurrency=_Settings.most_connections,
+                timeout_graceful_shutdown=_Settings.end_limit_s,
             )
             logging.getLogger("uvicorn").setLevel(logging.WARNING)
             server = _Server(settings, hub)

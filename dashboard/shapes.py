@@ -34,15 +34,16 @@ from .documents import BodyDocument, CameraShape, LinkShape
 log = logging.getLogger(__name__)
 
 MODULE = "bodyschema.dashboard.shapes"
-# A triangle takes at most 60 bytes, so all meshes together at most 1.8 MB.
-MOST_TRIANGLES = 30_000
-# Reading 256 MiB of text meshes takes minutes; the page is drawn without them meanwhile.
-READ_LIMIT_S = 180.0
-MOST_MEMORY_BYTES = 2**31
-# Edges that are sharper than this stay sharp; a cylinder of 12 sides looks round.
-_CREASE_COSINE = float(np.cos(np.radians(32.0)))
-# Corners at one vertex whose normals are compared, so that no mesh takes long.
-_MOST_NEIGHBOURS = 24
+
+
+class _Settings:
+    most_triangles: int = 30_000  # a triangle takes at most 60 bytes, so all meshes together at most 1.8 MB
+    # Reading 256 MiB of text meshes takes minutes; the page is drawn without them meanwhile.
+    read_limit_s: float = 180.0
+    most_memory_bytes: int = 2**31  # of the process that reads meshes
+    # Edges that are sharper than this stay sharp; a cylinder of 12 sides looks round.
+    crease_cosine = float(np.cos(np.radians(32.0)))
+    most_neighbours: int = 24  # corners at one vertex whose normals are compared, so that no mesh takes long
 
 
 class LinkShapes(msgspec.Struct, frozen=True):
@@ -120,7 +121,7 @@ class Body:
             self._child = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE)
         with self._child as child:
             try:
-                output, _ = child.communicate(timeout=READ_LIMIT_S)
+                output, _ = child.communicate(timeout=_Settings.read_limit_s)
             finally:
                 child.kill()
         if child.returncode != 0:
@@ -134,7 +135,7 @@ def read_shapes(urdf: Path) -> LinkShapes:
     Raises:
         RobotError: the URDF cannot be read.
     """
-    meshes, shapes = MeshSet(urdf, MOST_TRIANGLES), link_shapes(parse_urdf(urdf))
+    meshes, shapes = MeshSet(urdf, _Settings.most_triangles), link_shapes(parse_urdf(urdf))
     named = [(shape.mesh, shape.sizes) for parts in shapes.values() for shape in parts if shape.kind == "mesh"]
     used = [number for each in named if (number := meshes.number_of(*each)) is not None]
     drawn, before = meshes.coarser(used)
@@ -207,9 +208,9 @@ def _corner_normals(triangles: FloatArray, vertex: np.ndarray) -> FloatArray:
     order = np.argsort(vertex, kind="stable")
     vertices, face = vertex[order], order // 3
     sums = areas[face]
-    for step in range(1, min(_MOST_NEIGHBOURS, len(order))):
+    for step in range(1, min(_Settings.most_neighbours, len(order))):
         here, there = face[:-step], face[step:]
-        smooth = np.einsum("ij,ij->i", faces[here], faces[there]) > _CREASE_COSINE
+        smooth = np.einsum("ij,ij->i", faces[here], faces[there]) > _Settings.crease_cosine
         alike = np.flatnonzero((vertices[:-step] == vertices[step:]) & smooth)
         sums[alike] += areas[there[alike]]
         sums[alike + step] += areas[here[alike]]
@@ -237,7 +238,7 @@ def main() -> None:
     """Write the shapes of the URDF named by the argument to standard output."""
     os.nice(NICENESS)
     try:
-        with bounded_memory(MOST_MEMORY_BYTES):
+        with bounded_memory(_Settings.most_memory_bytes):
             found = read_shapes(Path(sys.argv[1]))
     except BodyschemaError as error:
         sys.exit(str(error))

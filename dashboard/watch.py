@@ -19,15 +19,21 @@ from bodyschema.daemon.transport.wire import CommandReply, CommandRequest, Joint
 from bodyschema.dashboard.course import Course, Series, expected_outlook
 from bodyschema.dashboard.documents import Process, ProcessDocument, RobotDocument
 from bodyschema.dashboard.hub import Hub
-from bodyschema.dashboard.recent import KEPT, RecentPairs, cloud
-from bodyschema.dashboard.scene import TRAIL, arm
+from bodyschema.dashboard.recent import RecentPairs, RecentSettings, cloud
+from bodyschema.dashboard.scene import arm
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import BusError, RecordingError, RequestError
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.waits import ANSWER_LIMIT_S, STATUS_EVERY_S
 
-# A process publishes its status every second; less often on a busy machine.
-SILENT_AFTER_S = 5.0
+
+class _Settings:
+    silent_after_s: float = 5.0  # a process publishes its status every second; less often on a busy machine
+    cloud_every_s: float = 2.0  # interval between two sets of pairs
+    picture_every_s: float = 0.5  # interval between two pictures of a camera
+    trail: int = 80  # pairs before the newest whose measured positions are shown
+    command_limit_s: float = 10.0  # longer than a tool change or switching torque on takes
+
 
 S = TypeVar("S", SamplerStatus, LearnerStatus)
 
@@ -80,16 +86,11 @@ class Heard(Generic[S]):
             return ProcessDocument(self._is_there(), self._endpoint, self._heard_utc, self._problem, self._fields)
 
     def _is_there(self) -> bool:
-        recent = self._heard_at is not None and self._clock.now() - self._heard_at < SILENT_AFTER_S
+        recent = self._heard_at is not None and self._clock.now() - self._heard_at < _Settings.silent_after_s
         return self._alive and recent
 
 
 log = logging.getLogger(__name__)
-
-CLOUD_EVERY_S = 2.0
-PICTURE_EVERY_S = 0.5
-# Longer than a tool change or switching torque on takes.
-COMMAND_LIMIT_S = 10.0
 
 
 class Watch:
@@ -112,7 +113,7 @@ class Watch:
         self._picture: tuple[float, bytes] | None = None
         self._picturing = threading.Lock()
         self._cloud_of: tuple[str, int] | None = None
-        self._cloud_at = -CLOUD_EVERY_S
+        self._cloud_at = -_Settings.cloud_every_s
         self._stopping = threading.Event()
         self._open: ExitStack | None = None
 
@@ -140,7 +141,9 @@ class Watch:
             RequestError: it refused.
         """
         payload = encode(CommandRequest(name))
-        reply = self._sessions[process].ask_one(self._keys.command(process), payload, timeout_s=COMMAND_LIMIT_S)
+        reply = self._sessions[process].ask_one(
+            self._keys.command(process), payload, timeout_s=_Settings.command_limit_s
+        )
         return decode(reply, CommandReply).message
 
     def picture(self) -> bytes:
@@ -152,7 +155,7 @@ class Watch:
         """
         with self._picturing:
             now = self._clock.now()
-            if self._picture is None or now - self._picture[0] > PICTURE_EVERY_S:
+            if self._picture is None or now - self._picture[0] > _Settings.picture_every_s:
                 jpeg = self._sessions["sampler"].ask_one(self._keys.picture, timeout_s=ANSWER_LIMIT_S)
                 self._picture = now, jpeg
             return self._picture[1]
@@ -211,7 +214,7 @@ class Watch:
             return
         # The prediction was asked for before newer pairs came.
         seq, reply = self._predicted or (newest.seq, None)
-        pairs = self._recent.upto(seq, TRAIL) or self._recent.upto(newest.seq, TRAIL)
+        pairs = self._recent.upto(seq, _Settings.trail) or self._recent.upto(newest.seq, _Settings.trail)
         reply = reply if pairs[-1].seq == seq and learner is not None else None
         self._hub.put("arm", arm(self._config.robot, pairs, learner, reply))
 
@@ -250,7 +253,7 @@ class Watch:
             return
         restarted = self._history is not None and status.pairs < self._history.next_seq - 1
         if self._history is None or status.store != self._store or restarted:
-            self._history, self._store, self._recent = self.history(KEPT), status.store, RecentPairs()
+            self._history, self._store, self._recent = self.history(RecentSettings.kept), status.store, RecentPairs()
             self._predicted = None
         had = len(self._recent), self._recent.newest
         while page := self._history.page():
@@ -261,7 +264,7 @@ class Watch:
     def _renew_cloud(self, status: LearnerStatus) -> None:
         now = self._clock.now()
         of = (status.model, status.last_seq)
-        if of == self._cloud_of or now - self._cloud_at < CLOUD_EVERY_S or status.store != self._store:
+        if of == self._cloud_of or now - self._cloud_at < _Settings.cloud_every_s or status.store != self._store:
             return
         pairs = self._recent.chosen(status.last_seq - status.pairs_since_change, status.last_seq)
         self._hub.put("cloud", cloud(pairs, self._predict))

@@ -11,15 +11,18 @@ from typing import Literal
 
 from .serial_line import serial_ports
 
-MANY_TROUBLES = 0.01  # share of lost readings that deserves a warning
-READ_S = 1.0  # how long a check of the rate lasts
+
+class CheckSettings:
+    many_troubles: float = 0.01  # share of lost readings that deserves a warning
+    read_s: float = 1.0  # how long a check of the rate lasts
+    longest_latency_ms: int = 1  # of an adapter's latency timer
+
+
 State = Literal["ok", "warning", "wrong"]
 ROOT = Path("/")
 LATENCY_TIMER = "sys/bus/usb-serial/devices/{}/latency_timer"
-LONGEST_LATENCY_MS = 1
 ENUMERATED = ("ttyUSB", "ttyACM")
 PSEUDO_TERMINALS, MASTERS = "/dev/pts/", {"/dev/ptmx", "/dev/pts/ptmx"}
-LONGEST_COMMAND = 60
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,13 +74,13 @@ def _has_open(process: Path, device: str) -> bool:
     return device in opened and not serves
 
 
-def _command(process: Path) -> str:
+def _command(process: Path, longest: int = 60) -> str:
     try:
         words = (process / "cmdline").read_bytes().split(b"\0")
     except OSError:
         return "?"
     command = " ".join(word.decode(errors="replace") for word in words if word)
-    return f"{command[:LONGEST_COMMAND]}…" if len(command) > LONGEST_COMMAND else command or "?"
+    return f"{command[:longest]}…" if len(command) > longest else command or "?"
 
 
 def port_checks(name: str, port: str, root: Path = ROOT, *, ours: Collection[int] = ()) -> Iterator[Check]:
@@ -147,4 +150,4 @@ def _latency(port: str, root: Path) -> Iterator[Check]:
         return
     said = f"the adapter keeps bytes back for up to {latency_ms} ms"
     fix = "bodyschema install udev    # then plug the adapter in again"
-    yield warned("latency timer", said, fix, when=latency_ms > LONGEST_LATENCY_MS)
+    yield warned("latency timer", said, fix, when=latency_ms > CheckSettings.longest_latency_ms)

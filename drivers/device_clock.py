@@ -5,9 +5,6 @@ from __future__ import annotations
 import math
 from collections import deque
 
-RELEARN_AFTER_S = 30.0
-KNOWN_AFTER_S = 1.0
-
 
 class _Settings:
     # difference of the clock rates until it is estimated, and its later change
@@ -28,6 +25,9 @@ class _Settings:
     lately: int = 3
     # USB polls every millisecond, so the delay of the fastest message is unknown
     quickest_sigma_s: float = 1e-3 / math.sqrt(3)
+    relearn_after_s: float = 30.0  # interval between two comparisons of the rates
+    known_after_s: float = 1.0  # shortest comparison that changes the rate
+    longest_held_s: float = 0.5  # longer after its stamp, or at first before it, no message belongs to it
 
 
 class DeviceClock:
@@ -87,8 +87,8 @@ class DeviceClock:
         return device_s + wrap_s * round((expected_s - device_s - self._tick_s / 2) / wrap_s)
 
     def _learn_rate(self, earliest: float, latest: float) -> None:
-        """Update the rate from the time elapsed on both clocks, and restart the comparison every `RELEARN_AFTER_S`."""
-        if self._begin is None or self._device_s - self._begin[2] < KNOWN_AFTER_S:
+        """Update the rate from the time elapsed on both clocks, and restart the comparison every `relearn_after_s`."""
+        if self._begin is None or self._device_s - self._begin[2] < _Settings.known_after_s:
             return
         self._is_known = True
         passed_s = self._device_s - self._begin[2]
@@ -98,11 +98,8 @@ class DeviceClock:
             turned = (self._rate - rate) * self._device_s  # keeps the offset at the present unchanged
             self._low, self._high = self._low + turned, self._high + turned
             self._rate, self._spread = rate, max(_Settings.drift, unsure_s / passed_s)
-        if passed_s > RELEARN_AFTER_S:
+        if passed_s > _Settings.relearn_after_s:
             self._begin = (earliest, latest, self._device_s)
-
-
-LONGEST_HELD_S = 0.5
 
 
 class StreamClock:
@@ -149,7 +146,8 @@ class StreamClock:
         device_s = self._unwrapped(stamp, latest)
         t = self._mapped(device_s)
         is_early = device_s - self._least[0][0] < _Settings.early_s if self._least else True
-        if latest - t > LONGEST_HELD_S or t - latest > (LONGEST_HELD_S if is_early else _Settings.ahead_s):
+        ahead_s = _Settings.longest_held_s if is_early else _Settings.ahead_s
+        if latest - t > _Settings.longest_held_s or t - latest > ahead_s:
             return None
         self._device_s = max(device_s, self._device_s)
         self._note(device_s, latest - device_s)

@@ -15,8 +15,10 @@ from bodyschema.interfaces.errors import SourceEnded, SourceError
 from bodyschema.interfaces.records import FloatArray, JointReading, MarkerFix, frozen_array
 from bodyschema.recordings.recording import Recording
 
-DEFAULT_SIGMA_M = 1e-3
-AHEAD = 8  # rows by which one source may lead the other
+
+class ReplaySettings:
+    default_sigma_m: float = 1e-3  # of a recording without covariances
+    rows_ahead: int = 8  # rows by which one source may lead the other
 
 
 class Replay:
@@ -119,7 +121,7 @@ def default_covariances(
     """
     if sigma_m is None and calibration is not None and calibration.is_stereo and (recording.x[:, 2] > 0).all():
         return stereo_covariances(recording.x, calibration)
-    sigma_m = DEFAULT_SIGMA_M if sigma_m is None else sigma_m
+    sigma_m = ReplaySettings.default_sigma_m if sigma_m is None else sigma_m
     return np.broadcast_to(np.eye(3) * sigma_m**2, (len(recording), 3, 3))
 
 
@@ -179,7 +181,7 @@ class _Pace:
 
     def _wait(self, reader: int, row: int, timeout_s: float) -> bool:
         deadline = time.monotonic() + timeout_s
-        if not self._turn.wait_for(lambda: row < self._next[1 - reader] + AHEAD, timeout_s):
+        if not self._turn.wait_for(lambda: row < self._next[1 - reader] + ReplaySettings.rows_ahead, timeout_s):
             return False
         if self._speed == 0:
             return True

@@ -15,8 +15,12 @@ import serial
 
 from bodyschema.interfaces.errors import SourceError, SourceLost
 
-RETRY_S = 0.2  # period of looking for a lost port
-DEFAULT_LATENCY_S = 4e-3  # for adapters that do not report their latency
+
+class SerialLineSettings:
+    retry_s: float = 0.2  # period of looking for a lost port
+    default_latency_s: float = 4e-3  # for adapters that do not report their latency
+
+
 LATENCY_OF = "/sys/bus/usb-serial/devices/{}/latency_timer"
 
 
@@ -34,7 +38,7 @@ class BusLost(SourceLost):
     def __init__(self, port: str, error: Exception, state: str = "is gone") -> None:
         number = next((part for part in error.args if isinstance(part, int)), None)
         why = os.strerror(number) if number else str(error) or "it was unplugged"
-        super().__init__(f"{port} {state}: {why}", retry_s=RETRY_S)
+        super().__init__(f"{port} {state}: {why}", retry_s=SerialLineSettings.retry_s)
 
 
 def adapter_latency_s(port: str, latency_of: str = LATENCY_OF) -> float:
@@ -43,7 +47,7 @@ def adapter_latency_s(port: str, latency_of: str = LATENCY_OF) -> float:
     try:
         return int(file.read_text()) * 1e-3
     except (OSError, ValueError):
-        return DEFAULT_LATENCY_S
+        return SerialLineSettings.default_latency_s
 
 
 class SerialLine:

@@ -79,9 +79,13 @@ def _in(folder: Path) -> list[Path]:
 if TYPE_CHECKING:
     from distributed import Client, Future
 
-# A diagnosis that ended this many workers (by running out of memory, for example) is not tried again.
-WORKERS_LOST = 1
-CONNECT_LIMIT_S = 10.0
+
+class _Settings:
+    # A diagnosis that ended this many workers (by running out of memory, for example) is not tried again.
+    workers_lost: int = 1
+    connect_limit_s: float = 10.0  # to a scheduler of Dask
+
+
 TOPIC = "bodyschema"
 
 
@@ -170,7 +174,7 @@ def workers(scheduler: str | None, jobs: int, count: int | None = None) -> Itera
     from distributed import Client, LocalCluster
 
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # errors that matter are reported by the diagnoses
-    with safe_children(), config.set({"distributed.scheduler.allowed-failures": WORKERS_LOST}):
+    with safe_children(), config.set({"distributed.scheduler.allowed-failures": _Settings.workers_lost}):
         if scheduler is not None:
             with _client_of(scheduler) as client:
                 yield client
@@ -193,7 +197,7 @@ def _client_of(scheduler: str) -> Client:
     from distributed import Client
 
     try:
-        client = Client(scheduler, timeout=CONNECT_LIMIT_S)
+        client = Client(scheduler, timeout=_Settings.connect_limit_s)
     except (OSError, ValueError, TimeoutError) as error:
         raise ConfigError(
             f"no Dask scheduler answers on {scheduler}",

@@ -92,8 +92,10 @@ class JointPaths:
         return at + 0.5 * s * (before - after) + 0.5 * s * s * (before - 2.0 * at + after)
 
 
-_SERVO_GAIN = 0.3
-_SERVO_FORCE = 200.0
+class _Settings:
+    servo_gain: float = 0.3  # of the head's position control
+    servo_force: float = 200.0  # largest torque of the head's joints [N·m]
+    slowest_physics_hz: int = 240  # pybullet's default
 
 
 class TorqueFreeArm:
@@ -136,14 +138,11 @@ class TorqueFreeArm:
                 [body.joints[k] for k in self._gaze],
                 body.bullet.POSITION_CONTROL,
                 targetPositions=gaze_target.tolist(),
-                positionGains=[_SERVO_GAIN] * len(self._gaze),
-                forces=[_SERVO_FORCE] * len(self._gaze),
+                positionGains=[_Settings.servo_gain] * len(self._gaze),
+                forces=[_Settings.servo_force] * len(self._gaze),
                 physicsClientId=body.client,
             )
         body.bullet.stepSimulation(physicsClientId=body.client)
-
-
-_SLOWEST_PHYSICS_HZ = 240  # pybullet's default
 
 
 class Physics:
@@ -152,7 +151,7 @@ class Physics:
     def __init__(self, truth: TrueRobot, calibration: StereoCalibration, config: SimConfig) -> None:
         self._truth, self._calibration, self._config = truth, calibration, config
         common = lcm(config.encoders.rate_hz, config.camera.rate_hz)
-        self.rate_hz = common * max(1, -(-_SLOWEST_PHYSICS_HZ // common))
+        self.rate_hz = common * max(1, -(-_Settings.slowest_physics_hz // common))
         self.steps = 0
         self.urdf = physics_urdf(truth)
         self.marker_xyz = np.array(truth.robot.robot.marker_xyz)

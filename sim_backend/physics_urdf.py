@@ -29,16 +29,22 @@ from .truth import TrueRobot
 
 # The link above the robot's root. It has no inertia, so that the world frame is the root's frame for pybullet too.
 WORLD_LINK = "bodyschema_world"
-MOST_LINKS = 120  # pybullet's messages hold 128 joints
-_LONGEST_NAME = 1000  # pybullet's messages hold 1024 bytes
-FARTHEST_M = 100.0
-HEAVIEST_KG = 1e4
-# A rod in the place of a mesh: its radius as a share of its length, and within what; the shortest one [m].
-_ROD_SHARE, ROD_RADIUS_M, _WIDEST_ROD_M, SHORTEST_ROD_M = 0.1, 0.005, 0.04, 0.01
+
+
+class UrdfSettings:
+    most_links: int = 120  # pybullet's messages hold 128 joints
+    longest_name: int = 1000  # pybullet's messages hold 1024 bytes
+    farthest_m: float = 100.0  # larger coordinates are not in metres
+    heaviest_kg: float = 1e4  # the inertia of a heavier link is not believed
+    # A rod in the place of a mesh: its radius as a share of its length, and within what; the shortest one [m].
+    rod_share, rod_radius_m, widest_rod_m, shortest_rod_m = 0.1, 0.005, 0.04, 0.01
+    # TinyRenderer takes 0.3 µs for a triangle, and a stereo frame is four pictures: 8,000 cost some 10 ms of CPU a
+    # frame.
+    most_triangles: int = 8_000
+
+
 _ROD_RGBA = "0.55 0.57 0.6 1"
 _SIZES = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "length"), "capsule": ("radius", "length")}
-# TinyRenderer takes 0.3 µs for a triangle, and a stereo frame is four pictures: 8,000 cost some 10 ms of CPU a frame.
-MOST_TRIANGLES = 8_000
 
 
 def physics_urdf(truth: TrueRobot) -> PhysicsUrdf:
@@ -86,16 +92,16 @@ class _Writer:
 
     def written(self) -> PhysicsUrdf:
         tree = self._truth.tree
-        if len(tree.links) > MOST_LINKS:
+        if len(tree.links) > UrdfSettings.most_links:
             raise RobotError(
-                f"the simulation takes robots of up to {MOST_LINKS} links, this one has {len(tree.links)}",
+                f"the simulation takes robots of up to {UrdfSettings.most_links} links, this one has {len(tree.links)}",
                 file=self._file,
                 remedy="Delete the links that neither carry the cameras nor the marker nor anything that is in the way",
             )
         longest = max((*tree.links, *tree.joints), key=len)
-        if len(longest.encode()) > _LONGEST_NAME:
+        if len(longest.encode()) > UrdfSettings.longest_name:
             raise RobotError(
-                f"the name {longest[:40]!r}... is longer than {_LONGEST_NAME} bytes",
+                f"the name {longest[:40]!r}... is longer than {UrdfSettings.longest_name} bytes",
                 file=self._file,
                 remedy="Shorten it",
             )
@@ -175,10 +181,11 @@ class _Writer:
         for joint in self._truth.tree.joints.values():
             end = joint.T_parent_joint[:3, 3]
             length = float(np.linalg.norm(end))
-            if joint.parent != link or length < SHORTEST_ROD_M or joint.child not in self._moving:
+            if joint.parent != link or length < UrdfSettings.shortest_rod_m or joint.child not in self._moving:
                 continue
             rod = _shape_at(kind, (end / 2).tolist(), rpy_of(turn_of_z(end / length)).tolist())
-            radius = float(np.clip(_ROD_SHARE * length, ROD_RADIUS_M, _WIDEST_ROD_M))
+            thinnest, widest = UrdfSettings.rod_radius_m, UrdfSettings.widest_rod_m
+            radius = float(np.clip(UrdfSettings.rod_share * length, thinnest, widest))
             ElementTree.SubElement(
                 ElementTree.SubElement(rod, "geometry"), "cylinder", radius=repr(radius), length=repr(length)
             )
@@ -188,7 +195,7 @@ class _Writer:
 
     def _add_joint(self, robot: ElementTree.Element, joint: UrdfJoint) -> None:
         place = joint.T_parent_joint[:3, 3]
-        if np.abs(place).max() > FARTHEST_M:
+        if np.abs(place).max() > UrdfSettings.farthest_m:
             raise RobotError(
                 f"joint {joint.name!r} is {np.linalg.norm(place):.3g} m from the joint before it",
                 file=self._file,
@@ -232,7 +239,7 @@ class Meshes(MeshSet):
     """The meshes of one URDF as files. Ask for each with `add`, then take all of them with `files`."""
 
     def __init__(self, urdf: Path) -> None:
-        super().__init__(urdf, MOST_TRIANGLES)
+        super().__init__(urdf, UrdfSettings.most_triangles)
         self._drawn: list[int] = []
 
     def add(self, name: str, scale: tuple[float, ...], *, drawn: bool) -> str | None:
@@ -332,7 +339,7 @@ def _origin(element: ElementTree.Element) -> tuple[tuple[float, ...], tuple[floa
     if origin is None:
         return _ZERO, _ZERO
     xyz, rpy = (floats(origin.get(key, "0 0 0"), 3) for key in ("xyz", "rpy"))
-    if xyz is None or rpy is None or max(map(abs, chain(xyz, rpy))) > FARTHEST_M:
+    if xyz is None or rpy is None or max(map(abs, chain(xyz, rpy))) > UrdfSettings.farthest_m:
         return None
     return xyz, rpy
 
@@ -347,13 +354,14 @@ def _inertia(inertial: ElementTree.Element) -> _Inertia | None:
     mass, tensor, pose = inertial.find("mass"), inertial.find("inertia"), _origin(inertial)
     kilograms = (0.0,) if mass is None else floats(mass.get("value"), 1)
     moments = floats(" ".join("0" if tensor is None else tensor.get(key, "0") for key in _MOMENTS), 6)
-    if kilograms is None or moments is None or pose is None or not 0.0 <= kilograms[0] <= HEAVIEST_KG:
+    if kilograms is None or moments is None or pose is None or not 0.0 <= kilograms[0] <= UrdfSettings.heaviest_kg:
         return None
     if not (kilograms[0] and any(moments)):
         return _SMALL._replace(mass_kg=kilograms[0] or _SMALL.mass_kg, xyz=pose[0])
     xx, xy, xz, yy, yz, zz = moments
     least, _, most = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    return _Inertia(kilograms[0], moments, *pose) if 0.0 < least <= most <= HEAVIEST_KG * LARGEST_M**2 else None
+    heaviest = UrdfSettings.heaviest_kg * LARGEST_M**2
+    return _Inertia(kilograms[0], moments, *pose) if 0.0 < least <= most <= heaviest else None
 
 
 def _add_world(root: ElementTree.Element, robot_root: str) -> None:

@@ -29,9 +29,6 @@ from .world import stereo_calibration, stereo_frame
 
 log = logging.getLogger(__name__)
 
-# Time from one posture to the next [s].
-PERIOD_S = 1.0
-
 
 class _Settings:
     # Number of frames that are rendered ahead.
@@ -41,6 +38,7 @@ class _Settings:
     # How far the head may be turned away from the marker [rad]: with it the head's angles say more than where the hand
     # is.
     wander: float = np.radians(20.0)
+    period_s: float = 1.0  # time from one posture to the next [s]
 
 
 class PosedWorld:
@@ -76,7 +74,9 @@ class PosedWorld:
         prismatic = self.robot.chain.prismatic
         self._encoders = Encoders(self.config.encoders, self._truth.offsets, prismatic, rng)
         count, beyond = len(self._postures), self._truth.beyond
-        motion = Motion(self._postures, PERIOD_S * np.arange(1.0, count + 1.0), np.zeros(count, dtype=np.int64))
+        motion = Motion(
+            self._postures, _Settings.period_s * np.arange(1.0, count + 1.0), np.zeros(count, dtype=np.int64)
+        )
         unloaded = beyond.unloaded(motion) - self._truth.offsets
         self._angles = unloaded + beyond.given_way(unloaded)  # true ones (n, d) [rad or m]
         urdf = physics_urdf(self._truth)
@@ -97,7 +97,7 @@ class PosedWorld:
 
     def now(self) -> float:
         """Return the time of the posture seen last [s]."""
-        return self._delivered * PERIOD_S
+        return self._delivered * _Settings.period_s
 
     def true_chain(self) -> RigidChain:
         """Return the ground-truth chain from the left eye to the marker, over reported angles."""
@@ -118,7 +118,7 @@ class PosedWorld:
             raise SourceEnded("the encoders were read in all postures")
         q = self._encoders.read(self._postures[self._read] - self._truth.offsets)
         self._read += 1
-        return JointReading(self._read * PERIOD_S, frozen_array(q))
+        return JointReading(self._read * _Settings.period_s, frozen_array(q))
 
     def next_frame(self, timeout_s: float) -> StereoFrame | None:
         """Return the next posture's frame, None if it is not rendered in time.
@@ -144,7 +144,7 @@ class PosedWorld:
     def scene(self, number: int) -> Scene:
         """Return the scene of the frame of posture `number`."""
         self._body.set_angles(self._angles[number])
-        row = Motion.at(self._postures[number], (number + 1) * PERIOD_S, PERIOD_S)
+        row = Motion.at(self._postures[number], (number + 1) * _Settings.period_s, _Settings.period_s)
         return scene_of(self._body, self._truth, self._marker, self._calibration, row)
 
 

@@ -19,9 +19,6 @@ from .config import SimConfig
 from .geometry import rotation, transform
 from .randomness import Stream, generator
 
-# The offset of a prismatic joint is known better than that of a revolute one: metres of error per radian.
-_METRES_PER_RADIAN = 0.1
-
 
 @dataclass(frozen=True)
 class TrueRobot:
@@ -47,8 +44,9 @@ class TrueRobot:
         way = [joint.name for joint, _ in robot.tree.path(robot.camera.parent_link, robot.robot.marker_link)]
         moving = [name for name in way if robot.tree.joints[name].kind in MOVING]
         offsets: dict[str, float] = {}
+        metres_per_radian = 0.1  # the offset of a prismatic joint is known better than that of a revolute one
         for name in moving:
-            scale = _METRES_PER_RADIAN if robot.tree.joints[name].kind == "prismatic" else 1.0
+            scale = metres_per_radian if robot.tree.joints[name].kind == "prismatic" else 1.0
             offsets[name] = float(scale * errors.joint_offset_rad * rng.standard_normal())
         for effect in extension.all_effects:
             if effect.kind.is_zero:

@@ -30,9 +30,11 @@ from .sources import SimClock, SimJoints, SimStereoCamera
 
 log = logging.getLogger(__name__)
 
-# Limits on running ahead of the readers: frames taken but not read, and seconds of joint readings.
-FRAMES_AHEAD = 2
-_READINGS_AHEAD_S = 1.0
+
+class _Settings:
+    # Limits on running ahead of the readers: frames taken but not read, and seconds of joint readings.
+    frames_ahead: int = 2
+    readings_ahead_s: float = 1.0
 
 
 @dataclass(slots=True)
@@ -179,7 +181,7 @@ class SimWorld:
         with self._moved:
             while self._may_take_frame():
                 self._check_open(self._camera_open)
-                if len(self._readings) < _READINGS_AHEAD_S * self.config.encoders.rate_hz:
+                if len(self._readings) < _Settings.readings_ahead_s * self.config.encoders.rate_hz:
                     self._step()
                 elif self._frame_times:
                     break
@@ -189,7 +191,7 @@ class SimWorld:
             return True
 
     def _may_take_frame(self) -> bool:
-        return not self._camera_open or self._taken - self._delivered < FRAMES_AHEAD
+        return not self._camera_open or self._taken - self._delivered < _Settings.frames_ahead
 
     def _check_open(self, is_open: bool) -> None:
         if not self._running:

@@ -170,7 +170,7 @@ def patient_host(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("bodyschema.drivers.servos.bus.HOST_S", 1.0)
     monkeypatch.setattr("bodyschema.drivers.servos.scan.HOST_S", 1.0)
     monkeypatch.setattr("bodyschema.drivers.dynamixel.bus.HOST_S", 1.0)
-    monkeypatch.setattr("bodyschema.drivers.servos.checks.IDENTIFY_S", 30.0)
+    monkeypatch.setattr("bodyschema.drivers.servos.checks._Settings.identify_s", 30.0)
     monkeypatch.setattr("bodyschema.drivers.serial_lines.joints.LOST_AFTER_S", 10.0)
     monkeypatch.setattr("bodyschema.drivers.serial_lines.board.DOUBTS", 10_000)
 

@@ -10,9 +10,10 @@ from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.errors import ConfigError, SourceError
 from bodyschema.interfaces.records import ImageArray, StereoFrame
 
-# Grey level of an over-exposed pixel, and the largest share of them in a usable image.
-WHITE, _MOST_WHITE = 250, 0.4
-_BLACK = 20  # grey level that hardly a pixel of a black image exceeds
+
+class ImageSettings:
+    white, most_white = 250, 0.4  # grey level of an over-exposed pixel, and the largest share of them in a usable image
+    black = 20  # grey level that hardly a pixel of a black image exceeds
 
 
 def check_images(frame: StereoFrame, calibration: StereoCalibration) -> None:
@@ -55,10 +56,10 @@ def check_calibration(calibration: StereoCalibration) -> None:
 
 def is_black(image: ImageArray) -> bool:
     """Return True if the whole image is dark."""
-    return bool(np.quantile(image, 0.99) < _BLACK)
+    return bool(np.quantile(image, 0.99) < ImageSettings.black)
 
 
 def too_white(levels: ImageArray) -> float | None:
     """Return the share of white among grey levels, if it is too large."""
-    white = float(np.mean(levels >= WHITE))
-    return white if white > _MOST_WHITE else None
+    white = float(np.mean(levels >= ImageSettings.white))
+    return white if white > ImageSettings.most_white else None

@@ -12,7 +12,6 @@ from bodyschema.robot.limited import read_at_most
 
 # The largest camera images, uncompressed, have half of it.
 MOST_BYTES = 2**28
-_QUALITY = 80  # of JPEG for a page: about 100 kB
 
 
 def read_image(file: Path, flags: int = cv2.IMREAD_COLOR) -> ImageArray | None:
@@ -35,6 +34,6 @@ def shrunk(image: ImageArray, widest_px: int) -> ImageArray:
     return np.asarray(cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def jpeg(image: ImageArray) -> bytes:
-    """Return an image as JPEG, for a page."""
-    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
+def jpeg(image: ImageArray, quality: int = 80) -> bytes:
+    """Return an image as JPEG, for a page: about 100 kB."""
+    return cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()

@@ -12,8 +12,6 @@ from bodyschema.interfaces.records import ImageArray, MarkerFix, MarkerMiss, Ste
 
 from .image_file import jpeg, shrunk
 
-_WIDEST_PX = 1280  # of a picture beside other panels of a page
-
 
 class MarkerTracker(Protocol):
     """Interface of a tracker that finds the marker in stereo images, frame by frame."""
@@ -67,7 +65,7 @@ class TrackedCamera:
         newest = self._newest
         if newest is None or self._annotator is None:
             return None
-        return jpeg(shrunk(self._annotator.drawn(*newest), _WIDEST_PX))
+        return jpeg(shrunk(self._annotator.drawn(*newest), widest_px=1280))  # beside other panels of a page
 
     def read(self, timeout_s: float) -> MarkerFix | MarkerMiss | None:
         """Return the marker in the next frame, or the reason for a miss; None if no frame came within `timeout_s`

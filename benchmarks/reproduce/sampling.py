@@ -9,7 +9,7 @@ from typing import Self
 
 import numpy as np
 
-from bodyschema.cli.terminal.screen import TELL_EVERY_S, Say
+from bodyschema.cli.terminal.screen import Say, ScreenSettings
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.sampler.devices import session_of
 from bodyschema.daemon.sampler.sampler import Sampler
@@ -42,7 +42,7 @@ class _Enough:
         pairs = self._stored.last_seq()
         if pairs >= self._count:
             raise SourceEnded("there are enough pairs")
-        if time.monotonic() - self._told >= TELL_EVERY_S:
+        if time.monotonic() - self._told >= ScreenSettings.tell_every_s:
             self._told = time.monotonic()
             self._say(f"{pairs:,} of {self._count:,} pairs sampled")
         return self._marker.read(timeout_s)

@@ -32,10 +32,10 @@ from bodyschema.vision.calibration.image_pairs import ImagePair, Images, read_pa
 from bodyschema.vision.calibration.live import LiveViews
 from bodyschema.vision.calibration.refocus import refocused
 from bodyschema.vision.calibration.report import page as report_page
-from bodyschema.vision.calibration.report.page import to_its_interval
+from bodyschema.vision.calibration.report.page import NORMAL_95, to_its_interval
 from bodyschema.vision.calibration.view import EYES, ONE_EYE
 from bodyschema.vision.printing.sheet import rulers_mm
-from bodyschema.vision.rig.common_error import AHEAD_M, CommonError
+from bodyschema.vision.rig.common_error import CommonError, CommonErrorSettings
 from bodyschema.vision.rig.rectified import Rectification
 from bodyschema.vision.rig.rig_file import read_rig, write_rig
 from bodyschema.vision.rig.stereo_rig import CalibrationError, OneEyeRig, StereoRig
@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     from bodyschema.cli.commands.calibrate.calibrate_cameras import KnownCameras
 
 REPORT = "report.html"
-NORMAL_95 = 1.96
 _SQUARES = re.compile(r"(\d{1,9})\s*[xX×]\s*(\d{1,9})")
 
 Tell = Callable[[str], None]
@@ -317,9 +316,6 @@ def _metres(mm: float | None) -> float | None:
     return None if mm is None else 1e-3 * mm
 
 
-_WISHES = 3
-
-
 def cameras_view(found: CamerasFile) -> Group:
     """Return a table of the eyes' parameters, followed by sentences on their accuracy."""
     width, height = found.image_size_px
@@ -356,15 +352,15 @@ def check_view(found: CheckFile, name: str) -> Group:
     return Group(table, *(Padding(Text(text), (1, 0, 0, 0), expand=False) for text in texts))
 
 
-def _sentences(found: CamerasFile) -> list[str]:
+def _sentences(found: CamerasFile, wishes: int = 3) -> list[str]:
     said: list[str] = []
     if found.baseline_mm is not None:
         said.append(f"Baseline {found.baseline_mm:.2f} ± {found.baseline_half_width_mm:.2f} mm (95 %).")
     across, down, ahead = found.position_half_widths_mm
     marker = "Positions" if found.baseline_mm is not None else "Tags of exactly known size"
     said.append(
-        f"{marker} {AHEAD_M:g} m ahead are known to ± {across:.2f} mm across, {down:.2f} down, {ahead:.2f} in depth "
-        "(95 %), as far as the calibration goes."
+        f"{marker} {CommonErrorSettings.ahead_m:g} m ahead are known to ± {across:.2f} mm across, {down:.2f} down, "
+        f"{ahead:.2f} in depth (95 %), as far as the calibration goes."
     )
     said.append(
         f"Views that were not fitted are foretold to {found.held_out_px:.3f} px (RMS per coordinate; fitted "
@@ -383,8 +379,8 @@ def _sentences(found: CamerasFile) -> list[str]:
             "or the distance of the lenses and give --baseline-mm."
         )
     if found.missing:
-        more = "" if len(found.missing) <= _WISHES else f"; and {len(found.missing) - _WISHES} more, in the report"
-        said.append(f"It would be better with: {'; '.join(found.missing[:_WISHES])}{more}.")
+        more = "" if len(found.missing) <= wishes else f"; and {len(found.missing) - wishes} more, in the report"
+        said.append(f"It would be better with: {'; '.join(found.missing[:wishes])}{more}.")
     return said
 
 

@@ -21,9 +21,10 @@ from bodyschema.interfaces.waits import LINE_EVERY_S, READ_S
 from bodyschema.vision.calibration.calibrate import Calibrated
 from bodyschema.vision.calibration.check import Check, check
 from bodyschema.vision.calibration.gather import Gathered, require_both
-from bodyschema.vision.calibration.guidance import TILTED_EACH_WAY, WANTED_VIEWS, Coverage, cell_counts
+from bodyschema.vision.calibration.guidance import Coverage, cell_counts
 from bodyschema.vision.calibration.image_pairs import ImagePair
 from bodyschema.vision.calibration.live import LiveViews, Look, Outcome
+from bodyschema.vision.calibration.settings import ViewSettings
 from bodyschema.vision.calibration.view import Eye, all_px, image_of
 from bodyschema.vision.rig.stereo_rig import CalibrationError
 
@@ -204,7 +205,8 @@ def now_text(shown: Shown) -> str:
 def screen(shown: Shown, heading: str) -> Group:
     """All of it, for 80 columns and 24 lines."""
     coverage = shown.coverage
-    count = f"{coverage.whole_views} of {max(WANTED_VIEWS, coverage.whole_views)} views, {coverage.progress:.0%}"
+    wanted = max(ViewSettings.wanted_views, coverage.whole_views)
+    count = f"{coverage.whole_views} of {wanted} views, {coverage.progress:.0%}"
     parts = Table.grid(padding=(0, 4))
     for _ in range(len(coverage.eyes) + 2):
         parts.add_column(no_wrap=True)
@@ -250,9 +252,13 @@ def _cells(coverage: Coverage, look: Look | None, eye: Eye) -> Table:
 def _tilts(coverage: Coverage) -> Table:
     table = Table.grid(padding=(0, 2))
     for edge, count in coverage.tilted().items():
-        done = count >= TILTED_EACH_WAY
+        done = count >= ViewSettings.tilted_each_way
         table.add_row(
-            edge, Text(f"{min(count, TILTED_EACH_WAY)}/{TILTED_EACH_WAY}", style=(_DONE if done else _OPEN)[1])
+            edge,
+            Text(
+                f"{min(count, ViewSettings.tilted_each_way)}/{ViewSettings.tilted_each_way}",
+                style=(_DONE if done else _OPEN)[1],
+            ),
         )
     return table
 

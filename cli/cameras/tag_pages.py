@@ -20,7 +20,6 @@ from .board_pages import printed_scale
 
 ShapeName = Literal["tags", "plate", "cube", "board", "chessboard"]
 _RUN = re.compile(r"(\d{1,9})(?:-(\d{1,9}))?")
-_MOST_TAGS = 100
 
 
 @dataclass(frozen=True)
@@ -55,16 +54,16 @@ class Tags:
         return numbers_of(self.ids)
 
 
-def numbers_of(ids: str) -> list[int]:
+def numbers_of(ids: str, most: int = 100) -> list[int]:
     """Parse tag numbers as in 0-5,9. ConfigError if they cannot be parsed, or one is repeated."""
     found: list[int] = []
     for part in ids.split(","):
         run = _RUN.fullmatch(part.strip())
         if run is None:
             raise ConfigError(f"--ids {ids} is not as in 0-5,9", remedy="Give numbers, or runs of them")
-        found += range(int(run[1]), int(run[2] or run[1]) + 1)[: _MOST_TAGS + 1]
-    if len(found) > _MOST_TAGS:
-        raise ConfigError(f"--ids {ids} are more than {_MOST_TAGS}", remedy="Print them on several pages")
+        found += range(int(run[1]), int(run[2] or run[1]) + 1)[: most + 1]
+    if len(found) > most:
+        raise ConfigError(f"--ids {ids} are more than {most}", remedy="Print them on several pages")
     if len(set(found)) < len(found) or not found:
         raise ConfigError(f"--ids {ids} has a tag twice, or none", remedy="No number may be there twice")
     return found

@@ -76,9 +76,13 @@ def _write(file: Path, data: bytes) -> None:
 log = logging.getLogger(__name__)
 
 BOUNDARY = "picture"
-# Each browser that shows the pictures has its own thread here.
-MOST_VIEWERS = 32
-_END_CHECK_S = 0.05
+
+
+class _Settings:
+    most_viewers: int = 32  # each browser that shows the pictures has its own thread here
+    end_check_s: float = 0.05  # how often the server looks for its end
+
+
 PAGE = b"<!doctype html><title>bodyschema</title><body style='margin:0;background:#111'><img src=/stream width=100%>"
 POLICY = "default-src 'none'; img-src 'self'; style-src 'unsafe-inline'; frame-ancestors 'none'"
 
@@ -101,7 +105,7 @@ class MjpegServer:
         self._number = 0
         self._changed = threading.Condition()
         self._is_closing = False
-        self._viewers = threading.BoundedSemaphore(MOST_VIEWERS)
+        self._viewers = threading.BoundedSemaphore(_Settings.most_viewers)
         self._server: _Server | None = None
 
     def __enter__(self) -> Self:
@@ -111,7 +115,7 @@ class MjpegServer:
             remedy = "Give another --port, or --port 0 for one that is free"
             raise ConfigError(f"port {self._port} cannot be used: {error.strerror}", remedy=remedy) from error
         serve = self._server.serve_forever
-        threading.Thread(target=serve, args=(_END_CHECK_S,), name="pictures", daemon=True).start()
+        threading.Thread(target=serve, args=(_Settings.end_check_s,), name="pictures", daemon=True).start()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -156,7 +160,7 @@ class MjpegServer:
                 elif self.path != "/stream":
                     self._say(404, "there is nothing here. The pictures are at /")
                 elif not server._viewers.acquire(blocking=False):
-                    self._say(503, f"{MOST_VIEWERS} browsers look on already. Close one")
+                    self._say(503, f"{_Settings.most_viewers} browsers look on already. Close one")
                 else:
                     try:
                         self._stream()

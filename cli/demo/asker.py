@@ -18,8 +18,6 @@ from bodyschema.daemon.transport.session import ZenohSession, client
 from bodyschema.daemon.transport.wire import JointsRequest, PredictReply, decode, encode
 from bodyschema.interfaces.errors import BusError, RequestError
 
-RATE_HZ = 20.0
-
 
 def main(robot_file: str, seed: str) -> None:
     """Ask until the input ends or the learner does not come back."""
@@ -40,7 +38,9 @@ def _patient_client(endpoint: str) -> ZenohSession:
     raise BusError(f"nothing listens on {endpoint}")
 
 
-def _one_second(bus: ZenohSession, config: Config, rng: np.random.Generator) -> dict[str, float | int]:
+def _one_second(
+    bus: ZenohSession, config: Config, rng: np.random.Generator, rate_hz: float = 20.0
+) -> dict[str, float | int]:
     key, robot = Keys(config.robot.name).predict, config.robot
     took: list[float] = []
     unanswered = refused = 0
@@ -55,7 +55,7 @@ def _one_second(bus: ZenohSession, config: Config, rng: np.random.Generator) -> 
             unanswered += 1
         except RequestError:
             refused += 1
-        time.sleep(max(0.0, 1.0 / RATE_HZ - (time.perf_counter() - start)))
+        time.sleep(max(0.0, 1.0 / rate_hz - (time.perf_counter() - start)))
     return {
         "answers": len(took),
         "unanswered": unanswered,

@@ -18,7 +18,7 @@ from typing import IO, Literal
 import numpy as np
 
 from bodyschema.cli.demo.scene import Scene
-from bodyschema.cli.replay.processes import END_LIMIT_S, Process, started
+from bodyschema.cli.replay.processes import Process, ProcessSettings, started
 from bodyschema.cli.terminal.screen import rejected
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.transport.keys import Keys
@@ -114,7 +114,12 @@ def _page(plot: str, legend: dict[str, str]) -> str:
     )
 
 
-POSES = 300
+class _Settings:
+    poses: int = 300  # at which the models are judged
+    stall_limit_s: float = 60.0  # without a new pair
+    glance_s: float = 0.5  # interval of looking at the learner
+    tool_length_m: float = 0.25  # by which the tool changes
+    pairs_between_verdicts: int = 15  # for the plot of the errors
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,7 +181,7 @@ class Judge:
         region = self._seen[self._region_start :]
         if not len(region):
             return None
-        poses = region[self._rng.integers(len(region), size=POSES)]
+        poses = region[self._rng.integers(len(region), size=_Settings.poses)]
         poses = poses + self._rng.normal(0.0, REGION_RAD, poses.shape)
         poses = np.clip(poses, self._robot.lower, self._robot.upper)
         truth = self.truth()
@@ -235,7 +240,7 @@ def started_asker(scene: Scene, seed: int) -> Iterator[Asker]:
     try:
         yield Asker(lines)
     finally:
-        end(process, END_LIMIT_S)
+        end(process, ProcessSettings.end_limit_s)
         reader.join()
         process.stdout.close()
 
@@ -243,12 +248,6 @@ def started_asker(scene: Scene, seed: int) -> Iterator[Asker]:
 def _collect(stream: IO[bytes], lines: queue.SimpleQueue[bytes]) -> None:
     for line in stream:
         lines.put(line)
-
-
-STALL_LIMIT_S = 60.0
-GLANCE_S = 0.5
-TOOL_LENGTH_M = 0.25
-PAIRS_BETWEEN_VERDICTS = 15
 
 
 @dataclass
@@ -319,7 +318,8 @@ def stalled(sampler: SamplerStatus) -> str:
     """Return the message for a sampler that has made no pair for too long."""
     why = ", ".join(f"{count} rejected: {reason}" for reason, count in rejected(sampler))
     seen = f"the sampler has seen {sampler.frames} frames" + (f", {why}" if why else "")
-    return f"no new pair for {STALL_LIMIT_S:.0f} s; {seen}. More may be in daemon.log. Try another --seed or marker"
+    more = "More may be in daemon.log. Try another --seed or marker"
+    return f"no new pair for {_Settings.stall_limit_s:.0f} s; {seen}. {more}"
 
 
 @dataclass
@@ -351,16 +351,16 @@ class _Stage:
             done = snapshot.learner.pairs >= begin + pairs
             if done or snapshot.learner.pairs >= next_verdict:
                 snapshot.verdict = self._verdict(snapshot.learner)
-                next_verdict = snapshot.learner.pairs + PAIRS_BETWEEN_VERDICTS
+                next_verdict = snapshot.learner.pairs + _Settings.pairs_between_verdicts
             self.asker.update()
             self.show(snapshot)
             if done and snapshot.verdict is not None:
                 told = snapshot.learner
                 claimed_rad = None if told.orientation is None else told.orientation.claimed_rad
                 return Chapter(told.pairs - begin, snapshot.verdict, told.claimed_error_m, claimed_rad, told.outlook)
-            if time.monotonic() - progress_at > STALL_LIMIT_S:
+            if time.monotonic() - progress_at > _Settings.stall_limit_s:
                 raise BusError(stalled(snapshot.sampler))
-            time.sleep(GLANCE_S)
+            time.sleep(_Settings.glance_s)
 
     def change_tool(self) -> int:
         """Act as a user would: pause, change the tool, report it to the learner, resume.
@@ -374,7 +374,7 @@ class _Stage:
             time.sleep(0.05)
         changed_at = self._judge.seen
         marker = np.array(self.config.robot.robot.marker_xyz)
-        self._judge.change_tool(marker * (1.0 + TOOL_LENGTH_M / float(np.linalg.norm(marker))))
+        self._judge.change_tool(marker * (1.0 + _Settings.tool_length_m / float(np.linalg.norm(marker))))
         self._judge.new_region()
         self._command("learner", "tool_changed")
         self._command("sampler", "resume")

@@ -20,10 +20,14 @@ from bodyschema.robot.description import RobotDescription
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation  # it takes half a second to import, and a ball has no rotation
 
-# Side of the cube [m], and of its black squares as a fraction: the white margin of a tag is an eighth of its side.
-CUBE_M, SQUARE = 0.07, 0.8
-# Side of a single tag's black square, and its distance in front of the tool's centre line [m], clear of the stick.
-TAG_M, BEFORE_M = 0.06, 0.007
+
+class _Settings:
+    # Side of the cube [m], and of its black squares as a fraction: the white margin of a tag is an eighth of its side.
+    cube_m, square = 0.07, 0.8
+    # Side of a single tag's black square, and its distance in front of the tool's centre line [m], clear of the stick.
+    tag_m, before_m = 0.06, 0.007
+
+
 FORWARD = np.array([1.0, 0.0, 0.0])
 
 
@@ -41,7 +45,7 @@ def tag_tables(towards_hand: FloatArray) -> str:
     ahead = FORWARD - (FORWARD @ up) * up
     ahead = ahead / np.linalg.norm(ahead)
     rpy = Rotation.from_matrix(np.column_stack([np.cross(up, ahead), up, ahead])).as_euler("xyz")
-    return "\n".join([*_head(TAG_M), *_tag(0, BEFORE_M * ahead, rpy)]) + "\n"
+    return "\n".join([*_head(_Settings.tag_m), *_tag(0, _Settings.before_m * ahead, rpy)]) + "\n"
 
 
 def cube_tables(towards_hand: FloatArray) -> str:
@@ -54,13 +58,13 @@ def cube_tables(towards_hand: FloatArray) -> str:
     """
     from scipy.spatial.transform import Rotation
 
-    lines = _head(SQUARE * CUBE_M)
+    lines = _head(_Settings.square * _Settings.cube_m)
     on_corner = Rotation.align_vectors(towards_hand[None] / np.linalg.norm(towards_hand), np.ones((1, 3)) / np.sqrt(3))[
         0
     ]
     for id, normal in enumerate(np.vstack([np.eye(3), -np.eye(3)])):
         face = on_corner * _outward(normal)
-        lines += _tag(id, on_corner.apply(normal * CUBE_M / 2), face.as_euler("xyz"))
+        lines += _tag(id, on_corner.apply(normal * _Settings.cube_m / 2), face.as_euler("xyz"))
     return "\n".join(lines) + "\n"
 
 
@@ -90,8 +94,6 @@ MARK = ".bodyschema-demo"
 Bus = Literal["dynamixel", "feetech", "serial", "ros2"]
 Marker = Literal["ball", "tag", "cluster"]
 Camera = Literal["stereo", "mono"]
-# Of the simulation's ball.
-BALL_RADIUS_M = 0.02
 # Light ones in the neck, strong ones in the shoulder.
 DYNAMIXEL = {
     "neck_yaw": "XL330-M288",
@@ -169,7 +171,7 @@ def _marker(marker: Marker, model: Path) -> str:
     towards_hand = -np.array(RobotDescription.load(model).robot.marker_xyz)
     match marker:
         case "ball":
-            return f"\n[vision]\nradius_m = {BALL_RADIUS_M}\n"
+            return "\n[vision]\nradius_m = 0.02\n"  # of the simulation's ball
         case "tag":
             return tag_tables(towards_hand)
         case "cluster":

@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from bodyschema.cli.terminal.findings_view import outlook_sentence
-from bodyschema.cli.terminal.screen import TELL_EVERY_S, coverage_table, degrees, mm, rejected, titled_table
+from bodyschema.cli.terminal.screen import ScreenSettings, coverage_table, degrees, mm, rejected, titled_table
 from bodyschema.daemon.transport.status import SamplerStatus
 
 from .play import Outcome, Snapshot
@@ -46,7 +46,7 @@ class _Lines:
             self._console.print(f"-- {self._phase}", soft_wrap=True)
         if time.monotonic() < self._next:
             return
-        self._next = time.monotonic() + TELL_EVERY_S
+        self._next = time.monotonic() + ScreenSettings.tell_every_s
         learner, verdict = snapshot.learner, snapshot.verdict
         truth, what = mm(verdict.error_m) if verdict else "-", "error: "
         if verdict and verdict.angle_rad is not None:

@@ -40,9 +40,12 @@ from bodyschema.recordings.store.file import LOW_DISK_BYTES
 from bodyschema.recordings.store.store import PairReader
 
 TIME_ERROR = 5  # adjtimex(2): the clock is not synchronised
-TIMEX_BYTES = 512  # more than struct timex has
-CONNECT_S = 0.3
-OPEN_S = 0.7
+
+
+class _Settings:
+    connect_s: float = 0.3  # how long a connection is waited for
+    open_s: float = 0.7  # how long a session is waited for
+
 
 # One that began before an update is called by the old name.
 SAMPLER = re.compile(r"(bodyschema|-m daemon) (run )?sampler\b")
@@ -104,7 +107,7 @@ def _description(config: Config) -> Iterator[Check]:
 def _sampler_status(config: Config) -> SamplerStatus | None:
     """Return the status of a running sampler, which holds ports and cameras; None if none answers."""
     route, keys = config.route("sampler"), Keys(config.robot.name)
-    if not is_alive(route, keys.alive("sampler"), open_timeout_s=OPEN_S):
+    if not is_alive(route, keys.alive("sampler"), open_timeout_s=_Settings.open_s):
         return None
     with ZenohSession(connect=route, client=True) as bus:
         return decode(bus.ask_one(keys.status("sampler")), SamplerStatus)
@@ -149,7 +152,7 @@ def _samplers(config: Config) -> list[int]:
     """Return the PIDs of sampler processes that have a port open, if the sampler answers."""
     pids = [holder.pid for holder in other_holders(config) if SAMPLER.search(holder.command)]
     route, token = config.route("sampler"), Keys(config.robot.name).alive("sampler")
-    return pids if pids and is_alive(route, token, open_timeout_s=OPEN_S) else []
+    return pids if pids and is_alive(route, token, open_timeout_s=_Settings.open_s) else []
 
 
 def _of_the_sampler(config: Config) -> Iterator[Check]:
@@ -224,7 +227,7 @@ def unit_checks(root: Path = Path("/")) -> Iterator[Check]:
 
 def _is_synchronised() -> bool | None:
     try:
-        state = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(TIMEX_BYTES))
+        state = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(512))  # more than struct timex has
     except (OSError, AttributeError):
         return None
     return None if state < 0 else state != TIME_ERROR
@@ -242,7 +245,7 @@ def _zenoh(config: Config) -> Iterator[Check]:
 def router_check(route: Route) -> Check:
     """Check that the router accepts our connection."""
     try:
-        with ZenohSession(connect=route, client=True, open_timeout_s=OPEN_S):
+        with ZenohSession(connect=route, client=True, open_timeout_s=_Settings.open_s):
             return Check("zenoh", "ok", f"the router {route} takes our connection")
     except BusError as error:
         first, _, rest = str(error).partition(". ")
@@ -252,9 +255,9 @@ def router_check(route: Route) -> Check:
 def zenoh_check(process: str, route: Route, token: str) -> Check:
     """Check that the process answers or, if it does not run, that its endpoint is free."""
     endpoint = str(route)
-    if endpoint.startswith(("tcp/", "tls/")) and not accepts(endpoint, CONNECT_S):
+    if endpoint.startswith(("tcp/", "tls/")) and not accepts(endpoint, _Settings.connect_s):
         return Check("zenoh", "ok", f"the {process} does not run; {endpoint} is free for it")
-    if is_alive(route, token, open_timeout_s=OPEN_S):
+    if is_alive(route, token, open_timeout_s=_Settings.open_s):
         return Check("zenoh", "ok", f"the {process} answers on {endpoint}")
     port = endpoint.rpartition(":")[2]
     said = f"another program listens on {endpoint}, where the {process} should"

@@ -32,9 +32,9 @@ class _Settings:
     beyond: float = 0.01
     # a marker that moved less shows no direction
     seen_m: float = 0.01
+    temperature_every_s: float = 0.5  # one servo in turn
 
 
-TEMPERATURE_EVERY_S = 0.5  # one servo in turn
 WORDS = (("forward", "back"), ("left", "right"), ("up", "down"))  # REP 103: x, y, z
 
 
@@ -121,7 +121,7 @@ class JointsWatch:
         joint = self._robot.joints[self._asked % len(self._robot.joints)]
         self._temperatures[joint] = self._servos.temperature_c(joint)
         self._asked += 1
-        self._next_s = self._clock.now() + TEMPERATURE_EVERY_S
+        self._next_s = self._clock.now() + _Settings.temperature_every_s
 
     def _seen(self, q: FloatArray) -> Seen:
         joints = tuple(self._joint(place, float(angle)) for place, angle in enumerate(q))

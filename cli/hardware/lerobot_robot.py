@@ -34,10 +34,14 @@ from bodyschema.robot.suggest import did_you_mean
 from bodyschema.robot.toml_text import toml_value
 from bodyschema.robot.urdf import MOVING, UrdfTree
 
-BAUD = 1_000_000
-# Where the middle of a joint's limits is nearer to 0 than this, 0 is meant to be the middle: the URDF of SO-101 has
-# wrist_roll from -157° to 163°, and LeRobot's own kinematics gives it the degrees as they are.
-MIDDLE_WITHIN_RAD = math.radians(5.0)
+
+class _Settings:
+    baud: int = 1_000_000  # of LeRobot's arms [bit/s]
+    # Where the middle of a joint's limits is nearer to 0 than this, 0 is meant to be the middle: the URDF of SO-101 has
+    # wrist_roll from -157° to 163°, and LeRobot's own kinematics gives it the degrees as they are.
+    middle_within_rad: float = math.radians(5.0)
+
+
 Scan = Callable[[Sequence[int]], Sequence[ScannedBus]]
 
 
@@ -83,7 +87,7 @@ def lerobot_robot_toml(arm: LeRobotArm, urdf: Path, robot: Path, calibration: Pa
 def lerobot_port(arm: LeRobotArm, scan: Scan) -> str:
     """Return the only port that has all motors of `arm`; raise ConfigError if none or more than one has."""
     wanted = {(arm.id(name), arm.models[name]) for name in arm.joints}
-    scanned = scan([BAUD])
+    scanned = scan([_Settings.baud])
     found = [bus.port for bus in scanned if wanted <= {(servo.id, servo.model) for servo in bus.servos}]
     if len(found) == 1:
         return found[0]
@@ -154,7 +158,7 @@ def _servos(arm: LeRobotArm, tree: UrdfTree, calibrations: Calibrations, file: P
 def _middle_rad(lower: float, upper: float) -> float:
     """Return the angle of a joint with these limits where LeRobot reads 0° [rad]."""
     middle = (lower + upper) / 2
-    return 0.0 if abs(middle) < MIDDLE_WITHIN_RAD else middle
+    return 0.0 if abs(middle) < _Settings.middle_within_rad else middle
 
 
 def _servo_tables(arm: LeRobotArm, servos: Sequence[LeRobotServo], calibration: Path, port: str) -> str:
@@ -165,7 +169,7 @@ def _servo_tables(arm: LeRobotArm, servos: Sequence[LeRobotServo], calibration: 
         "# CHECK directions with `bodyschema watch joints`: move a joint, and look where its angle goes.",
         f"[{table}.buses.arm]",
         f"port = {toml_value(port)}",
-        f"baud = {BAUD:_}",
+        f"baud = {_Settings.baud:_}",
         "",
     ]
     for servo in servos:

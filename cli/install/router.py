@@ -20,7 +20,7 @@ from bodyschema.daemon.service.notify import Notifier
 from bodyschema.daemon.service.service import Service
 from bodyschema.daemon.transport.access import EVERY_ROBOT, ROLES, Names, access_control
 from bodyschema.daemon.transport.identity import SECURE, Identity, TlsConfig
-from bodyschema.daemon.transport.session import LARGEST_REPLY_BYTES, LEASE_MS, ZenohSession
+from bodyschema.daemon.transport.session import SessionSettings, ZenohSession
 from bodyschema.daemon.transport.zenoh_config import ENDPOINT, HOW_TO
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.protocols import Clock
@@ -88,8 +88,8 @@ class RouterConfig:
             "scouting/multicast/enabled": False,
             "scouting/gossip/enabled": False,
             "timestamping/enabled": True,
-            "transport/link/tx/lease": LEASE_MS,
-            "transport/link/rx/max_message_size": LARGEST_REPLY_BYTES,
+            "transport/link/tx/lease": SessionSettings.lease_ms,
+            "transport/link/rx/max_message_size": SessionSettings.largest_reply_bytes,
             "access_control": access_control(self.tables.access, by_user=self.identity.by_user),
             **self.identity.settings(),
         }

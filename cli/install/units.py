@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bodyschema.daemon.config import Config
-from bodyschema.daemon.service.notify import START_LIMIT_S
+from bodyschema.daemon.service.notify import NotifySettings
 from bodyschema.daemon.transport.identity import is_local
 from bodyschema.daemon.wiring.servos import configured_ports
 from bodyschema.interfaces.errors import ConfigError
@@ -127,8 +127,12 @@ WantedBy=multi-user.target
 # Longer than the slowest round of any loop: the learner's background work took 6 s with twelve joints on a busy
 # machine.
 _WATCHDOG_S = {"sampler": 30, "learner": 60}
-# A learner of 50 robots takes 16 MB for each robot.
-_MEMORY_MIB, _MORE_MIB = 2048, 64
+
+
+class _Settings:
+    memory_mib, more_mib = 2048, 64  # a learner of 50 robots takes 16 MB for each robot
+
+
 _READY = {
     "sampler": "encoders and cameras are read, the store is open and zenoh answers",
     "learner": "the checkpoint is read and zenoh answers",
@@ -167,7 +171,7 @@ def template(process: str, installed: Installed) -> str:
         ready=_READY[process],
         command=_command(installed.command),
         watchdog_s=_WATCHDOG_S[process],
-        memory_mib=_MEMORY_MIB,
+        memory_mib=_Settings.memory_mib,
         kept_running=_kept_running(installed),
         devices=_DEVICES[process],
         sandbox=_SANDBOX,
@@ -197,7 +201,7 @@ def of_host(configs: Sequence[Config], user: str, installed: Installed) -> str:
         f"Description=bodyschema: the learner of {len(configs)} robots (%i)",
         "[Service]",
         f"User={user}",
-        f"MemoryMax={_MEMORY_MIB + _MORE_MIB * len(configs)}M",
+        f"MemoryMax={_Settings.memory_mib + _Settings.more_mib * len(configs)}M",
         "ExecStart=",
         f"ExecStart={_command([*installed.command, 'run', 'learner', *named])}",
         "StateDirectory=",
@@ -285,7 +289,7 @@ def _kept_running(installed: Installed) -> str:
     steps = ["RestartSec=5"]
     if installed.systemd >= WITH_RESTART_STEPS:
         steps = ["RestartSec=1", "RestartSteps=6", "RestartMaxDelaySec=60"]
-    times = [f"TimeoutStartSec={START_LIMIT_S}", "TimeoutStopSec=30"]
+    times = [f"TimeoutStartSec={NotifySettings.start_limit_s}", "TimeoutStopSec=30"]
     return "\n".join(["WatchdogSignal=SIGABRT", *times, "KillMode=mixed", "Restart=on-failure", *steps])
 
 

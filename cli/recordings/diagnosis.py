@@ -43,8 +43,6 @@ from bodyschema.robot.suggest import did_you_mean
 DIAGNOSIS, REPORT, POSE_COVARIANCE = "diagnosis.json", "report.html", "pose_covariance"
 # Effects that are always looked for.
 ALWAYS = ("outliers",)
-# Minimum number of pairs per joint.
-FEWEST_PAIRS_A_JOINT = 5
 Tell = Callable[[str], None]
 
 
@@ -192,7 +190,7 @@ def run(config: Config, source: Source, asked: Asked, tell: Tell, *, force: bool
         RecordingError: the pairs cannot be of this robot as they are.
     """
     robot, recording = config.robot, source.recording
-    fewest = FEWEST_PAIRS_A_JOINT * len(robot.joints)
+    fewest = 5 * len(robot.joints)
     if len(recording) < fewest:
         raise DiagnosisError(
             f"{source.name}: {len(recording)} pairs are too few to tell causes of {len(robot.joints)} joints apart. "

@@ -30,9 +30,6 @@ from bodyschema.recordings.ros_bag import METADATA, BagTopics, is_bag, read_bag,
 from bodyschema.recordings.tracks import MarkerTrack
 from bodyschema.robot.lerobot import Unit, read_calibration, where_calibrations_are
 
-# Times of frames are multiples of their interval, and rounded in the list of episodes.
-_EARLY_S = 1e-3
-
 
 def markers_in_video(config: Config, source: Path, camera: str) -> MarkerTrack:
     """Return the marker's positions in a dataset's videos of `camera`, timed from the start of each episode.
@@ -100,10 +97,11 @@ def _fixes(config: Config, file: Path, parts: list[VideoPart]) -> list[tuple[flo
     from bodyschema.daemon.wiring.cameras import tracked_video
 
     found = list[tuple[float, int, MarkerFix]]()
+    early_s = 1e-3  # times of frames are multiples of their interval, and rounded in the list of episodes
     with tracked_video(config, file) as video:
         for seen in _seen(video):
-            part = next((part for part in reversed(parts) if part.begin_s - _EARLY_S <= seen.t), None)
-            if part is not None and seen.t < part.end_s - _EARLY_S and isinstance(seen, MarkerFix):
+            part = next((part for part in reversed(parts) if part.begin_s - early_s <= seen.t), None)
+            if part is not None and seen.t < part.end_s - early_s and isinstance(seen, MarkerFix):
                 found.append((seen.t - part.begin_s, part.episode, seen))
     return found
 

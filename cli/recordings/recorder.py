@@ -24,8 +24,6 @@ from bodyschema.robot.description import RobotDescription
 
 log = logging.getLogger(__name__)
 
-LIVE_WAIT_S = 0.5
-
 
 class History:
     """The sampler's stored pairs from a sequence number on, page by page. Publications only trigger the next look."""
@@ -62,9 +60,9 @@ class History:
             self.next_seq, self._begun = pairs[-1].seq + 1, True
         return pairs
 
-    def wait(self) -> None:
+    def wait(self, longest_s: float = 0.5) -> None:
         """Wait for a published pair, or for a moment."""
-        self._news.wait(LIVE_WAIT_S)
+        self._news.wait(longest_s)
 
 
 def copy_history(history: History, robot: RobotDescription, out: Path) -> int:

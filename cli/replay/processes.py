@@ -17,8 +17,10 @@ from bodyschema.daemon.transport.session import is_alive
 from bodyschema.interfaces.errors import BusError
 from bodyschema.interfaces.interpreter import end, module_command
 
-START_LIMIT_S = 300.0  # a full machine takes minutes to import; a process that ends is reported at once
-END_LIMIT_S = 15.0
+
+class ProcessSettings:
+    start_limit_s: float = 300.0  # a full machine takes minutes to import; a process that ends is reported at once
+    end_limit_s: float = 15.0  # after which a process is killed
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,11 +44,12 @@ class Process:
 
         Listening is not enough: it is alive when it answers.
         """
-        limit = time.monotonic() + START_LIMIT_S
+        limit = time.monotonic() + ProcessSettings.start_limit_s
         while not is_alive(endpoint, token):
             self.check()
             if time.monotonic() > limit:
-                raise BusError(f"the {self.name} does not answer after {START_LIMIT_S:.0f} s; {self.log} may say why")
+                waited = f"{ProcessSettings.start_limit_s:.0f} s"
+                raise BusError(f"the {self.name} does not answer after {waited}; {self.log} may say why")
             time.sleep(0.1)
 
 
@@ -66,7 +69,7 @@ def started(name: str, arguments: list[str], environment: Mapping[str, str], log
         try:
             yield Process(name, log, popen)
         finally:
-            end(popen, END_LIMIT_S)
+            end(popen, ProcessSettings.end_limit_s)
 
 
 def override(table: str, key: str, value: object) -> dict[str, str]:

@@ -26,7 +26,13 @@ from bodyschema.recordings.recording import ROW_INTERVAL_S, Recording
 from bodyschema.robot.description import RobotDescription
 from kbmaps import rotation_matrices, rotation_vectors
 
-MOST = 0.5
+
+class _Settings:
+    most_too_far: float = 0.5  # share of the steps: with more it is no path
+    glance_s: float = 0.25  # interval of looking at the progress
+    stall_limit_s: float = 120.0  # without progress
+    # Live pairs come at most at the frame rate, and over some time: background learning is designed for that.
+    shortest_s: float = 20.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,20 +62,13 @@ class Steps:
 
 def require_path(steps: Steps, recording: Recording) -> None:
     """Raise RecordingError if the rows are single poses far apart."""
-    if steps.too_far > MOST * steps.count:
+    if steps.too_far > _Settings.most_too_far * steps.count:
         raise RecordingError(
             f"{steps}: these are single poses, not a guided path, and the sampler's step and speed rules do not "
             "apply to them",
             file=recording.file or "recording",
             remedy="Give --any-step to relax these rules and accept every row, each as a segment of its own",
         )
-
-
-GLANCE_S = 0.25
-STALL_LIMIT_S = 120.0
-BATCH = 2000
-# Live pairs come at most at the frame rate, and over some time: background learning is designed for that.
-SHORTEST_S = 20.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +78,7 @@ class Job:
     config: Config  # the robot's configuration
     recording: Recording
     split: Split  # its held-out rows
-    # 1 as recorded, 0 as fast as the sampler takes it; None at the usual frame rate on average, but in `SHORTEST_S` at
+    # 1 as recorded, 0 as fast as the sampler takes it; None at the usual frame rate on average, but in `shortest_s` at
     # least
     speed: float | None
     sigma_m: float | None  # 1-sigma of the positions if the recording has none [m]; None as in robot.toml
@@ -91,7 +90,7 @@ class Job:
     def drivers(self) -> dict[str, float]:
         """Keys of the table [drivers] for this job."""
         times = self.learnt_rows.play_times
-        live = float(times[-1] - times[0]) / max(len(times) * ROW_INTERVAL_S, SHORTEST_S)
+        live = float(times[-1] - times[0]) / max(len(times) * ROW_INTERVAL_S, _Settings.shortest_s)
         keys = {"speed": live if self.speed is None else self.speed}
         return keys if self.sigma_m is None else keys | {"recording_sigma_m": self.sigma_m}
 
@@ -184,7 +183,7 @@ class _Live:
         self._recording = job.recording
         speed = job.drivers["speed"]
         pauses_s = np.diff(job.learnt_rows.play_times) / speed if speed else np.zeros(1)
-        self._stall_limit_s = STALL_LIMIT_S + float(pauses_s.max(initial=0.0))
+        self._stall_limit_s = _Settings.stall_limit_s + float(pauses_s.max(initial=0.0))
 
     def until_learnt(self, report: Report) -> tuple[SamplerStatus, LearnerStatus, float]:
         """Wait until the recording has ended, every pair is learnt, and the learner is at rest.
@@ -212,18 +211,18 @@ class _Live:
                 return sampler, learner, changed - begin
             if now - changed > self._stall_limit_s:
                 raise BusError(f"no progress for {self._stall_limit_s:.0f} s; --keep DIR keeps the logs that say why")
-            time.sleep(GLANCE_S)
+            time.sleep(_Settings.glance_s)
 
-    def predictions(self, q: FloatArray) -> PredictReply:
+    def predictions(self, q: FloatArray, batch: int = 2000) -> PredictReply:
         """Return the learner's predictions for q (n, d), queried in batches."""
         replies = [
             decode(
                 self._learner_bus.ask_one(
-                    self._keys.predict, encode(JointsRequest(q[begin : begin + BATCH].tolist())), timeout_s=30.0
+                    self._keys.predict, encode(JointsRequest(q[begin : begin + batch].tolist())), timeout_s=30.0
                 ),
                 PredictReply,
             )
-            for begin in range(0, len(q), BATCH)
+            for begin in range(0, len(q), batch)
         ]
         return PredictReply(
             x=[row for reply in replies for row in reply.x],

@@ -10,11 +10,12 @@ from rich.text import Text
 from bodyschema.calibration.report import CalibrationReport, Figure, Zero
 from bodyschema.cli.terminal.screen import ruled_table, such_zeros
 
-# Told noise that explains the residuals leaves less than this.
-MISFIT = 1.5
-# If held-out errors exceed those with free links by this factor, the URDF is measurably wrong. Chance on 5 blocks of a
-# good arm stays below 1.1.
-WRONG_URDF = 1.25
+
+class _Settings:
+    misfit: float = 1.5  # told noise that explains the residuals leaves less than this
+    # If held-out errors exceed those with free links by this factor, the URDF is measurably wrong. Chance on 5 blocks
+    # of a good arm stays below 1.1.
+    wrong_urdf: float = 1.25
 
 
 def view(report: CalibrationReport) -> Group:
@@ -55,7 +56,7 @@ def sentences(report: CalibrationReport) -> list[str]:
         said.insert(0, f"Learnt from row {report.first} on.")
     if report.other_tool_from is not None:
         said.insert(0, two_tools(report))
-    if report.misfit > MISFIT:
+    if report.misfit > _Settings.misfit:
         said.append(
             f"The residuals are {report.misfit:.1f} times what the noise explains: the arm is not quite a rigid chain "
             "(compliance, eccentric encoders), or the noise is larger than stated. The intervals are widened."
@@ -103,7 +104,7 @@ def _trusted(report: CalibrationReport) -> str:
     what = "Links and zeros are" if report.trusted == "urdf" else "The links are"
     said = f"{what} those of the URDF; the intervals hold if it is right."
     free, expected = report.free_expected_mm, report.expected_mm
-    if free is None or expected is None or expected < WRONG_URDF * free:
+    if free is None or expected is None or expected < _Settings.wrong_urdf * free:
         return said
     return f"{said} The recording says it is not: with nothing held, expect {free:.2g} mm on new poses."
 

@@ -10,14 +10,12 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from bodyschema.cli.terminal.screen import BAR_WIDTH
+from bodyschema.cli.terminal.screen import ScreenSettings
 from bodyschema.diagnosis.report.numbers import chance, mm, numbers_of, percent, place, share, telling
 from bodyschema.diagnosis.report.presenters.registry import named, rival_named
 from bodyschema.diagnosis.report.result import SMALL, DiagnosisFile, Indistinguishable, Verdict
 from bodyschema.diagnosis.report.text import in_order, made_to, modelled, other_shares, to_do
 
-# Number of rejected hypotheses shown.
-NEAREST = 6
 _HEADS: dict[Verdict, tuple[str, str]] = {
     "explained": ("EXPLAINED", "bold white on dark_green"),
     "nothing_found": ("NOTHING FOUND", "bold white on blue"),
@@ -127,7 +125,7 @@ def _errors(diagnosis: DiagnosisFile) -> Table:
 
 
 def _bar(part: float) -> str:
-    return "█" * max(round(BAR_WIDTH * min(part, 1.0)), 1) + ("…" if part > 1.001 else "")
+    return "█" * max(round(ScreenSettings.bar_width * min(part, 1.0)), 1) + ("…" if part > 1.001 else "")
 
 
 def _causes(diagnosis: DiagnosisFile, timed: bool) -> Table:
@@ -150,12 +148,12 @@ def _causes(diagnosis: DiagnosisFile, timed: bool) -> Table:
     return table
 
 
-def _rejected(diagnosis: DiagnosisFile) -> Table:
+def _rejected(diagnosis: DiagnosisFile, nearest: int = 6) -> Table:
     table = _table(f"Not there (nearest of {len(diagnosis.rejected)})")
     table.add_column("effect", overflow="fold")
     table.add_column("would gain", justify="right", no_wrap=True)
     table.add_column("p-value", justify="right", no_wrap=True)
-    shown = diagnosis.rejected[:NEAREST]
+    shown = diagnosis.rejected[:nearest]
     if any(row.why for row in shown):
         table.add_column("and yet", overflow="fold")
     for row in shown:

@@ -13,8 +13,6 @@ from bodyschema.learning.status import ChainCalibration, JointZero, LearntFigure
 
 from .screen import mm, such_zeros
 
-_DEG = math.degrees(1.0)
-
 
 def outlook_lines(outlook: Outlook | None) -> list[str]:
     """Return at most two lines on whether there is enough data."""
@@ -51,7 +49,7 @@ def calibration_table(calibration: ChainCalibration, slides: Collection[str] = (
     for name in ("x, roll", "y, pitch", "z, yaw"):
         table.add_column(name, justify="right", no_wrap=True)
     table.add_row(Text(f"camera on {calibration.camera_link} [mm]"), *_moves(calibration.camera_xyz, 1e3))
-    table.add_row(Text("turned by [°]"), *_moves(calibration.camera_rpy, _DEG))
+    table.add_row(Text("turned by [°]"), *_moves(calibration.camera_rpy, math.degrees(1.0)))
     table.add_row(Text(f"marker on {calibration.marker_link} [mm]"), *_moves(calibration.marker_xyz, 1e3))
     facts = Table.grid(padding=(0, 2))
     facts.add_column(no_wrap=True)
@@ -74,7 +72,7 @@ def calibration_table(calibration: ChainCalibration, slides: Collection[str] = (
 def _workmanship(calibration: ChainCalibration) -> str:
     if calibration.axes_rad is None or calibration.points_m is None:
         return "not determined by these pairs"
-    return f"about {_DEG * calibration.axes_rad:.2g}° and {1e3 * calibration.points_m:.2g} mm"
+    return f"about {math.degrees(calibration.axes_rad):.2g}° and {1e3 * calibration.points_m:.2g} mm"
 
 
 def _other_is_better(outlook: Outlook) -> bool:
@@ -95,7 +93,7 @@ def _moves(figures: list[LearntFigure], unit: float) -> list[str]:
 
 
 def _zero(zero: JointZero, *, slides: bool) -> str:
-    unit, name = (1e3, " mm") if slides else (_DEG, "°")
+    unit, name = (1e3, " mm") if slides else (math.degrees(1.0), "°")
     return _rounded(unit * zero.value, unit * zero.half_width) + name
 
 

@@ -15,7 +15,10 @@ from rich.text import Text
 
 from bodyschema.daemon.transport.status import JointRange, SamplerStatus
 
-BAR_WIDTH = 24
+
+class ScreenSettings:
+    bar_width: int = 24  # characters
+    tell_every_s: float = 5.0  # interval between two lines of progress
 
 
 def mm(metres: float | None, unit: str = " mm") -> str:
@@ -104,17 +107,15 @@ def coverage_table(status: SamplerStatus, slides: Collection[str] = ()) -> Table
 def bar(joint: JointRange) -> Text:
     """Return a bar of the part of its range that a joint has covered."""
     span = (joint.upper_limit - joint.lower_limit) or 1.0
-    first = round(BAR_WIDTH * (joint.low - joint.lower_limit) / span)
-    last = round(BAR_WIDTH * (joint.high - joint.lower_limit) / span)
-    first = min(max(first, 0), BAR_WIDTH - 1)
-    last = min(max(last, first + 1), BAR_WIDTH)
-    return Text("·" * first + "█" * (last - first) + "·" * (BAR_WIDTH - last), style="cyan")
+    first = round(ScreenSettings.bar_width * (joint.low - joint.lower_limit) / span)
+    last = round(ScreenSettings.bar_width * (joint.high - joint.lower_limit) / span)
+    first = min(max(first, 0), ScreenSettings.bar_width - 1)
+    last = min(max(last, first + 1), ScreenSettings.bar_width)
+    return Text("·" * first + "█" * (last - first) + "·" * (ScreenSettings.bar_width - last), style="cyan")
 
 
 Say = Callable[[str], None]
 T = TypeVar("T")
-
-TELL_EVERY_S = 5.0
 
 
 def quiet(_said: str) -> None:
@@ -126,7 +127,7 @@ def counted(say: Say, what: str, items: Sequence[T]) -> Iterator[T]:
     say(what)
     told = time.monotonic()
     for done, item in enumerate(items):
-        if time.monotonic() - told >= TELL_EVERY_S:
+        if time.monotonic() - told >= ScreenSettings.tell_every_s:
             told = time.monotonic()
             say(f"{what}: {done:,} of {len(items):,}")
         yield item

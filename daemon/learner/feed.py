@@ -20,9 +20,12 @@ from bodyschema.learning.online_learner import OnlineLearner
 
 log = logging.getLogger(__name__)
 
-WAITING = 1024
-# Health reports a learner that is this many pairs behind: more than arrive in two or three seconds.
-BEHIND = 100
+
+class FeedSettings:
+    most_waiting: int = 1024  # pairs that the learner has not taken
+    # Health reports a learner that is this many pairs behind: more than arrive in two or three seconds.
+    behind: int = 100
+
 
 History = Callable[[int], Page]
 
@@ -97,7 +100,7 @@ class PairFeed:
     def offer(self, payload: bytes) -> None:
         """Accept a published pair."""
         self._published = payload, self._clock.now()
-        if self._waiting.qsize() < WAITING:
+        if self._waiting.qsize() < FeedSettings.most_waiting:
             self._waiting.put(payload)
         else:
             self._missed = True

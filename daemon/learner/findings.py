@@ -35,13 +35,15 @@ from kbmaps import ChainBelief, KBMapsError
 
 log = logging.getLogger(__name__)
 
-# Findings take at most 1/SHARE of a processor, which the robots share, and recur no more often.
-SHARE = 10.0
-EVERY_S = 1.0
+
+class _Settings:
+    share: float = 10.0  # findings take at most 1/share of a processor, which the robots share, and recur no more often
+    every_s: float = 1.0  # shortest interval between two findings of a robot
+    least_probability: float = 0.01  # kinds less probable than this are not reported
 
 
 class FindingTurns:
-    """Limits all users of the background thread together to `SHARE` of a processor. For that thread alone.
+    """Limits all users of the background thread together to 1/`share` of a processor. For that thread alone.
 
     Attributes:
         due_at: time of the next permitted finding.
@@ -54,7 +56,7 @@ class FindingTurns:
 
     def took(self, begin: float, seconds: float) -> None:
         """Note that one finding took `seconds` from `begin` on."""
-        self.due_at = begin + SHARE * seconds
+        self.due_at = begin + _Settings.share * seconds
 
 
 class Findings:
@@ -76,7 +78,7 @@ class Findings:
     ) -> None:
         self._learning, self._robot, self._clock = learning, robot, clock
         self._turns = turns or FindingTurns()
-        self._parts = SHARE * robots
+        self._parts = _Settings.share * robots
         self._found_of: tuple[ChainBelief | None, str] = None, ""
         self._due_at = clock.now()
         self._found: tuple[ChainCalibration | None, Outlook | None] = None, None
@@ -122,7 +124,7 @@ class Findings:
             self._found = None, None
         seconds = self._turns.spent() - spent
         self._turns.took(begin, seconds)
-        self._due_at = begin + max(self._parts * seconds, EVERY_S)
+        self._due_at = begin + max(self._parts * seconds, _Settings.every_s)
 
     def _check(self) -> None:
         """Check the pairs with the present tool once there are enough, and again whenever their number has doubled."""
@@ -192,10 +194,6 @@ def figures(robot: RobotDescription, known: LearnerEvidence) -> tuple[ChainFigur
     return ChainFigures(robot, tuple(beliefs[k][0] for k in kept), shares, prior), made[kept[0]] if told else None
 
 
-# Kinds less probable than this are not reported.
-_TOLD = 0.01
-
-
 class Changes:
     """Logs the learner's changes, in the robot's names. Not thread-safe.
 
@@ -229,7 +227,9 @@ class Changes:
             found=change.found,
             kind=self._name(change),
             probabilities={
-                self._of(kind): round(kind.probability, 3) for kind in change.kinds if kind.probability > _TOLD
+                self._of(kind): round(kind.probability, 3)
+                for kind in change.kinds
+                if kind.probability > _Settings.least_probability
             },
             alike=None if change.named is None else change.alike(change.named),
             moved_m=change.moved_m,

@@ -35,10 +35,15 @@ from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.waits import RETRY_S, STATUS_EVERY_S
 from bodyschema.recordings.store.file import lock
 
-IDLE_S = 0.02
-SOLVE_WHEN_IDLE_S = 0.5
-# A thread that waits for a lock gets it between two pieces of work.
-BREATH_S = 1e-4
+
+class _Settings:
+    idle_s: float = 0.02  # how often a thread without work looks for some
+    solve_when_idle_s: float = 0.5  # after so long without work the solver starts on all pairs
+    breath_s: float = 1e-4  # a thread that waits for a lock gets it between two pieces of work
+    tick_s: float = 0.05  # period of the main loop
+    # Fraction of one processor; the rest is left to new pairs and queries, which share the interpreter.
+    shared_work: float = 0.3
+    switch_interval_s: float = 2e-4  # Python's thread switch interval; its default of 5 ms would delay every query
 
 
 class Background:
@@ -77,10 +82,10 @@ class Background:
                 self._stop.wait(RETRY_S)
                 continue
             if worked:
-                self._stop.wait(max(self._rest * (time.thread_time() - begin), BREATH_S))
-            elif not self._stop.wait(IDLE_S):
+                self._stop.wait(max(self._rest * (time.thread_time() - begin), _Settings.breath_s))
+            elif not self._stop.wait(_Settings.idle_s):
                 for worker, since in zip(self._workers, self._idle_since, strict=True):
-                    if self._clock.now() - since > SOLVE_WHEN_IDLE_S:
+                    if self._clock.now() - since > _Settings.solve_when_idle_s:
                         worker.solve_soon()
 
     def _round(self) -> bool:
@@ -93,12 +98,6 @@ class Background:
 
 
 log = logging.getLogger(__name__)
-
-TICK_S = 0.05
-# Fraction of one processor; the rest is left to new pairs and queries, which share the interpreter.
-SHARED_WORK = 0.3
-# Python's thread switch interval; its default of 5 ms would delay every query.
-SWITCH_INTERVAL_S = 2e-4
 
 
 def run_learners(configs: Sequence[Config], clock: Clock, wishes: SignalFlags, notifier: Notifier) -> None:
@@ -113,7 +112,7 @@ def run_learners(configs: Sequence[Config], clock: Clock, wishes: SignalFlags, n
         StoreError: another learner has the same state.
         CheckpointError: an unusable checkpoint cannot be moved aside.
     """
-    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    sys.setswitchinterval(_Settings.switch_interval_s)
     loops = LOOPS if len(configs) == 1 else (*(_loop(config) for config in configs), *LOOPS[1:])
     service = Service(notifier, loops, clock)
     with ExitStack() as stack:
@@ -204,7 +203,7 @@ def _learners(
 def _working(learners: Sequence[Learner], service: Service, clock: Clock) -> Iterator[list[Exception]]:
     """Run the background thread; an exception that ended it early is in the list."""
     stop, failed = threading.Event(), list[Exception]()
-    share = 1.0 if len(learners) == 1 else SHARED_WORK
+    share = 1.0 if len(learners) == 1 else _Settings.shared_work
     background = Background(learners, service, clock, stop, share=share)
 
     def guarded() -> None:
@@ -249,4 +248,4 @@ def attend(
             learner.tick()
         if failed:
             raise failed[0]
-        time.sleep(TICK_S)
+        time.sleep(_Settings.tick_s)

@@ -17,7 +17,7 @@ from pathlib import Path
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.learner.answers import Answers, ExpectedMarker
 from bodyschema.daemon.learner.checkpoint import CheckpointError, go_on, write_checkpoint
-from bodyschema.daemon.learner.feed import BEHIND, PairFeed
+from bodyschema.daemon.learner.feed import FeedSettings, PairFeed
 from bodyschema.daemon.learner.findings import Changes, Findings, FindingTurns
 from bodyschema.daemon.sampler.history import Page, read_page
 from bodyschema.daemon.service.reload import reload
@@ -37,11 +37,15 @@ from bodyschema.learning.solvers.solver import LARGEST_NET, Solver
 
 log = logging.getLogger(__name__)
 
-HISTORY_LIMIT_S = 5.0
-# How long pairs may wait to be evaluated as one batch, per robot of a process, and at most [s].
-TOGETHER_S, LONGEST_TOGETHER_S = 0.08, 1.0
-# Up to this many robots per process, states and checkpoints are as frequent as for one alone.
-AS_OFTEN_AS_ONE = 10
+
+class _Settings:
+    history_limit_s: float = 5.0  # how long a page of stored pairs is waited for
+    # How long pairs may wait to be evaluated as one batch, per robot of a process, and at most [s].
+    together_s, longest_together_s = 0.08, 1.0
+    # Up to this many robots per process, states and checkpoints are as frequent as for one alone.
+    as_often_as_one: int = 10
+
+
 # Name of the loop that must keep running.
 LISTENING = "learning"
 LOOPS = (LISTENING, "background", "status")
@@ -200,7 +204,7 @@ class Learner:
                 yield problem
         yield from self._findings.doubts
         behind = self._feed.behind
-        if behind >= BEHIND and not self._feed.paused:
+        if behind >= FeedSettings.behind and not self._feed.paused:
             age_s = self._feed.age_s(self._learning.snapshot.newest_utc)
             newest = "" if age_s is None else f", and the newest that was learnt is {age_s:.0f} s old"
             yield (
@@ -231,7 +235,7 @@ class Learner:
             self._feed.wake()
 
     def _history(self, begin: int) -> Page:
-        return read_page(self._bus.ask_one(f"{self._keys.pairs}?from={begin}", timeout_s=HISTORY_LIMIT_S))
+        return read_page(self._bus.ask_one(f"{self._keys.pairs}?from={begin}", timeout_s=_Settings.history_limit_s))
 
     def _command(self, request: Request) -> bytes:
         command = decode(request.payload, CommandRequest, request.encoding).command
@@ -345,7 +349,7 @@ def show_name() -> None:
 
 def more_rarely(robots: int) -> float:
     """Return the factor by which states and checkpoints are rarer when `robots` robots share a process."""
-    return max(1.0, robots / AS_OFTEN_AS_ONE)
+    return max(1.0, robots / _Settings.as_often_as_one)
 
 
 def _common_variance(config: Config) -> tuple[Callable[[FloatArray], FloatArray] | None, str | None]:
@@ -369,7 +373,7 @@ def _common_variance(config: Config) -> tuple[Callable[[FloatArray], FloatArray]
 
 def together_s(robots: int) -> float:
     """Return how long pairs may wait to be evaluated together [s] when `robots` robots share a process."""
-    return 0.0 if robots == 1 else min(TOGETHER_S * robots, LONGEST_TOGETHER_S)
+    return 0.0 if robots == 1 else min(_Settings.together_s * robots, _Settings.longest_together_s)
 
 
 def status_line(status: LearnerStatus) -> str:

@@ -31,10 +31,15 @@ from bodyschema.learning.solvers.orientation import OrientationSolution
 from bodyschema.learning.solvers.solver import DirectSolver, Solved, Task
 from kbmaps import ChainBelief, ChainTolerances, KBMap, OrientedChain, ResidualModel
 
-LONGEST_REST_S = 5.0
-# A child that owes an answer and uses no processor for this long is stopped or locked up: the learner's `WatchdogSec`.
-HUNG_AFTER_S = 60.0
-READS_WITHIN_S = 0.1  # a child that waits for orders takes some of them within this time
+
+class _Settings:
+    longest_rest_s: float = 5.0  # after a solution, which is followed by a rest as long as it took
+    # A child that owes an answer and uses no processor for this long is stopped or locked up: the learner's
+    # `WatchdogSec`.
+    hung_after_s: float = 60.0
+    reads_within_s: float = 0.1  # a child that waits for orders takes some of them within this time
+
+
 _LENGTH = struct.Struct("<I")
 
 
@@ -167,7 +172,7 @@ class SolverProcess:
         return solved
 
     def _require_progress(self, pid: int) -> None:
-        if time.monotonic() - self._looked_at < HUNG_AFTER_S:
+        if time.monotonic() - self._looked_at < _Settings.hung_after_s:
             return
         try:
             used_s = time.clock_gettime(~pid << 3 | 2)  # as clock_getcpuclockid(3) has it
@@ -176,7 +181,7 @@ class SolverProcess:
         if used_s == self._moved_s:
             os.kill(pid, signal.SIGKILL)
             self._end()
-            raise SolverLostError(f"the solver did nothing for {HUNG_AFTER_S:.0f} s; it is started again")
+            raise SolverLostError(f"the solver did nothing for {_Settings.hung_after_s:.0f} s; it is started again")
         self._moved_s, self._looked_at = used_s, time.monotonic()
 
     def _next_solution(self) -> Solved | None:
@@ -196,7 +201,7 @@ class SolverProcess:
         if self._child is None:
             raise SolverLostError("the solver has not been started")
         self._unsent += _framed(order)
-        self._hand_over(READS_WITHIN_S)
+        self._hand_over(_Settings.reads_within_s)
 
     def _hand_over(self, within_s: float) -> None:
         """Write what the child reads within this time each; `poll` writes the rest: a stopped child blocks nothing."""
@@ -245,7 +250,7 @@ def serve(orders: IO[bytes], solutions: IO[bytes]) -> None:
             )
         else:
             time.sleep(max(rested_at - time.monotonic(), 0.0))
-            rested_at = time.monotonic() + min(_solve(solver, solutions), LONGEST_REST_S)
+            rested_at = time.monotonic() + min(_solve(solver, solutions), _Settings.longest_rest_s)
 
 
 def _solve(solver: DirectSolver, solutions: IO[bytes]) -> float:

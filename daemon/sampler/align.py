@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray, JointReading, Reason, frozen_array
 
-CAPACITY = 8192
 ROUNDING_S = 1e-9  # rounding error of time differences on day-long clocks
 
 
@@ -34,7 +33,7 @@ class JointBuffer:
         self,
         prismatic: NDArray[np.bool_],
         max_gap_s: float,
-        capacity: int = CAPACITY,  # number of readings that are kept at most
+        capacity: int = 8192,  # number of readings that are kept at most
         *,
         live: bool = False,  # `put` never waits
         kept_s: float = 0.0,  # readings up to this long before the frame are kept [s]

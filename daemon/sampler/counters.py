@@ -11,8 +11,12 @@ from bodyschema.interfaces.rejections import REMEDIES, WORDS
 from bodyschema.interfaces.waits import STATUS_EVERY_S
 from bodyschema.robot.description import RobotDescription
 
-# A complaint needs nearly all of the newest frames (10 s of a usual camera; fewer at the start) to be refused.
-NEWEST_FRAMES, FEWEST_FRAMES, NEARLY_ALL = 300, 30, 0.9
+
+class _Settings:
+    # A complaint needs nearly all of the newest frames (10 s of a usual camera; fewer at the start) to be refused.
+    newest_frames, fewest_frames, nearly_all = 300, 30, 0.9
+
+
 # An arm at rest, or paused by an operator, is in order. The other reasons have complaints of their own.
 _NO_COMPLAINT = frozenset({Reason.TOO_NEAR, Reason.PAUSED, Reason.NOT_STORED, Reason.NOT_BORNE})
 
@@ -37,7 +41,7 @@ class SamplerCounters:
         self._covered = covered
         # All reasons exist from the start, because a dict must not grow while another thread copies it.
         self._rejected = dict.fromkeys(Reason, 0)
-        self._newest: deque[Reason | None] = deque(maxlen=NEWEST_FRAMES)
+        self._newest: deque[Reason | None] = deque(maxlen=_Settings.newest_frames)
         self.readings = self.frames = self.pairs = 0
         self.readings_per_s = self.frames_per_s = self.pairs_per_s = 0.0
         self._started = self._window_start = wall.now()
@@ -70,7 +74,7 @@ class SamplerCounters:
         """Complaint with main reason and remedy if nearly no frame becomes a pair; otherwise empty."""
         newest = tuple(self._newest)
         refused = Counter(reason for reason in newest if reason is not None)
-        if len(newest) < FEWEST_FRAMES or refused.total() < NEARLY_ALL * len(newest):
+        if len(newest) < _Settings.fewest_frames or refused.total() < _Settings.nearly_all * len(newest):
             return []
         [(reason, count)] = refused.most_common(1)
         return [f"{count} of the last {len(newest)} frames were rejected: {WORDS[reason]}. {REMEDIES[reason]}"]

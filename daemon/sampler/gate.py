@@ -12,12 +12,14 @@ from bodyschema.interfaces.records import FloatArray, Pair, Reason
 
 from .align import joint_difference
 
-# This many consecutive fixes that agree with each other, but not with the previous position, are accepted.
-CONFIRMATIONS = 3
-SEGMENT_GAP_S = 1.0  # a longer pause between pairs starts a new segment
-# Joints that move farther while the time of a frame is uncertain (1-sigma, and what lies between the two eyes' images)
-# are too fast for a pair.
-MOST_TIME_ERROR_DEG = 0.2
+
+class _Settings:
+    # This many consecutive fixes that agree with each other, but not with the previous position, are accepted.
+    confirmations: int = 3
+    segment_gap_s: float = 1.0  # a longer pause between pairs starts a new segment
+    # Joints that move farther while the time of a frame is uncertain (1-sigma, and what lies between the two eyes'
+    # images) are too fast for a pair.
+    most_time_error_deg: float = 0.2
 
 
 class _Fix(NamedTuple):
@@ -34,7 +36,7 @@ class Gate:
     new segment.
 
     A marker that moved faster than `max_marker_speed_m_s` from its last accepted position is refused. It is accepted
-    again in three cases: after `CONFIRMATIONS` consecutive fixes that agree with each other (a tool change), once the
+    again in three cases: after `confirmations` consecutive fixes that agree with each other (a tool change), once the
     marker has had the time to move there, or after a pause of more than a second.
 
     With `any_step`, neither step nor speed is checked: a static recording has no path between its poses.
@@ -76,7 +78,7 @@ class Gate:
             step_deg = float(np.linalg.norm(joint_difference(q, self._q, self._prismatic) * self._degrees_per_unit))
         if step_deg < rules.min_step_deg and not rules.any_step:
             return Reason.TOO_NEAR
-        paused = self._t is None or t - self._t > SEGMENT_GAP_S
+        paused = self._t is None or t - self._t > _Settings.segment_gap_s
         if self._broken or paused or step_deg > rules.max_step_deg:
             self.segment += 1
         self._t, self._q, self._broken = t, q, False
@@ -84,15 +86,15 @@ class Gate:
 
     def is_too_fast(self, moved: FloatArray) -> bool:
         """Return True if `moved` [rad or m] (d,), the motion within the time uncertainty, is too large for a pair."""
-        return float(np.linalg.norm(moved * self._degrees_per_unit)) > MOST_TIME_ERROR_DEG
+        return float(np.linalg.norm(moved * self._degrees_per_unit)) > _Settings.most_time_error_deg
 
     def _believe(self, fix: _Fix) -> bool:
         jumped = self._reachable(self._suspect, fix)
         last = self._believed
-        if last is not None and fix.t - last.t <= SEGMENT_GAP_S and not self._reachable(last, fix):
+        if last is not None and fix.t - last.t <= _Settings.segment_gap_s and not self._reachable(last, fix):
             self._suspects = self._suspects + 1 if jumped else 1
             self._suspect = fix
-            if self._suspects < CONFIRMATIONS:
+            if self._suspects < _Settings.confirmations:
                 return False
         self._broken |= jumped
         self._believed, self._suspect, self._suspects = fix, None, 0

@@ -25,10 +25,13 @@ from .sources import Head, Sources
 
 log = logging.getLogger(__name__)
 
-PERIOD_S = 0.04
-GAIN = 0.5  # fraction of a step towards the centre; the head follows with a delay
-GOOD_M = 0.02  # a learnt model with a larger uncertainty at the hand is not used
-PREDICT_S = 0.2  # how long the head waits for the learner
+
+class _Settings:
+    period_s: float = 0.04  # of a new aim for the head
+    gain: float = 0.5  # fraction of a step towards the centre; the head follows with a delay
+    good_m: float = 0.02  # a learnt model with a larger uncertainty at the hand is not used
+    predict_s: float = 0.2  # how long the head waits for the learner
+
 
 Predict = Callable[[bytes], bytes]
 """Asks the learner: a `JointsRequest`, and its `PredictReply`; BusError or RequestError without an answer."""
@@ -58,7 +61,7 @@ class HandModel:
             self._ask_s = self._clock.now() + RETRY_S
             return None
         x = np.array(reply.x)
-        is_good = reply.in_support[:1] == [True] and max(reply.sigma[0]) <= GOOD_M
+        is_good = reply.in_support[:1] == [True] and max(reply.sigma[0]) <= _Settings.good_m
         return x if is_good and x.shape == (len(q), 3) and np.isfinite(x).all() else None
 
 
@@ -97,11 +100,11 @@ class GazeLoop:
             return
         self._told_s, q = pose
         step = self._pointing.step(q[None], self._model.positions)[0]
-        self._head.aim(self._told_s, self._pointing.clipped(q[self._places] + GAIN * step))
+        self._head.aim(self._told_s, self._pointing.clipped(q[self._places] + _Settings.gain * step))
 
     def _run(self) -> None:
         try:
-            while not self._ending.wait(PERIOD_S):
+            while not self._ending.wait(_Settings.period_s):
                 self.look()
         except Exception:
             log.exception("the gaze failed; the head stands still")
@@ -114,5 +117,5 @@ def gaze_of(robot: RobotDescription, sources: Sources, bus: ZenohSession, wall: 
     key = Keys(robot.name).predict
     if sources.calibration is not None:
         robot = replace(robot, calibration=sources.calibration)
-    model = HandModel(robot, lambda payload: bus.ask_one(key, payload, timeout_s=PREDICT_S), wall)
+    model = HandModel(robot, lambda payload: bus.ask_one(key, payload, timeout_s=_Settings.predict_s), wall)
     return GazeLoop(robot, sources.head, model)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Generic, Protocol, Self, TypeVar
 
-from bodyschema.daemon.service.logs import REPEATED_S
+from bodyschema.daemon.service.logs import RepeatSettings
 from bodyschema.interfaces.errors import SourceError, SourceLost, StoreUnwritable
 from bodyschema.interfaces.protocols import Clock, Source
 from bodyschema.interfaces.records import FloatArray, MarkerFix, Pair
@@ -149,7 +149,7 @@ class ResilientWriter:
         said: list[str] = []
         if self._refused is not None:
             said.append(f"{self._refused}. No pairs are taken until the disk does ({self._lost} frames so far)")
-        if self._slow is not None and self._wall.now() - self._slow[0] < REPEATED_S:
+        if self._slow is not None and self._wall.now() - self._slow[0] < RepeatSettings.repeated_s:
             said.append(f"the disk of {self._store.file} is slow: a pair took {self._slow[1]:.1f} s")
         return said
 

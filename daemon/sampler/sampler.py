@@ -36,8 +36,12 @@ from .sources import Sources, TellsHealth, answer_simulation, asked
 
 log = logging.getLogger(__name__)
 
-JOINTS_TIMEOUT_S = 1.0  # how long a frame waits for the encoders to reach its time
-AROUND_S = 0.1  # [s] around a frame whose time is uncertain, to estimate the joints' speed
+
+class _Settings:
+    joints_timeout_s: float = 1.0  # how long a frame waits for the encoders to reach its time
+    around_s: float = 0.1  # [s] around a frame whose time is uncertain, to estimate the joints' speed
+
+
 ZERO_FORCE = "zero_force"  # value of [robot] hold, and name of the drive
 # Loops that must keep running.
 LOOPS = ("encoders", "frames")
@@ -90,7 +94,7 @@ class Sampler:
             sources.marker, sources.seen_by, self._wall, forbidden=self._service.forbidden
         )
         rules, prismatic = config.tables.daemon, config.robot.chain.prismatic
-        self._buffer = JointBuffer(prismatic, rules.max_reading_gap_s, live=sources.live, kept_s=AROUND_S)
+        self._buffer = JointBuffer(prismatic, rules.max_reading_gap_s, live=sources.live, kept_s=_Settings.around_s)
         self._gate = Gate(rules, prismatic, store.last())
         self._storing = ResilientWriter(store, self._wall)
         self._tally = SamplerCounters(config.robot, self._wall, store.audit.joint_ranges)
@@ -258,12 +262,12 @@ class Sampler:
     def _angles(self, fix: MarkerFix) -> FloatArray | Reason:
         """Return the joint angles at the time of a fix, if they are accurate enough despite that time's uncertainty."""
         if fix.t_sigma > 0:
-            moved = self._buffer.moved(fix.t, fix.t_sigma, JOINTS_TIMEOUT_S)
+            moved = self._buffer.moved(fix.t, fix.t_sigma, _Settings.joints_timeout_s)
             if isinstance(moved, Reason):
                 return moved
             if self._gate.is_too_fast(moved):
                 return Reason.MOVING
-        q = self._buffer.at(fix.t, JOINTS_TIMEOUT_S)
+        q = self._buffer.at(fix.t, _Settings.joints_timeout_s)
         if not isinstance(q, Reason) and self._gate.is_too_fast(self._buffer.slack(fix.t)):
             return Reason.LATE_JOINTS
         return q

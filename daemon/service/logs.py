@@ -17,9 +17,14 @@ from .remedies import as_typed
 
 # sd-daemon(3): the journal reads a line's priority from its head.
 _PRIORITIES = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6))
-REPEATED_S = 60.0
-OFTEN = 20  # messages that differ only in numbers may appear this often in that time
-REMEMBERED = 256
+
+
+class RepeatSettings:
+    repeated_s: float = 60.0  # the same text is not logged again within this time
+    often: int = 20  # messages that differ only in numbers may appear this often in that time
+    remembered: int = 256  # texts
+
+
 _NUMBER = re.compile(r"\d+")
 # Clients of the page, and a disk that is full again after each pair, cause messages without end.
 _FLOODED = ("uvicorn", "bodyschema.daemon.sampler.reconnect")
@@ -50,7 +55,7 @@ class _Said:
 
 
 class UnrepeatedHandler(logging.StreamHandler[TextIO]):
-    """Suppresses repeats: the same text within `REPEATED_S`, or more than `OFTEN` texts that differ only in numbers.
+    """Suppresses repeats: the same text within `repeated_s`, or more than `often` texts that differ only in numbers.
 
     The number of suppressed messages is logged with the next record after that time, and at the end.
     """
@@ -63,7 +68,7 @@ class UnrepeatedHandler(logging.StreamHandler[TextIO]):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write the record, unless it is a repeat."""
-        self._forget_before(self._now() - REPEATED_S)
+        self._forget_before(self._now() - RepeatSettings.repeated_s)
         if self._is_new(record):
             super().emit(record)
 
@@ -78,7 +83,7 @@ class UnrepeatedHandler(logging.StreamHandler[TextIO]):
         if alike != text and (record.name, record.levelno, text) not in self._said:
             said = self._entry(record, alike)
             said.count += 1
-            if said.count > OFTEN:
+            if said.count > RepeatSettings.often:
                 return False
         said = self._entry(record, text)
         said.count += 1
@@ -86,9 +91,9 @@ class UnrepeatedHandler(logging.StreamHandler[TextIO]):
 
     def _entry(self, record: logging.LogRecord, text: str) -> _Said:
         key = (record.name, record.levelno, text)
-        if key not in self._said and len(self._said) >= REMEMBERED:
+        if key not in self._said and len(self._said) >= RepeatSettings.remembered:
             self._forget(next(iter(self._said)))
-        self._said.setdefault(key, _Said(self._now(), OFTEN if text != record.getMessage() else 1))
+        self._said.setdefault(key, _Said(self._now(), RepeatSettings.often if text != record.getMessage() else 1))
         self._said.move_to_end(key)
         return self._said[key]
 

@@ -11,10 +11,13 @@ from collections.abc import MutableMapping
 log = logging.getLogger(__name__)
 
 SOCKET, WATCHDOG, WATCHDOG_PID = "NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID"
-SEND_LIMIT_S = 0.5  # sent by the working loops: a systemd that does not listen must not block them
-LONGEST_STATUS = 400
-# systemd waits this long for a start, and again from each sign of life, which is sent this often [s].
-START_LIMIT_S, EXTEND_EVERY_S = 90, 5.0
+
+
+class NotifySettings:
+    send_limit_s: float = 0.5  # sent by the working loops: a systemd that does not listen must not block them
+    longest_status: int = 400  # characters
+    # systemd waits this long for a start, and again from each sign of life, which is sent this often [s].
+    start_limit_s, extend_every_s = 90, 5.0
 
 
 class Notifier:
@@ -51,11 +54,11 @@ class Notifier:
         self._tell("READY=1")
 
     def starting(self) -> None:
-        """Report progress of the start, as often as you like: systemd waits for `START_LIMIT_S` from now."""
+        """Report progress of the start, as often as you like: systemd waits for `start_limit_s` from now."""
         now = time.monotonic()
         if now >= self._next_extension:
-            self._next_extension = now + EXTEND_EVERY_S
-            self._tell(f"EXTEND_TIMEOUT_USEC={START_LIMIT_S * 1_000_000}")
+            self._next_extension = now + NotifySettings.extend_every_s
+            self._tell(f"EXTEND_TIMEOUT_USEC={NotifySettings.start_limit_s * 1_000_000}")
 
     def reloading(self) -> None:
         """Report that the configuration is being read again; `ready` ends this."""
@@ -67,7 +70,7 @@ class Notifier:
 
     def status(self, line: str) -> None:
         """Send one line that `systemctl status` shows."""
-        self._tell(f"STATUS={' '.join(line.split())[:LONGEST_STATUS]}")
+        self._tell(f"STATUS={' '.join(line.split())[: NotifySettings.longest_status]}")
 
     def feed_watchdog(self) -> None:
         """Report that the process works."""
@@ -78,7 +81,7 @@ class Notifier:
             return
         try:
             with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sending:
-                sending.settimeout(SEND_LIMIT_S)
+                sending.settimeout(NotifySettings.send_limit_s)
                 sending.sendto(state.encode(), self._address)
         except OSError as error:
             if not self._failed:

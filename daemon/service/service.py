@@ -15,9 +15,10 @@ from .notify import Notifier
 
 log = logging.getLogger(__name__)
 
-# systemd's timeout as a multiple of the interval between two signs of life.
-SIGNS_PER_WATCHDOG = 4
-SETTLED_S = 3.0  # a device that was plugged in gets its group a moment after its name
+
+class _Settings:
+    signs_per_watchdog: int = 4  # systemd's timeout as a multiple of the interval between two signs of life
+    settled_s: float = 3.0  # a device that was plugged in gets its group a moment after its name
 
 
 class Service:
@@ -42,7 +43,7 @@ class Service:
         self._notifier, self._clock = notifier, clock
         self._loops = set(loops)
         self._round: set[str] = set()
-        self._every_s = None if notifier.watchdog_s is None else notifier.watchdog_s / SIGNS_PER_WATCHDOG
+        self._every_s = None if notifier.watchdog_s is None else notifier.watchdog_s / _Settings.signs_per_watchdog
         self._next_feed = clock.now()
         self._lock = threading.Lock()
         self._ready = False
@@ -85,7 +86,7 @@ class Service:
         found = next((name for name in self._devices if os.path.exists(name) and not self._may_open(name)), None)
         now = self._clock.now()
         self._forbidden_since = math.inf if found is None else min(self._forbidden_since, now)
-        return found if now - self._forbidden_since >= SETTLED_S else None
+        return found if now - self._forbidden_since >= _Settings.settled_s else None
 
     def follow(self, reload: Callable[[], str]) -> None:
         """Report that robot.toml is read again by `reload`. Log its result, as the request came by a signal."""

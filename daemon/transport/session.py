@@ -26,16 +26,19 @@ from bodyschema.interfaces.errors import BodyschemaError, BusError, RequestError
 
 log = logging.getLogger(__name__)
 
-LEASE_MS = 2000
-FIRST_TRY_MS = 100  # how long opening waits for an absent peer; connecting goes on in the background
-OPEN_TIMEOUT_S = 5.0
+
+class SessionSettings:
+    lease_ms: int = 2000  # a peer that is silent for so long is gone
+    first_try_ms: int = 100  # how long opening waits for an absent peer; connecting goes on in the background
+    open_timeout_s: float = 5.0  # how long opening waits for another process
+    # Limits of messages that zenoh reassembles: the largest model with orientation for a client, pairs for a process.
+    largest_reply_bytes, largest_message_bytes = 2**26, 2**23
+    most_refusals: int = 1000  # refusals waiting to be sent; beyond them a query ends without an answer
+    accept_limit_s: float = 1.0  # how long an endpoint is waited for to accept a connection
+
+
 # Default encodings of clients that set none; treated as JSON.
 PLAIN = ("zenoh/", "text/")
-RETRY_MS = {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2}
-# Limits of messages that zenoh reassembles: the largest model with orientation for a client, pairs for a process.
-LARGEST_REPLY_BYTES, LARGEST_MESSAGE_BYTES = 2**26, 2**23
-LONGEST_ERROR = 2000  # characters
-REFUSALS = 1000  # refusals waiting to be sent; beyond them a query ends without an answer
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +73,7 @@ class ZenohSession:
         # further zenoh configuration, as returned by `Config.zenoh_settings` for a process
         settings: Mapping[str, Any] | None = None,
         # time allowed for the process that accepts the connection to speak zenoh
-        open_timeout_s: float = OPEN_TIMEOUT_S,
+        open_timeout_s: float = SessionSettings.open_timeout_s,
     ) -> None:
         """Open a session that listens on `listen` and connects to `connect` when a process listens there."""
         self._listen, self._client, self._settings = listen, client, dict(settings or {})
@@ -80,7 +83,7 @@ class ZenohSession:
         self._declared: list[object] = []  # a token without a reference is undeclared
         self._receptions: list[QueryLimiter[zenoh.Query]] = []
         self._threads: list[threading.Thread] = []
-        self._refusals: queue.Queue[tuple[zenoh.Query, str] | None] = queue.Queue(REFUSALS)
+        self._refusals: queue.Queue[tuple[zenoh.Query, str] | None] = queue.Queue(SessionSettings.most_refusals)
 
     def __enter__(self) -> Self:
         try:
@@ -208,17 +211,18 @@ class ZenohSession:
         config = zenoh.Config()
         # A peer linked to a process and to the router would receive everything twice.
         is_linked_twice = self._route is not None and len(self._route.endpoints) > 1
+        largest_bytes = SessionSettings.largest_reply_bytes if self._client else SessionSettings.largest_message_bytes
         settings: dict[str, Any] = {
             "mode": "client" if self._client else "router" if is_linked_twice else "peer",
             "scouting/multicast/enabled": False,
             "scouting/gossip/enabled": False,
             "listen/endpoints": [self._listen] if self._listen else [],
-            "scouting/delay": FIRST_TRY_MS,
+            "scouting/delay": SessionSettings.first_try_ms,
             "connect/endpoints": list(self._route.endpoints) if self._route else [],
-            "connect/retry": RETRY_MS,
+            "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
             "timestamping/enabled": True,
-            "transport/link/tx/lease": LEASE_MS,
-            "transport/link/rx/max_message_size": LARGEST_REPLY_BYTES if self._client else LARGEST_MESSAGE_BYTES,
+            "transport/link/tx/lease": SessionSettings.lease_ms,
+            "transport/link/rx/max_message_size": largest_bytes,
             "transport/unicast/open_timeout": round(1e3 * self._open_timeout_s),
         }
         if self._route is not None and self._route.identity is not None:
@@ -300,9 +304,9 @@ def _encodings(query: zenoh.Query) -> tuple[str, str]:
     return asked, MSGPACK if asked.startswith(MSGPACK) else JSON
 
 
-def _reply_error(query: zenoh.Query, text: str) -> None:
+def _reply_error(query: zenoh.Query, text: str, longest: int = 2000) -> None:
     _, encoding = _encodings(query)
-    shortened = text if len(text) <= LONGEST_ERROR else f"{text[:LONGEST_ERROR]}..."  # may quote the request
+    shortened = text if len(text) <= longest else f"{text[:longest]}..."  # may quote the request
     query.reply_err(encode(ErrorReply(shortened), encoding), encoding=zenoh.Encoding(encoding))
 
 
@@ -312,13 +316,13 @@ def _source(query: zenoh.Query) -> str:
 
 
 @contextmanager
-def client(route: str | Route, open_timeout_s: float = OPEN_TIMEOUT_S) -> Iterator[ZenohSession]:
+def client(route: str | Route, open_timeout_s: float = SessionSettings.open_timeout_s) -> Iterator[ZenohSession]:
     """Open a short-lived session to a process. BusError if it cannot be reached."""
     with ZenohSession(connect=route, client=True, open_timeout_s=open_timeout_s) as bus:
         yield bus
 
 
-def is_alive(endpoint: str | Route, token: str, *, open_timeout_s: float = OPEN_TIMEOUT_S) -> bool:
+def is_alive(endpoint: str | Route, token: str, *, open_timeout_s: float = SessionSettings.open_timeout_s) -> bool:
     """Return True if a process listens on `endpoint` and has declared the liveliness token."""
     try:
         with client(endpoint, open_timeout_s) as bus:
@@ -340,9 +344,6 @@ def _taken_apart(reply: zenoh.Reply) -> Reply:
         return Reply(payload, payload.decode(errors="replace"))
 
 
-ACCEPT_LIMIT_S = 1.0
-
-
 def unreached(route: Route) -> str:
     """Return the reason why none of a route's endpoints could be reached."""
     last = route.endpoints[-1]
@@ -362,7 +363,7 @@ def unreached(route: Route) -> str:
     )
 
 
-def accepts(endpoint: str, within_s: float = ACCEPT_LIMIT_S) -> bool:
+def accepts(endpoint: str, within_s: float = SessionSettings.accept_limit_s) -> bool:
     """Return True if a TCP endpoint accepts connections, even from a process that never answers."""
     protocol, _, address = endpoint.partition("/")
     host, _, port = address.rpartition(":")

@@ -21,7 +21,7 @@ from bodyschema.drivers.bench.device import Angle
 from bodyschema.drivers.bench.dry_run import BenchArm, DryRun
 from bodyschema.drivers.bench.faults import AskedFault
 from bodyschema.drivers.bench.servo_arm import played, swinging
-from bodyschema.drivers.bench.through_driver import LATENCY_MS, READ_S, Behind, ThroughDriver
+from bodyschema.drivers.bench.through_driver import Behind, ThroughDriver, ThroughDriverSettings
 from bodyschema.drivers.dynamixel.config import DynamixelConfig
 from bodyschema.drivers.feetech.config import FeetechConfig
 from bodyschema.drivers.ros2.config import Ros2Config
@@ -38,11 +38,15 @@ from bodyschema.robot.toml_text import toml_text
 
 from .simulation import simulation_settings
 
-PATH_S = 40.0  # of guided motion, played to and fro
+
+class _Settings:
+    path_s: float = 40.0  # of guided motion, played to and fro
+    board_rate_hz, board_baud = 500.0, 921_600  # of a board in the simulation's place, which waits for each line
+    settled_s: float = 2e-3  # how far off the time of a line may be
+
+
 MARK = "# Written by `bodyschema bench`, which removes it when it ends."
 PSEUDO_TERMINALS = "/dev/pts/"
-BOARD_RATE_HZ, BOARD_BAUD = 500.0, 921_600  # of a board in the simulation's place, which waits for each line
-SETTLED_S = 2e-3  # how far off the time of a line may be
 
 OnPorts = DynamixelConfig | FeetechConfig | SerialLinesConfig
 
@@ -82,9 +86,11 @@ def bench_motion(config: Config, tell: Callable[[float], None]) -> Motion:
     from bodyschema.sim_backend.world import guided_path
 
     sim = simulation_settings(config)
-    path = guided_path(config.robot, sim, PATH_S, config.simulation, lambda done_s: tell(done_s / PATH_S))
+    path = guided_path(
+        config.robot, sim, _Settings.path_s, config.simulation, lambda done_s: tell(done_s / _Settings.path_s)
+    )
     angles = played(path, sim.encoders.rate_hz, monotonic())
-    words = f"guided by the simulated hand, {PATH_S:.0f} s of path to and fro"
+    words = f"guided by the simulated hand, {_Settings.path_s:.0f} s of path to and fro"
     return Motion(dict(zip(joints, angles, strict=True)), words)
 
 
@@ -217,10 +223,13 @@ def through_bench(config: Config, joints: JointSource, open_driver: OpenDriver) 
 def _looking_at_servos(
     hardware: DynamixelConfig | FeetechConfig, angles: Mapping[str, Angle], open_driver: OpenDriver
 ) -> Iterator[Behind]:
-    buses = {name: msgspec.structs.replace(bus, latency_ms=LATENCY_MS) for name, bus in hardware.buses.items()}
+    buses = {
+        name: msgspec.structs.replace(bus, latency_ms=ThroughDriverSettings.latency_ms)
+        for name, bus in hardware.buses.items()
+    }
     patient = msgspec.structs.replace(hardware, buses=buses)
     with _on_a_bench(_arm_of(patient)(patient, angles)) as bench, open_driver(bench.config) as servos:
-        yield Behind(servos, lambda: servos.read(READ_S))
+        yield Behind(servos, lambda: servos.read(ThroughDriverSettings.read_s))
 
 
 @contextmanager
@@ -231,10 +240,10 @@ def _looking_at_lines(
     from bodyschema.drivers.serial_lines.bench.board import Listener
 
     clock = SystemClock()
-    quick = msgspec.structs.replace(hardware, baud=BOARD_BAUD, delay_ms=0.0, native_usb=False)
-    arm = _arm_of(quick)(quick, angles, rate_hz=BOARD_RATE_HZ)
+    quick = msgspec.structs.replace(hardware, baud=_Settings.board_baud, delay_ms=0.0, native_usb=False)
+    arm = _arm_of(quick)(quick, angles, rate_hz=_Settings.board_rate_hz)
     with _on_a_bench(arm) as bench, open_driver(bench.config) as encoders, Listener(encoders) as listener:
-        yield Behind(encoders, lambda: listener.after(clock.now() + SETTLED_S, READ_S))
+        yield Behind(encoders, lambda: listener.after(clock.now() + _Settings.settled_s, ThroughDriverSettings.read_s))
 
 
 @contextmanager
@@ -254,7 +263,7 @@ def _looking_at_messages(
 
         def look() -> JointReading | None:
             robot.publish(node, clock.now())
-            return joints.read(READ_S)
+            return joints.read(ThroughDriverSettings.read_s)
 
         yield Behind(joints, look)
 

@@ -34,8 +34,12 @@ from bodyschema.vision.rig.stereo_rig import OneEyeRig, Rig
 from bodyschema.vision.tracked_camera import TrackedCamera
 from bodyschema.vision.trackers import tracker_of
 
-LOOK_S = 2.0  # `doctor` looks at the images
-READ_S = 0.5
+
+class _Settings:
+    look_s: float = 2.0  # `doctor` looks at the images
+    read_s: float = 0.5  # how long a frame is waited for
+
+
 PAGE = "docs/cameras.md"
 
 Eyes = LiveEyes | RealsenseCamera | Film
@@ -238,10 +242,10 @@ def _open_checks(eyes: Eyes, cameras: CamerasConfig) -> Iterator[Check]:
     with ExitStack() as stack:
         stack.enter_context(eyes)
         serials = eyes.serials
-        frames, until = 0, monotonic() + LOOK_S
+        frames, until = 0, monotonic() + _Settings.look_s
         sigma_s = 0.0
         while monotonic() < until:
-            frame = eyes.read(READ_S)
+            frame = eyes.read(_Settings.read_s)
             if frame is not None:
                 frames, sigma_s = frames + 1, frame.t_sigma
             if isinstance(eyes, Film):

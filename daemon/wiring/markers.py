@@ -30,7 +30,11 @@ from bodyschema.vision.tags.dictionary import tags_of
 from bodyschema.vision.tags.finder import Seen, TagFinder
 from bodyschema.vision.tags.image import TagImage
 
-_IMAGES = 20  # images during the observation
+
+class _Settings:
+    images: int = 20  # images during the observation
+    # Largest difference of the printed size from the one given: a share, and sigmas on top of it.
+    most_grown, grown_sigmas = 0.01, 4.0
 
 
 def learnt_colour_table(images: Sequence[Path], at: tuple[float, float] | None) -> str:
@@ -66,14 +70,13 @@ def moving_colour_table(eyes: StereoEyes, clock: Clock, seconds: float, tell: Ca
         while clock.now() - began < seconds:
             frame = source.read(READ_S)
             if frame is not None and frame.t >= next_t:
-                next_t = frame.t + seconds / _IMAGES
+                next_t = frame.t + seconds / _Settings.images
                 shown.append(frame.left)
             elif source.trouble is not None:
                 tell(source.trouble)
     return colour_table(colour_of_the_moving(shown))
 
 
-_MOST_GROWN, _SIGMAS = 0.01, 4.0
 _SIDE = re.compile(r"(\d{1,9})=(\d{1,9}\.?\d*)")
 
 
@@ -140,7 +143,7 @@ def measured(images: Images, calibration: Path, wanted: Wanted, tell: Callable[[
         views.append(ClusterView(pair.name, left, right))
     _require_tags(views, twice, wanted)
     found = measure_cluster(views, rectification.calibration, wanted.side_m, wanted.other_sides_m)
-    if abs(found.grown) > _MOST_GROWN + _SIGMAS * found.grown_sigma:
+    if abs(found.grown) > _Settings.most_grown + _Settings.grown_sigmas * found.grown_sigma:
         raise CalibrationError(
             f"the black squares seem to be {1e3 * wanted.side_m * (1.0 + found.grown):.2f} mm wide, not "
             f"{1e3 * wanted.side_m:g}. Measure one and give --side-mm; or is this the calibration of other cameras?"

@@ -17,11 +17,12 @@ if TYPE_CHECKING:
     from bodyschema.sim_backend.config import CameraConfig, SimConfig, SimTag
     from bodyschema.vision.config import VisionConfig
 
-# A painted ball: saturation, value; how far the room's hue gap exceeds the ball's band, and its minimum [deg].
-_SATURATION, _VALUE, _ROOM_DEG, _GAP_DEG = 0.93, 0.86, 6.0, 36.0
-# A ball detected by brightness glows; everything else is darker than half the threshold.
-_LAMP, _DIMMED = 0.9, 0.45
-_APART_S = 60.0  # a tracker has forgotten what it saw then
+
+class _Settings:
+    # A painted ball: saturation, value; how far the room's hue gap exceeds the ball's band, and its minimum [deg].
+    saturation, value, room_deg, gap_deg = 0.93, 0.86, 6.0, 36.0
+    lamp, dimmed = 0.9, 0.45  # a ball detected by brightness glows; everything else is darker than half the threshold
+    apart_s: float = 60.0  # a tracker has forgotten what it saw then
 
 
 def simulation_settings(config: Config) -> SimConfig:
@@ -49,14 +50,15 @@ def _marker(vision: VisionConfig) -> dict[str, Any]:
         return {"tags": _tags(vision), "tag_dictionary": DICTIONARIES[vision.tag.dictionary]}
     ball = {"ball_radius_m": vision.radius_m}
     if vision.marker == "bright_ball":
-        level = max(_LAMP, (1.0 + vision.min_brightness) / 2)
-        return {**ball, "ball_rgb": (level, level, level), "light": _DIMMED * vision.min_brightness}
+        level = max(_Settings.lamp, (1.0 + vision.min_brightness) / 2)
+        return {**ball, "ball_rgb": (level, level, level), "light": _Settings.dimmed * vision.min_brightness}
     band = vision.band
     # A lit ball is darker on one side, and its highlight is paler.
-    saturation = max(_SATURATION, (1.0 + band.min_saturation) / 2)
-    value = _VALUE if band.min_value < _VALUE / 2 else 1.0
+    saturation = max(_Settings.saturation, (1.0 + band.min_saturation) / 2)
+    value = _Settings.value if band.min_value < _Settings.value / 2 else 1.0
     rgb = hsv_to_rgb(band.hue_deg / 360.0, saturation, value)
-    return {**ball, "ball_rgb": rgb, "clutter_gap_deg": max(_GAP_DEG, band.half_width_deg + _ROOM_DEG)}
+    gap_deg = max(_Settings.gap_deg, band.half_width_deg + _Settings.room_deg)
+    return {**ball, "ball_rgb": rgb, "clutter_gap_deg": gap_deg}
 
 
 def _require_found(config: Config, calibration: StereoCalibration, camera: CameraConfig) -> None:
@@ -66,7 +68,7 @@ def _require_found(config: Config, calibration: StereoCalibration, camera: Camer
 
     tracker, reasons = tracker_of(calibration, config.tables.vision), []
     for t, images in enumerate(portraits(calibration, camera)):
-        seen = tracker.track(StereoFrame(_APART_S * t, images[0], images[1] if len(images) > 1 else None))
+        seen = tracker.track(StereoFrame(_Settings.apart_s * t, images[0], images[1] if len(images) > 1 else None))
         if isinstance(seen, MarkerFix):
             return
         reasons.append(seen.reason)

@@ -12,8 +12,10 @@ from bodyschema.drivers.servos.model import Model
 
 from .device import Angle, Faults, OnlyAnswers, Reply, Sampling, byte_s, no_faults
 
-FORGET_AFTER_S = 0.02  # an incomplete instruction is discarded after this pause
-BAUD_TOLERANCE = 0.03
+
+class _Settings:
+    forget_after_s: float = 0.02  # an incomplete instruction is discarded after this pause
+    baud_tolerance: float = 0.03  # relative: a servo hears a rate that is off by less
 
 
 class EmulatedServo(ABC):
@@ -116,7 +118,7 @@ class ServoChain(OnlyAnswers, ABC, Generic[ServoT]):
         The first byte is on the wire at `t` [s], or as soon as the wire is free.
         """
         t = max(t, self._last_byte_s)
-        if t - self._last_byte_s > FORGET_AFTER_S:
+        if t - self._last_byte_s > _Settings.forget_after_s:
             self._stream.clear()
         before = len(self._stream)
         self._stream += data
@@ -153,7 +155,7 @@ class ServoChain(OnlyAnswers, ABC, Generic[ServoT]):
         """Return True if the servo's status return level allows an answer to this instruction."""
 
     def _listening(self, baud: int) -> list[ServoT]:
-        return [servo for servo in self.servos if abs((its := servo.baud) - baud) <= BAUD_TOLERANCE * its]
+        return [servo for servo in self.servos if abs((its := servo.baud) - baud) <= _Settings.baud_tolerance * its]
 
     def _together(
         self, servos: list[ServoT], t: float, act: Callable[[ServoT, float], tuple[Any, bytes]], code: int

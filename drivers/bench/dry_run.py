@@ -13,9 +13,14 @@ from .device import Device
 from .faults import NOW_AND_THEN, AskedFault
 from .pty_shell import PtyShell
 
-EVERY_S = 10.0  # period of recurring faults
-UNPLUGGED_S = 3.0
-GLITCH_S, GLITCH_TICKS = 0.1, 700
+
+class _Settings:
+    every_s: float = 10.0  # period of recurring faults
+    unplugged_s: float = 3.0  # how long a port is gone
+    glitch_s: float = 0.1  # how long an encoder is wrong
+
+
+GLITCH_TICKS = 700  # by which an encoder is wrong
 
 Event = tuple[float, str, Callable[[], None]]
 
@@ -92,13 +97,17 @@ class DryRun:
     def _happening(self, fault: AskedFault) -> Iterator[Event]:
         joint = fault.joint or ""
         if fault.kind == "unplug":
-            yield EVERY_S, "unplugged", lambda: self._each(PtyShell.unplug)
-            yield UNPLUGGED_S, "plugged in again", lambda: self._each(PtyShell.plug_in)
+            yield _Settings.every_s, "unplugged", lambda: self._each(PtyShell.unplug)
+            yield _Settings.unplugged_s, "plugged in again", lambda: self._each(PtyShell.plug_in)
         elif fault.kind == "power-cycle":
-            yield EVERY_S, "the power is lost and comes back", lambda: self.arm.power_cycle(time.monotonic())
+            yield _Settings.every_s, "the power is lost and comes back", lambda: self.arm.power_cycle(time.monotonic())
         else:
-            yield EVERY_S, f"the encoder of {joint} is wrong for a moment", lambda: self.arm.glitch(joint, True)
-            yield GLITCH_S, f"the encoder of {joint} is right again", lambda: self.arm.glitch(joint, False)
+            yield (
+                _Settings.every_s,
+                f"the encoder of {joint} is wrong for a moment",
+                lambda: self.arm.glitch(joint, True),
+            )
+            yield _Settings.glitch_s, f"the encoder of {joint} is right again", lambda: self.arm.glitch(joint, False)
 
     def _each(self, act: Callable[[PtyShell], None]) -> None:
         for shell in self.shells.values():

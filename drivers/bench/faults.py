@@ -64,7 +64,6 @@ ON_THE_WIRE: Mapping[str, Fault] = {
 }
 OF_ALL = ("power-cycle", "unplug")
 NOW_AND_THEN = ("glitch", *OF_ALL)
-SHARE = 0.02
 OPTION = "--fault"
 
 
@@ -88,7 +87,7 @@ class AskedFault:
     share: float  # the probability that an answer is affected, for faults on the wire
 
     @classmethod
-    def parsed(cls, text: str, joints: Collection[str], kinds: FaultKinds) -> AskedFault:
+    def parsed(cls, text: str, joints: Collection[str], kinds: FaultKinds, usual_share: float = 0.02) -> AskedFault:
         """Parse `KIND[@JOINT][=SHARE]`.
 
         A wire fault with a joint affects every answer of its servo; without a joint it affects 2 % of all answers.
@@ -109,7 +108,7 @@ class AskedFault:
             raise ConfigError(f"{OPTION} {text}: it strikes all servos", remedy=f"Give {kind} alone")
         if share and kind not in kinds.on_the_wire:
             raise ConfigError(f"{OPTION} {text}: it has no share", remedy=f"Give {named} alone")
-        return cls(kind, joint or None, _probability(text, share) if share else 1.0 if joint else SHARE)
+        return cls(kind, joint or None, _probability(text, share) if share else 1.0 if joint else usual_share)
 
 
 def _probability(text: str, share: str) -> float:

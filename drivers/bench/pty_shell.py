@@ -20,7 +20,6 @@ from typing import Self
 from .device import Device, Reply, byte_s
 
 _BAUDS = {getattr(termios, name): int(name[1:]) for name in dir(termios) if name[0] == "B" and name[1:].isdigit()}
-DEFAULT_BAUD = 38_400  # of a terminal whose rate was never set
 LINE_SPEED = 5  # index of the output speed in termios.tcgetattr
 # <asm-generic/termbits.h>: the only call that returns any rate; tcgetattr knows only the standard rates.
 TCGETS2, TERMIOS2 = 0x802C542A, struct.Struct("=4I20s2I")
@@ -108,7 +107,7 @@ class _Serving:
 
     @property
     def _baud(self) -> int:
-        return _line_speed(self._slave) or DEFAULT_BAUD
+        return _line_speed(self._slave) or 38_400  # a terminal's rate that was never set
 
     def _hear(self, data: bytes) -> None:
         self._bring(self._device.send(data, self._now(), self._baud), self._baud)

@@ -13,10 +13,12 @@ from bodyschema.interfaces.servos import BusStatus, ServoStatus
 
 from .device import Angle
 
-ATTEMPTS = 5
-READ_S = 0.5
-# Emulator, driver and simulation share a process and perhaps a core, so answers may be this late.
-LATENCY_MS = 40.0
+
+class ThroughDriverSettings:
+    attempts: int = 5  # of reading
+    read_s: float = 0.5  # how long a reading is waited for
+    # Emulator, driver and simulation share a process and perhaps a core, so answers may be this late.
+    latency_ms: float = 40.0
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,7 @@ class ThroughDriver:
         if self._behind is None:  # only once the first angles are known, or the arm would jump there
             angles = {name: self._angle(place) for place, name in enumerate(self.joints)}
             self._behind = self._opened.enter_context(self._open_bench(angles))
-        for _ in range(ATTEMPTS):
+        for _ in range(ThroughDriverSettings.attempts):
             told = self._behind.look()
             if told is not None:
                 return JointReading(wanted.t, frozen_array(told.q))

@@ -16,7 +16,6 @@ from .powered_config import GazeConfig, ZeroForceConfig
 
 __all__ = ["Baud", "BusConfig", "DynamixelConfig", "ServoConfig"]
 
-CYCLES_PER_HEARTBEAT = 4
 
 Baud = Literal[9600, 57600, 115200, 1_000_000, 2_000_000, 3_000_000, 4_000_000]
 
@@ -53,7 +52,7 @@ class DynamixelConfig(ServosConfig[BusConfig], frozen=True, forbid_unknown_field
                 continue
             for keys, what, remedy in table.mistakes(self.servos, self.models):
                 yield name, keys, what, remedy
-            shortest_s = CYCLES_PER_HEARTBEAT / self.rate_hz
+            shortest_s = 4 / self.rate_hz  # so many cycles within a heartbeat
             if table.heartbeat_s < shortest_s:
                 yield (
                     name,

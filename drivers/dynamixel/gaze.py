@@ -14,17 +14,16 @@ from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import FloatArray, frozen_array
 
 from .guard import Drop, Guard, GuardLimits
+from .models import MODES
 from .powered import PoweredJoints
 from .powered_config import GazeConfig
-
-POSITION_MODE = 3
-SPEED_MARGIN = 3.0  # a head that moves this many times faster than commanded is out of control
-STEP_BASE_S = 0.05  # a longer pause between two cycles moves the head no farther than this one
 
 
 class _Settings:
     stale_s = 0.5  # without a newer target for this long, the head stands still
     blocked_s, blocked_deg = 1.0, 15.0  # torque goes off when the head stays this far from its command for this long
+    speed_margin: float = 3.0  # a head that moves this many times faster than commanded is out of control
+    longest_step_s: float = 0.05  # a longer pause between two cycles moves the head no farther than this one
 
 
 class Gaze(PoweredJoints):
@@ -35,7 +34,7 @@ class Gaze(PoweredJoints):
     """
 
     name, goal = "gaze", "goal"
-    mode, mode_name = POSITION_MODE, "position control"
+    mode, mode_name = MODES["position"], "position control"
 
     def __init__(
         self, gaze: GazeConfig, joints: Sequence[str], limits: Sequence[tuple[float, float]], clock: Clock
@@ -51,7 +50,7 @@ class Gaze(PoweredJoints):
         guard = GuardLimits(
             joints=tuple(self._head),
             heartbeat_s=gaze.heartbeat_s,
-            max_speed=np.full(count, SPEED_MARGIN * speed),
+            max_speed=np.full(count, _Settings.speed_margin * speed),
             current_limit=np.full(count, math.inf),
             max_temperature_c=gaze.max_temperature_c,
         )
@@ -111,7 +110,7 @@ class Gaze(PoweredJoints):
         here = q[self._places]
         if self._command is None:
             self._command = here
-        dt = min(now - self._commanded_s, STEP_BASE_S)
+        dt = min(now - self._commanded_s, _Settings.longest_step_s)
         self._commanded_s = now
         self._command = command = self._next(now, self._command, dt)
         self._check_astray(now, np.abs(here - command))

@@ -12,12 +12,16 @@ import numpy as np
 
 from bodyschema.interfaces.records import FloatArray, frozen_array
 
-SHORTEST_BASE_S = 0.02  # shortest interval for a speed from positions: one tick is 4°/s at most
-CURRENT_SLACK, CURRENT_SLACK_A = 0.15, 0.05  # allowance for the servo's own current regulation
-REFUSALS = 3  # consecutive goals that a servo ignored
-DOUBTFUL_CYCLES = 10  # consecutive checks without a reading
-RAMP_S = 1.0  # duration of the ramp of the currents
-OVERCURRENT_S = 0.5  # time that a current exceeds its limit
+
+class GuardSettings:
+    shortest_base_s: float = 0.02  # shortest interval for a speed from positions: one tick is 4°/s at most
+    current_slack, current_slack_a = 0.15, 0.05  # allowance for the servo's own current regulation
+    refusals: int = 3  # consecutive goals that a servo ignored
+    doubtful_cycles: int = 10  # consecutive checks without a reading
+    look_every_s: float = 0.05  # period of reading one servo's torque, health, watchdog and goal
+    ramp_s: float = 1.0  # duration of the ramp of the currents
+    saturated_s: float = 1.0  # time at its current limit after which a joint is reported to sink
+    overcurrent_s: float = 0.5  # time that a current exceeds its limit
 
 
 class Drop(Exception):
@@ -111,7 +115,7 @@ class Guard:
             )
         if motion is None:
             self._doubts += 1
-            if self._doubts >= DOUBTFUL_CYCLES:
+            if self._doubts >= GuardSettings.doubtful_cycles:
                 raise Drop(
                     f"{self._doubts} readings in a row could not be believed. "
                     "Look at cable and supply: `bodyschema doctor`"
@@ -129,10 +133,10 @@ class Guard:
             raise Drop("a reading is not finite. Report this: it should have been refused before")
         self._check_speed("by its servo", np.abs(motion.velocity))
         self._track.append((motion.t, frozen_array(motion.q)))
-        while len(self._track) > 1 and motion.t - self._track[1][0] >= SHORTEST_BASE_S:
+        while len(self._track) > 1 and motion.t - self._track[1][0] >= GuardSettings.shortest_base_s:
             self._track.popleft()
         base_s = motion.t - self._track[0][0]
-        if base_s >= SHORTEST_BASE_S:
+        if base_s >= GuardSettings.shortest_base_s:
             self._check_speed("by its positions", np.abs(motion.q - self._track[0][1]) / base_s)
         self._check_currents(motion.t, np.abs(motion.current))
 
@@ -146,13 +150,13 @@ class Guard:
             )
 
     def _check_currents(self, t: float, current: FloatArray) -> None:
-        allowed = (1 + CURRENT_SLACK) * self._limits.current_limit + CURRENT_SLACK_A
+        allowed = (1 + GuardSettings.current_slack) * self._limits.current_limit + GuardSettings.current_slack_a
         for place, joint in enumerate(self._limits.joints):
             if current[place] <= allowed[place]:
                 self._over_since[place] = math.inf
                 continue
             self._over_since[place] = min(self._over_since[place], t)
-            if t - self._over_since[place] >= OVERCURRENT_S:
+            if t - self._over_since[place] >= GuardSettings.overcurrent_s:
                 raise Drop(
                     f"joint {joint!r} drew {current[place]:.2f} A for {t - self._over_since[place]:.1f} s "
                     f"({self._limits.current_limit[place]:.2f} A are allowed). Free the joint"
@@ -169,7 +173,7 @@ class Guard:
         if not state.temperature_c < self._limits.max_temperature_c:
             raise Drop(f"joint {joint!r}: its servo is at {state.temperature_c:.0f} °C. Let it cool down")
         self._refusals[joint] = 0 if state.took_goal else self._refusals.get(joint, 0) + 1
-        if self._refusals[joint] >= REFUSALS:
+        if self._refusals[joint] >= GuardSettings.refusals:
             raise Drop(f"joint {joint!r}: its servo does not take its goal. Look at the cable: `bodyschema doctor`")
 
 
@@ -198,7 +202,7 @@ class Currents:
 
     def share(self, now: float) -> float:
         """Return the share of the torque that is applied at `now` [s]."""
-        return self._share * min(max((now - self._begin_s) / RAMP_S, 0.0), 1.0)
+        return self._share * min(max((now - self._begin_s) / GuardSettings.ramp_s, 0.0), 1.0)
 
     def at(self, now: float, torques: FloatArray) -> FloatArray:
         """Return the currents [A] (n,) for the torques that hold the arm [N·m] (n,).

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import dynamixel_sdk as sdk
 
-from bodyschema.drivers.servos.packets import Garbled, Packets, Status, take_summed
+from bodyschema.drivers.servos.packets import BROADCAST, Garbled, Packets, Status, take_summed
 
 from .crc16 import crc16
 
@@ -20,7 +20,6 @@ HEADER2 = b"\xff\xff\xfd\x00"
 STATUS = 0x55
 ALERT = 0x80
 LOOKS_LIKE_HEADER, STUFFED = b"\xff\xff\xfd", b"\xff\xff\xfd\xfd"
-BROADCAST = 0xFE
 Version = Literal[1, 2]
 PING, REBOOT = 1, 8
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from bodyschema.drivers.servos.bus import Bus as ServoBus
 from bodyschema.drivers.servos.channel import Sample
-from bodyschema.drivers.servos.handshake import ATTEMPTS, switch_torque_off
+from bodyschema.drivers.servos.handshake import HandshakeSettings, switch_torque_off
 from bodyschema.drivers.servos.model import Register
 from bodyschema.drivers.servos.servo import IdentifiedServo
 from bodyschema.interfaces.errors import RequestError
@@ -23,13 +23,12 @@ from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import FloatArray, JointReading
 
 from .bus import Bus
-from .guard import Drop, Guard, Motion, ServoState
+from .guard import Drop, Guard, GuardSettings, Motion, ServoState
 from .models import HARDWARE_ERRORS
 from .powered_config import PoweredConfig
 
 log = logging.getLogger(__name__)
 
-LOOK_EVERY_S = 0.05  # period of reading one servo's torque, health, watchdog and goal
 
 State = Literal["off", "on", "dropped"]
 
@@ -266,7 +265,7 @@ class PoweredJoints(ABC):
 
     def _look_at_one(self, now: float) -> None:
         servo = self._servos[self._looked % len(self._servos)]
-        self._looked, self._next_look = self._looked + 1, now + LOOK_EVERY_S
+        self._looked, self._next_look = self._looked + 1, now + GuardSettings.look_every_s
         layout = servo.model.layout
         begin = layout["torque"].address
         span = Register(begin, layout["temperature"].end - begin)
@@ -274,7 +273,7 @@ class PoweredJoints(ABC):
         exchange = bus.ask(bus.read_request(servo.model, servo.id, span))
         if exchange.trouble is not None:
             self._missed[servo.joint] = self._missed.get(servo.joint, 0) + 1
-            if self._missed[servo.joint] >= ATTEMPTS:
+            if self._missed[servo.joint] >= HandshakeSettings.attempts:
                 raise Drop(f"joint {servo.joint!r}: its servo does not report its state: {exchange.trouble}")
             return
         self._missed[servo.joint] = 0
@@ -304,7 +303,7 @@ class PoweredJoints(ABC):
         """Write a register and read it back. Raise RequestError if the value differs."""
         register = servo.model.layout[name]
         found = None
-        for _ in range(ATTEMPTS):
+        for _ in range(HandshakeSettings.attempts):
             self._buses[servo.bus].write(servo.model, servo.id, register, register.bytes(value))
             found = self._read(servo, name)
             if found == value:
@@ -315,7 +314,7 @@ class PoweredJoints(ABC):
         """Return the value of a register. Raise RequestError without an answer."""
         bus, register = self._buses[servo.bus], servo.model.layout[name]
         exchange = None
-        for _ in range(ATTEMPTS):
+        for _ in range(HandshakeSettings.attempts):
             exchange = bus.ask(bus.read_request(servo.model, servo.id, register))
             if exchange.trouble is None:
                 return register.value(exchange.answers[0].status.data)

@@ -14,12 +14,10 @@ from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import FloatArray, frozen_array
 
 from .config import DynamixelConfig
-from .guard import RAMP_S, Currents, Drop, Guard, GuardLimits
+from .guard import Currents, Drop, Guard, GuardLimits, GuardSettings
+from .models import CURRENT_MODES
 from .powered import PoweredJoints
 from .powered_config import ZeroForceConfig
-
-CURRENT_MODE = 0
-SATURATED_S = 1.0
 
 HoldingTorques = Callable[[FloatArray], FloatArray]
 """From the angles of all joints [rad] (d,) the torques about them that hold the arm where it is [N·m] (d,)."""
@@ -29,7 +27,7 @@ class ZeroForce(PoweredJoints):
     """Joints that carry the arm by current; see `PoweredJoints`. The torque of other joints stays off."""
 
     name, goal = "zero_force", "goal_current"
-    mode, mode_name = CURRENT_MODE, "current control"
+    mode, mode_name = CURRENT_MODES["current"], "current control"
 
     def __init__(
         self,
@@ -89,13 +87,13 @@ class ZeroForce(PoweredJoints):
         currents = self._currents.at(now, torques)
         saturated = self._currents.saturated
         self._saturated_s = min(self._saturated_s, now) if saturated else math.inf
-        self._sinking = saturated if now - self._saturated_s > SATURATED_S else ()
+        self._sinking = saturated if now - self._saturated_s > GuardSettings.saturated_s else ()
         return [self._ticks(servo, current) for servo, current in zip(self._servos, currents, strict=True)]
 
     def _said_on(self) -> str:
         return (
-            f"zero_force is on: within {RAMP_S:.0f} s {', '.join(self._joints)} bear the arm. Hold it until "
-            "then, and stay ready to hold it: any doubt switches torque off"
+            f"zero_force is on: within {GuardSettings.ramp_s:.0f} s {', '.join(self._joints)} bear the arm. Hold it "
+            "until then, and stay ready to hold it: any doubt switches torque off"
         )
 
     @staticmethod

@@ -12,7 +12,7 @@ from bodyschema.drivers.servos.channel import Channel as ServoChannel
 from bodyschema.drivers.servos.channel import Sample
 from bodyschema.drivers.servos.joints import ServoJoints
 from bodyschema.drivers.servos.model import Model, Register
-from bodyschema.drivers.servos.packets import Packets, Status, summed, take_summed
+from bodyschema.drivers.servos.packets import BROADCAST, Packets, Status, summed, take_summed
 from bodyschema.drivers.servos.scan import ServoProtocol
 from bodyschema.drivers.servos.servo import IdentifiedServo
 from bodyschema.drivers.servos.settings import (
@@ -28,8 +28,6 @@ from bodyschema.drivers.servos.settings import (
 from bodyschema.drivers.servos.vendor import ServoVendor, Way, one_by_one
 
 from .models import BAUDS, BY_NUMBER, HARDWARE_ERRORS, MODES, PING, READ, STS, SYNC_READ, WRITE
-
-BROADCAST = 0xFE
 
 
 class FeetechPackets:

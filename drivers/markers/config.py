@@ -21,9 +21,6 @@ from bodyschema.robot.toml_file import ENDPOINT, NonNegative, Positive, convert,
 
 TABLE = "marker_source"
 PAGE = "docs/marker_sources.md"
-PORT = 5005
-# A sender's own stamp is taken when its computation ends, or when its frame arrives: milliseconds from the exposure.
-UNKNOWN_LATENCY_SIGMA_S = 0.005
 
 Port = Annotated[int, Meta(ge=1, le=65535)]
 Vector3 = tuple[float, float, float]
@@ -44,7 +41,8 @@ class SourceTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     xyz: Vector3 = (0.0, 0.0, 0.0)
     rpy: Vector3 = (0.0, 0.0, 0.0)
 
-    usual_sigma_s: ClassVar[float] = UNKNOWN_LATENCY_SIGMA_S
+    # A sender's own stamp is taken when its computation ends, or its frame arrives: milliseconds from the exposure.
+    usual_sigma_s: ClassVar[float] = 0.005
 
     @property
     def kind(self) -> str:
@@ -86,7 +84,7 @@ class UdpTable(SourceTable, frozen=True, forbid_unknown_fields=True, kw_only=Tru
 
     # address to listen on: 127.0.0.1 takes them from this machine only, 0.0.0.0 from the network
     host: str = "127.0.0.1"
-    port: Port = PORT  # to listen on
+    port: Port = 5005  # to listen on
     sender: str | None = None  # the only address that datagrams are taken from; without it, any
 
     @property

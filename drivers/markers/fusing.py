@@ -39,11 +39,12 @@ class _Settings:
     well_fitted: float = 3.0
     # the positions have to span so much in two directions for the transform to be known
     spread_m: float = 0.02
+    longest_wait_s: float = 0.1  # for the other sources' positions of the same time
+    # between two positions that are interpolated: three frames at 30 Hz, of which one is missing
+    longest_gap_s: float = 0.12
+    fixes_kept: int = 64  # of each source
 
 
-LONGEST_WAIT_S = 0.1  # for the other sources' positions of the same time
-LONGEST_GAP_S = 0.12  # between two positions that are interpolated: three frames at 30 Hz, of which one is missing
-KEPT = 64
 CHI2_999, CHI2_MEDIAN = 16.27, 2.37  # of 3 degrees of freedom
 
 
@@ -82,8 +83,8 @@ class Member:
         self.forget()
 
     def forget(self) -> None:
-        self.fixes: deque[MarkerFix] = deque(maxlen=KEPT)
-        self.waiting: deque[tuple[MarkerFix, float]] = deque(maxlen=KEPT)
+        self.fixes: deque[MarkerFix] = deque(maxlen=_Settings.fixes_kept)
+        self.waiting: deque[tuple[MarkerFix, float]] = deque(maxlen=_Settings.fixes_kept)
         self.newest_t = self.fixed_at = -math.inf
 
     def take(self, seen: MarkerFix | MarkerMiss, now: float) -> None:
@@ -102,7 +103,7 @@ class Member:
             return None
         first, second = self.fixes[after - 1], self.fixes[after]
         gap_s = second.t - first.t
-        if gap_s > LONGEST_GAP_S:
+        if gap_s > _Settings.longest_gap_s:
             return None
         share = (t - first.t) / gap_s
         velocity = (second.x - first.x) / gap_s
@@ -223,7 +224,7 @@ class FusedMarkers:
         if not leader.waiting:
             return None
         fix, came = leader.waiting[0]
-        if now - came < LONGEST_WAIT_S and any(other.newest_t < fix.t for other in others):
+        if now - came < _Settings.longest_wait_s and any(other.newest_t < fix.t for other in others):
             return None
         leader.waiting.popleft()
         return self._fused(leader, fix, others)

@@ -9,7 +9,7 @@ from bodyschema.drivers.markers.config import Ros2Table, ZenohTable
 from bodyschema.drivers.markers.report import Fault, Packet, Report, Unusable
 from bodyschema.drivers.ros2 import rmw
 from bodyschema.drivers.ros2.cdr import CdrReader
-from bodyschema.drivers.ros2.link import RETRY_S, ZenohLink, open_session
+from bodyschema.drivers.ros2.link import LinkSettings, ZenohLink, open_session
 from bodyschema.drivers.ros2.messages import Header, read_header
 from bodyschema.interfaces.errors import SourceLost
 from bodyschema.interfaces.protocols import Clock
@@ -95,7 +95,7 @@ class KeyReceiver:
             raise SourceLost(
                 f"no zenoh router answers on {self._table.router}. Start zenohd there, or correct router in "
                 "[marker_source]",
-                retry_s=RETRY_S,
+                retry_s=LinkSettings.retry_s,
             ) from error
         with ExitStack() as stack:
             stack.callback(session.close)
@@ -113,7 +113,7 @@ class KeyReceiver:
         sample = self._link.receive(until)
         if sample is None:
             if not self._link.is_connected:
-                raise SourceLost(f"the zenoh router {self._table.router} is gone", retry_s=RETRY_S)
+                raise SourceLost(f"the zenoh router {self._table.router} is gone", retry_s=LinkSettings.retry_s)
             return None
         gid, _ = rmw.sender_of(sample.attached)
         return Packet(sample.payload, gid.hex(), sample.arrived, sample.attached)

@@ -12,7 +12,7 @@ from typing import Protocol, Self
 import numpy as np
 
 from bodyschema.drivers.checks import Check, warned
-from bodyschema.drivers.markers.config import UNKNOWN_LATENCY_SIGMA_S, SourceTable
+from bodyschema.drivers.markers.config import SourceTable
 from bodyschema.drivers.markers.report import ADVICE, Fault, Packet, Report, Unusable
 from bodyschema.drivers.ros2.cdr import Malformed
 from bodyschema.drivers.ros2.senders import Refusal, Sender
@@ -39,6 +39,9 @@ class _Settings:
     # consecutive lower numbers: the sender was started again
     restart: int = 3
     few_per_s: float = 15.0
+    farthest_m: float = 50.0  # no arm is measured over a larger distance: such a number is in millimetres
+    most_senders: int = 64  # whose sequence numbers are kept
+    read_s: float = 2.5  # until the clock of the stamps is known to milliseconds
 
 
 USED = "used"
@@ -95,8 +98,6 @@ class Ledger:
 
 log = logging.getLogger(__name__)
 
-FARTHEST_M = 50.0  # no arm is measured over a larger distance: such a number is in millimetres
-SENDERS = 64
 
 Decode = Callable[[bytes, bytes], Iterable[Report]]
 
@@ -272,7 +273,7 @@ class MarkerStream:
     def _time(self, report: Report, arrived: float) -> tuple[float, float]:
         """Return the time of the measurement and its 1-sigma [s]."""
         if report.stamp_ns is None:
-            return arrived - self._table.latency_s, math.hypot(UNKNOWN_LATENCY_SIGMA_S, self._table.sigma_s)
+            return arrived - self._table.latency_s, math.hypot(SourceTable.usual_sigma_s, self._table.sigma_s)
         times_set = self._clock_of.times_set
         t = self._clock_of.time_of(report.stamp_ns, (0,), arrived)
         if self._clock_of.times_set != times_set:
@@ -287,7 +288,7 @@ class MarkerStream:
             return None
         numbers = self._numbers.get(packet.sender)
         if numbers is None:
-            if len(self._numbers) >= SENDERS:
+            if len(self._numbers) >= _Settings.most_senders:
                 self._numbers.clear()
             numbers = self._numbers[packet.sender] = _Numbers()
         lost, order = numbers.count(seq, self._unread)
@@ -298,7 +299,7 @@ class MarkerStream:
 
     def _position(self, sent: tuple[float, ...]) -> FloatArray:
         x = self._table.metres * np.array(sent)
-        if float(np.linalg.norm(x)) > FARTHEST_M:
+        if float(np.linalg.norm(x)) > _Settings.farthest_m:
             raise Unusable(Fault.UNIT, f"{float(np.linalg.norm(x)):.4g} m")
         if self._table.unit == "mm" and float(np.linalg.norm(x)) < _Settings.nearest_m:
             raise Unusable(Fault.SMALL_UNIT, f"{1e3 * float(np.linalg.norm(x)):.2g} mm")
@@ -377,10 +378,7 @@ class _Numbers:
         return 0, Fault.DUPLICATE if seq == before else Fault.OUT_OF_ORDER
 
 
-READ_S = 2.5  # until the clock of the stamps is known to milliseconds
-
-
-def stream_checks(stream: MarkerStream, clock: Clock, read_s: float = READ_S) -> Iterator[Check]:
+def stream_checks(stream: MarkerStream, clock: Clock, read_s: float = _Settings.read_s) -> Iterator[Check]:
     """Yield checks of the positions that come, of their rate and time, and of the messages that cannot be used.
 
     Args:

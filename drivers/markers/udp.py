@@ -16,10 +16,13 @@ from .report import Packet
 
 SO_TIMESTAMPNS = 35  # Linux: a struct timespec of CLOCK_REALTIME beside each datagram
 STAMP = struct.Struct("@ll")
-LARGEST_BYTES = 65535
-BUFFER_BYTES = 1 << 20  # seconds of a mocap stream, while the reader waits for the encoders
-RETRY_S = 2.0
-LONGEST_WAIT_S = 60.0  # in the kernel's buffer; more shows that the wall clock was set meanwhile
+
+
+class _Settings:
+    largest_bytes: int = 65535  # of a UDP datagram
+    buffer_bytes: int = 1 << 20  # seconds of a mocap stream, while the reader waits for the encoders
+    retry_s: float = 2.0
+    longest_wait_s: float = 60.0  # in the kernel's buffer; more shows that the wall clock was set meanwhile
 
 
 def listening(host: str, port: int, *, shared: bool = False) -> socket.socket:
@@ -36,7 +39,7 @@ def listening(host: str, port: int, *, shared: bool = False) -> socket.socket:
         if shared:
             found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         found.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
-        found.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
+        found.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _Settings.buffer_bytes)
         found.bind((host, port))
         found.setblocking(False)
     except BaseException:
@@ -48,7 +51,7 @@ def listening(host: str, port: int, *, shared: bool = False) -> socket.socket:
 def received(found: socket.socket, clock: Clock) -> tuple[bytes, tuple[str, int], float] | None:
     """Return the next datagram, its sender, and its time of arrival [s]; None if none is there."""
     try:
-        payload, ancillary, _, sender = found.recvmsg(LARGEST_BYTES, socket.CMSG_SPACE(STAMP.size))
+        payload, ancillary, _, sender = found.recvmsg(_Settings.largest_bytes, socket.CMSG_SPACE(STAMP.size))
     except (BlockingIOError, ConnectionRefusedError):
         return None
     waited_s = 0.0
@@ -56,7 +59,7 @@ def received(found: socket.socket, clock: Clock) -> tuple[bytes, tuple[str, int]
         if level == socket.SOL_SOCKET and kind == SO_TIMESTAMPNS and len(data) == STAMP.size:
             seconds, nanoseconds = STAMP.unpack(data)
             waited_s = 1e-9 * (time.time_ns() - seconds * 1_000_000_000 - nanoseconds)
-    return payload, sender, clock.now() - (waited_s if 0.0 < waited_s < LONGEST_WAIT_S else 0.0)
+    return payload, sender, clock.now() - (waited_s if 0.0 < waited_s < _Settings.longest_wait_s else 0.0)
 
 
 def await_any(sockets: Sequence[socket.socket], until: float, clock: Clock) -> bool:
@@ -80,7 +83,7 @@ class UdpReceiver:
             raise SourceLost(
                 f"UDP port {self._table.port} of {self._table.host} cannot be listened on: {error.strerror}. "
                 f"`ss -ulnp 'sport = :{self._table.port}'` shows who does; or choose another port in [marker_source]",
-                retry_s=RETRY_S,
+                retry_s=_Settings.retry_s,
             ) from error
 
     def close(self) -> None:

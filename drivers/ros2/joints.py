@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import Self
 
-from bodyschema.drivers.checks import MANY_TROUBLES, READ_S, Check, warned
+from bodyschema.drivers.checks import Check, CheckSettings, warned
 from bodyschema.drivers.ros2 import rmw
 from bodyschema.drivers.ros2.cdr import Malformed
 from bodyschema.drivers.ros2.config import Ros2Config
-from bodyschema.drivers.ros2.link import RETRY_S, Link, OpenLink, Sample, open_zenoh
+from bodyschema.drivers.ros2.link import Link, LinkSettings, OpenLink, Sample, open_zenoh
 from bodyschema.drivers.ros2.messages import JOINT_STATE, JointState, decode_joint_state
 from bodyschema.drivers.ros2.senders import Gates, Refusal, Sender
 from bodyschema.drivers.turns import FASTEST_M_S, FASTEST_RAD_S
@@ -24,7 +24,15 @@ from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import JointReading, frozen_array
 from bodyschema.interfaces.waits import POLL_S, RIVAL_AFTER_S, SILENT_AFTER_S
 
-LONGEST = 4096
+
+class _Settings:
+    points_kept: int = 4096  # of each joint
+    most_shown: int = 12  # names in a message
+    slack_rad, slack_m = 0.02, 2e-3  # on top of what the fastest joint moves between two messages
+    most_gap_s: float = 0.1  # no position is interpolated between two messages of a joint that are farther apart
+    most_senders: int = 64  # that are kept apart
+    most_names: int = 256  # upper bound of the names kept for messages
+    few_per_s: float = 20.0  # readings: fewer get a warning
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +63,7 @@ class Merging:
 
     def __init__(self, joints: int) -> None:
         """Start with empty buffers for `joints` joints."""
-        self._tracks: list[deque[_Point]] = [deque(maxlen=LONGEST) for _ in range(joints)]
+        self._tracks: list[deque[_Point]] = [deque(maxlen=_Settings.points_kept) for _ in range(joints)]
         self._told = float("-inf")
 
     def missing(self) -> list[int]:
@@ -99,8 +107,6 @@ def _at(t: float, track: deque[_Point]) -> tuple[float, float] | None:
     return before.q + (after.q - before.q) * (t - before.t) / gap, gap
 
 
-SHOWN = 12
-
 ADVICE = {
     Refusal.MALFORMED: "it is no intact sensor_msgs/JointState; see what publishes it: ros2 topic info -v",
     Refusal.NO_POSITIONS: "it has names and no positions; take a topic that has them",
@@ -135,7 +141,7 @@ def silence(
         why, count = refused.most_common(1)[0]
         return f"nothing of {config.topic} can be used; {count} times: {ADVICE[why]}"
     if names and missing:
-        there = ", ".join(sorted(names)[:SHOWN])
+        there = ", ".join(sorted(names)[: _Settings.most_shown])
         return (
             f"{config.topic} does not name {', '.join(missing)}; it names {there}. "
             "Say in [drivers.ros2] names what ROS calls each joint"
@@ -161,7 +167,7 @@ def _unheard(config: Ros2Config, topics: Sequence[rmw.Topic]) -> str:
     elsewhere = sorted({topic.domain for topic in topics if topic.name == wanted})
     if elsewhere:
         return f"{wanted} is published in the domain {elsewhere[0]}, not {config.domain}; fix domain"
-    others = sorted({topic.name for topic in here if topic.type == JOINT_STATE.name})[:SHOWN]
+    others = sorted({topic.name for topic in here if topic.type == JOINT_STATE.name})[: _Settings.most_shown]
     if others:
         return f"nothing publishes {wanted}; there are joint states on {', '.join(others)}. Fix topic"
     return (
@@ -172,10 +178,6 @@ def _unheard(config: Ros2Config, topics: Sequence[rmw.Topic]) -> str:
 
 log = logging.getLogger(__name__)
 
-SLACK_RAD, SLACK_M = 0.02, 2e-3
-MOST_GAP_S = 0.1  # no position is interpolated between two messages of a joint that are farther apart
-SENDERS = 64
-NAMES = 256  # upper bound of the names kept for messages
 
 Who = bytes | tuple[str, ...]
 
@@ -207,7 +209,7 @@ class Ros2Joints:
         self._wanted = config.ros_names(joints)
         slides = [False] * len(joints) if prismatic is None else list(prismatic)
         self._fastest = [FASTEST_M_S if sliding else FASTEST_RAD_S for sliding in slides]
-        self._slack = [SLACK_M if sliding else SLACK_RAD for sliding in slides]
+        self._slack = [_Settings.slack_m if sliding else _Settings.slack_rad for sliding in slides]
         self._link: Link | None = None
         self._last_t = -math.inf
         self._forget()
@@ -247,7 +249,7 @@ class Ros2Joints:
                 self._read_at = self._clock.now()
                 return reading
             if sample is None and not self._link.is_connected:
-                raise SourceLost(f"the zenoh router {self._config.router} is gone", retry_s=RETRY_S)
+                raise SourceLost(f"the zenoh router {self._config.router} is gone", retry_s=LinkSettings.retry_s)
             self._complain(self._link)
             if sample is None or self._clock.now() >= deadline:
                 return None
@@ -274,12 +276,12 @@ class Ros2Joints:
             return None
         gid, sequence = rmw.sender_of(sample.attached)
         self._count_lost(gid, sequence)
-        if len(self._names) < NAMES:
+        if len(self._names) < _Settings.most_names:
             self._names.update(message.names)
         merged = self._believed(gid or message.names, message, sample.arrived)
         if merged is None:
             return None
-        if merged.gap_s > MOST_GAP_S:
+        if merged.gap_s > _Settings.most_gap_s:
             self._refuse(Refusal.GAP, f"{merged.gap_s:.3f} s")
             return None
         if merged.t <= self._last_t:
@@ -304,7 +306,9 @@ class Ros2Joints:
             self._owners[place] = who, arrived
         verdict = self._gates.offer(told, places, q)
         if self._gates.jumped:
-            raise SourceLost("a joint is suddenly somewhere else, or the names were changed", retry_s=RETRY_S)
+            raise SourceLost(
+                "a joint is suddenly somewhere else, or the names were changed", retry_s=LinkSettings.retry_s
+            )
         if verdict is False:
             self._refuse(Refusal.TOO_FAST, self._wanted[places[0]])
         sigma_s = self._sender(who).sigma_s
@@ -329,7 +333,7 @@ class Ros2Joints:
     def _sender(self, who: Who) -> Sender:
         sender = self._senders.get(who)
         if sender is None:
-            if len(self._senders) >= SENDERS:
+            if len(self._senders) >= _Settings.most_senders:
                 del self._senders[min(self._senders, key=lambda known: self._senders[known].heard)]
             self._senders[who] = sender = Sender(self._config.max_delay_s)
         return sender
@@ -340,7 +344,7 @@ class Ros2Joints:
         before = self._sequences.get(gid)
         if before is not None and sequence > before + 1:
             self.lost += sequence - before - 1
-        if before is not None or len(self._sequences) < SENDERS:
+        if before is not None or len(self._sequences) < _Settings.most_senders:
             self._sequences[gid] = sequence
 
     def _refuse(self, why: Refusal, detail: str) -> None:
@@ -359,7 +363,6 @@ class Ros2Joints:
         log.warning("%s", self._complaint)
 
 
-FEW_PER_S = 20.0
 LAST_PART = re.compile(r"[;.] (?!.*[;.] )", re.DOTALL)
 
 
@@ -384,16 +387,16 @@ def joint_state_checks(
                 return
             yield Check("joint states", "ok", f"all {len(joints)} joints of robot.toml are in {config.topic}")
             lost, heard = _lost_and_sent(robot)
-            end, readings = clock.now() + READ_S, 0
+            end, readings = clock.now() + CheckSettings.read_s, 0
             while clock.now() < end:
                 readings += robot.read(end - clock.now()) is not None
             lost_since, heard_since = _lost_and_sent(robot)
-            rate_hz, lost, messages = readings / READ_S, lost_since - lost, heard_since - heard
+            rate_hz, lost, messages = readings / CheckSettings.read_s, lost_since - lost, heard_since - heard
             fix = "let the robot's nodes publish more often"
-            yield warned("rate", f"{rate_hz:.0f} readings/s come", fix, when=rate_hz < FEW_PER_S)
+            yield warned("rate", f"{rate_hz:.0f} readings/s come", fix, when=rate_hz < _Settings.few_per_s)
             fix = "bodyschema watch joints    # its log says why, once for each reason"
             said = f"{lost} of {messages} messages were lost or not used"
-            yield warned("errors", said, fix, when=lost > MANY_TROUBLES * messages)
+            yield warned("errors", said, fix, when=lost > CheckSettings.many_troubles * messages)
     except SourceError as error:
         yield Check("router", "wrong", *_parted((str(error),)))
 

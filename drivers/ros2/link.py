@@ -19,9 +19,11 @@ from . import rmw
 from .config import Ros2Config
 from .messages import JOINT_STATE
 
-RETRY_S = 0.5  # asking for an absent router is cheap
-WAITING = 4096  # messages: four seconds at 1 kHz
-GRAPH_LIMIT_S = 1.0
+
+class LinkSettings:
+    retry_s: float = 0.5  # asking for an absent router is cheap
+    most_waiting: int = 4096  # messages: four seconds at 1 kHz
+    graph_limit_s: float = 1.0  # how long the list of publishers is waited for
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,7 +83,7 @@ def open_session(router: str, start: str = "ros2 run rmw_zenoh_cpp rmw_zenohd") 
         return zenoh.open(session_config("client", connect=[router]))
     except zenoh.ZError as error:
         raise SourceLost(
-            f"no zenoh router answers on {router}. Start it on the robot: {start}", retry_s=RETRY_S
+            f"no zenoh router answers on {router}. Start it on the robot: {start}", retry_s=LinkSettings.retry_s
         ) from error
 
 
@@ -96,7 +98,7 @@ class ZenohLink:
     def __init__(self, session: zenoh.Session, key: str, clock: Clock) -> None:
         """Subscribe to `key`; the session is closed with the link."""
         self._session, self._clock = session, clock
-        self._waiting: queue.Queue[Sample] = queue.Queue(WAITING)
+        self._waiting: queue.Queue[Sample] = queue.Queue(LinkSettings.most_waiting)
         # In zenoh's own thread, so that the time of arrival does not depend on the reader.
         handler = zenoh.handlers.Callback(self._take, indirect=False)
         self._subscriber = session.declare_subscriber(key, handler)
@@ -115,7 +117,7 @@ class ZenohLink:
                     return None
 
     def tokens(self) -> Sequence[str]:
-        replies = self._session.liveliness().get(rmw.publishers_key(), timeout=GRAPH_LIMIT_S)
+        replies = self._session.liveliness().get(rmw.publishers_key(), timeout=LinkSettings.graph_limit_s)
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 
     def close(self) -> None:

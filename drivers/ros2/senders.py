@@ -37,6 +37,8 @@ class _Settings:
     anew_after: int = 3
     # if they are late by less, the network was probably held up
     stall_s: float = 5.0
+    anew_after_s: float = 0.5  # for this long: the sender's clock was set
+    anew_after_stall_s: float = 10.0  # and catches up within this time
 
 
 class StampClock:
@@ -130,10 +132,6 @@ class StampClock:
         self._heard = 0
 
 
-ANEW_AFTER_S = 0.5  # for this long: the sender's clock was set
-ANEW_AFTER_STALL_S = 10.0  # and catches up within this time
-
-
 class Refusal(StrEnum):
     """Reason for not using a message, or the reading it would have completed."""
 
@@ -194,7 +192,7 @@ class Sender:
         if self._astray and abs(off_s - self._astray[0][1]) > self._max_delay_s:
             self._astray.clear()
         self._astray = [*self._astray[: _Settings.anew_after - 1], (arrived, off_s)]
-        patience_s = ANEW_AFTER_STALL_S if 0 < off_s < _Settings.stall_s else ANEW_AFTER_S
+        patience_s = _Settings.anew_after_stall_s if 0 < off_s < _Settings.stall_s else _Settings.anew_after_s
         if len(self._astray) == _Settings.anew_after and arrived - self._astray[0][0] > patience_s:
             self._clock, self._newest_ns, self._astray = StampClock(self._max_delay_s), {}, []
             self.times_set += 1

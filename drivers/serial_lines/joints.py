@@ -9,9 +9,9 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Self
 
-from bodyschema.drivers.checks import MANY_TROUBLES, READ_S, Check, aligned, warned
+from bodyschema.drivers.checks import Check, CheckSettings, aligned, warned
 from bodyschema.drivers.echo import BITS_PER_BYTE, Port, close_quietly
-from bodyschema.drivers.serial_line import RETRY_S, SerialLine
+from bodyschema.drivers.serial_line import SerialLine, SerialLineSettings
 from bodyschema.drivers.turn_count import LOST_AFTER_S, TurnCount
 from bodyschema.drivers.turns import FASTEST_RAD_S, SpeedGate
 from bodyschema.interfaces.errors import SourceError, SourceLost
@@ -33,10 +33,9 @@ class _Settings:
     # of a turn
     slack_ticks_part: int = 1000
     few_per_s: float = 50.0
+    ask_every_s: float = 0.5  # for the board's header
+    largest_sigma_s: float = 5e-3  # of a reading's time
 
-
-ASK_EVERY_S = 0.5
-LARGEST_SIGMA_S = 5e-3  # of a reading's time
 
 OpenPort = Callable[[SerialLinesConfig, Clock], Port]
 
@@ -202,7 +201,7 @@ class SerialLineJoints:
         end, heard = self._clock.now() + _Settings.header_s, 0
         while self._clock.now() < end:
             port.write(ASK_HEADER)
-            ask_again = min(end, self._clock.now() + ASK_EVERY_S)
+            ask_again = min(end, self._clock.now() + _Settings.ask_every_s)
             while self._clock.now() < ask_again:
                 data = port.receive(ask_again)
                 heard += len(data)
@@ -210,7 +209,7 @@ class SerialLineJoints:
                 if self._board.header is not None:
                     return self._board.header
         what = "sends nothing: does its program run?" if heard == 0 else "sends no header: compare baud, and the lines"
-        raise SourceLost(f"the board on {self._config.port} {what}", retry_s=RETRY_S)
+        raise SourceLost(f"the board on {self._config.port} {what}", retry_s=SerialLineSettings.retry_s)
 
     def _found(self, header: Header) -> list[Encoder]:
         """Return the encoders. Raise SourceError with a table of all if one differs from robot.toml."""
@@ -246,7 +245,7 @@ class SerialLineJoints:
                 if believed >= 2 and self._is_sure(timed):
                     return
             self._board.hear(port.receive(end), self._clock.now())
-        raise SourceLost(f"the encoders cannot be read: {self._why}", retry_s=RETRY_S)
+        raise SourceLost(f"the encoders cannot be read: {self._why}", retry_s=SerialLineSettings.retry_s)
 
     # --- reading
 
@@ -256,7 +255,7 @@ class SerialLineJoints:
         garbled = self.counts.garbled
         self._board.hear(data, self._clock.now())
         if self._board.restarted:
-            raise SourceLost("the board was restarted, or its lines were held up", retry_s=RETRY_S)
+            raise SourceLost("the board was restarted, or its lines were held up", retry_s=SerialLineSettings.retry_s)
         if data:
             self._heard_s = self._clock.now()
         if self.counts.garbled > garbled:
@@ -265,7 +264,7 @@ class SerialLineJoints:
             self._why = "no line"
         self._attempts += 1
         if self._clock.now() > lost_at and self._attempts >= _Settings.few_attempts and not self._board.is_waiting:
-            raise SourceLost(f"the encoders cannot be read: {self._why}", retry_s=RETRY_S)
+            raise SourceLost(f"the encoders cannot be read: {self._why}", retry_s=SerialLineSettings.retry_s)
 
     def _raw(self, timed: Timed) -> list[int] | None:
         """Return the raw positions of the joints; None when an encoder has none."""
@@ -286,7 +285,7 @@ class SerialLineJoints:
         if refused is not None:
             self._why = f"joint {self.joints[refused]!r}: a position where it cannot have come to"
             if self._gate.jumped:
-                raise SourceLost(self._why, retry_s=RETRY_S)
+                raise SourceLost(self._why, retry_s=SerialLineSettings.retry_s)
             return None
         if timed.t <= self._last_t:
             return None
@@ -295,7 +294,7 @@ class SerialLineJoints:
 
     def _is_sure(self, timed: Timed) -> bool:
         """Return True if the time of the reading is accurate enough."""
-        if timed.sigma > LARGEST_SIGMA_S:
+        if timed.sigma > _Settings.largest_sigma_s:
             self._why = "delayed lines, whose time is unknown"
             return False
         return True
@@ -323,16 +322,16 @@ def encoder_checks(config: SerialLinesConfig, joints: Sequence[str], clock: Cloc
     try:
         with SerialLineJoints(config, joints, clock) as encoders:
             yield Check("encoders", "ok", f"all {len(joints)} of robot.toml are in the board's header")
-            end, readings = clock.now() + READ_S, 0
+            end, readings = clock.now() + CheckSettings.read_s, 0
             while clock.now() < end:
                 readings += encoders.read(end - clock.now()) is not None
-            rate_hz, counts = readings / READ_S, encoders.counts
+            rate_hz, counts = readings / CheckSettings.read_s, encoders.counts
             fix = "a higher rate of the UART, fewer other things that the board does"
             yield warned("rate", f"{rate_hz:.0f} readings/s come", fix, when=rate_hz < _Settings.few_per_s)
             lost = counts.garbled + counts.missing
             said = f"{lost} of {counts.lines + lost} lines were garbled or missing"
             fix = "look at the cable, and whether the board keeps the rate exactly"
-            yield warned("errors", said, fix, when=lost > MANY_TROUBLES * (counts.lines + lost))
+            yield warned("errors", said, fix, when=lost > CheckSettings.many_troubles * (counts.lines + lost))
             for complaint in encoders.health:
                 said, _, fix = complaint.rpartition(": ")
                 yield Check("encoders", "wrong", said, fix)

@@ -29,10 +29,10 @@ class _Settings:
     owed_s: float = 0.06
     # number of recent requests whose size is avoided
     asked_lately: int = 4
+    longest_noise_s: float = 0.25  # how long a bus is waited for to fall quiet
+    # bytes: from the end of a reading's block to that of the documented registers of the X and P series
+    most_spare_bytes: int = 10
 
-
-LONGEST_NOISE_S = 0.25
-MOST_SPARE = 10  # bytes: from the end of a reading's block to that of the documented registers of the X and P series
 
 Taken = TypeVar("Taken")
 Take = Callable[[bytearray, int], Taken | None]
@@ -244,7 +244,7 @@ class Bus(ABC):
     def settle(self) -> None:
         """Wait until the line has been silent for a while."""
         quiet_s = max(_Settings.quiet_s, 2 * self._latency_s)
-        end = self._clock.now() + LONGEST_NOISE_S
+        end = self._clock.now() + _Settings.longest_noise_s
         while self._clock.now() < end and self._port.receive(self._clock.now() + quiet_s):
             pass
 
@@ -371,4 +371,4 @@ class Inbox:
 
 def spare_after(layout: Layout, register: Register) -> int:
     """Return how many bytes after a register may be read with it."""
-    return min(MOST_SPARE, layout.size - register.end)
+    return min(_Settings.most_spare_bytes, layout.size - register.end)

@@ -8,7 +8,7 @@ from itertools import pairwise, zip_longest
 from statistics import median, quantiles
 from typing import Any
 
-from bodyschema.drivers.checks import MANY_TROUBLES, READ_S, Check, warned
+from bodyschema.drivers.checks import Check, CheckSettings, warned
 from bodyschema.drivers.echo import without_echo
 from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.protocols import Clock
@@ -20,11 +20,15 @@ from .joints import OpenPort, open_serial
 from .servo import IdentifiedServo
 from .vendor import ServoVendor, plans_of
 
-IDENTIFY_S = 1.0  # servos not yet asked by then are not asked any more
-FEW_PER_S = 100.0
-LONGEST_DELAY_S = 50e-6
+
+class _Settings:
+    identify_s: float = 1.0  # servos not yet asked by then are not asked any more
+    few_per_s: float = 100.0  # readings: fewer get a warning
+    longest_delay_s: float = 50e-6  # of a servo's answers
+    fast_baud: int = 1_000_000  # a slower bus is the reason for few readings [bit/s]
+
+
 TYPE = "servos"
-FAST_BAUD = 1_000_000
 
 
 def servo_checks(
@@ -33,7 +37,7 @@ def servo_checks(
     clock: Clock,
     open_port: OpenPort = open_serial,
     *,
-    read_s: float = READ_S,
+    read_s: float = CheckSettings.read_s,
 ) -> Iterator[Check]:
     """Yield checks of presence, health and reading rate of the servos. Open the ports for that."""
     with ExitStack() as stack:
@@ -57,7 +61,7 @@ def servo_checks(
 
 def _identified(vendor: ServoVendor, config: ServosConfig[Any], buses: dict[str, Bus], clock: Clock) -> list[Finding]:
     found: list[Finding] = []
-    end = clock.now() + IDENTIFY_S
+    end = clock.now() + _Settings.identify_s
     for servo in config.servos:
         if clock.now() > end:
             found.append(Finding(servo, "not asked"))
@@ -94,7 +98,7 @@ def _health(vendor: ServoVendor, bus: Bus, servo: IdentifiedServo) -> Iterator[C
 
 def _delays(servos: Sequence[IdentifiedServo]) -> Iterator[Check]:
     for name in dict.fromkeys(servo.bus for servo in servos):
-        slow = [s for s in servos if s.bus == name and s.return_delay_s > LONGEST_DELAY_S]
+        slow = [s for s in servos if s.bus == name and s.return_delay_s > _Settings.longest_delay_s]
         if slow:
             worst_us = 1e6 * max(servo.return_delay_s for servo in slow)
             names = ", ".join(servo.joint for servo in slow)
@@ -145,10 +149,10 @@ def _rate(times: Sequence[float], read_s: float, config: ServosConfig[Any]) -> C
     intervals = [b - a for a, b in pairwise(times)]
     jitter_ms = 1e3 * (quantiles(intervals, n=20)[-1] - median(intervals))
     said = f"{rate:.0f} readings/s are possible ({wanted_hz:.0f} wanted), jitter {jitter_ms:.1f} ms (95 %)"
-    slow = next((name for name, bus in config.buses.items() if bus.baud < FAST_BAUD), None)
+    slow = next((name for name, bus in config.buses.items() if bus.baud < _Settings.fast_baud), None)
     faster = "bodyschema install udev    # an adapter's latency timer; then plug it in again"
-    fix = faster if slow is None else f"bodyschema servos baud={FAST_BAUD} --bus {slow}"
-    return warned("rate", said, fix, when=rate < min(FEW_PER_S, wanted_hz))
+    fix = faster if slow is None else f"bodyschema servos baud={_Settings.fast_baud} --bus {slow}"
+    return warned("rate", said, fix, when=rate < min(_Settings.few_per_s, wanted_hz))
 
 
 def _troubles(name: str, exchanges: int, troubles: dict[str, int]) -> Check:
@@ -156,4 +160,4 @@ def _troubles(name: str, exchanges: int, troubles: dict[str, int]) -> Check:
     words = ", ".join(f"{n}× {what}" for what, n in sorted(troubles.items(), key=lambda item: -item[1]))
     said = f"{count} of {exchanges} questions on {name} went wrong{f': {words}' if words else ''}"
     fix = "look at cable and connectors, the supply's voltage under load, noise"
-    return warned("errors", said, fix, when=count > MANY_TROUBLES * exchanges)
+    return warned("errors", said, fix, when=count > CheckSettings.many_troubles * exchanges)

@@ -18,10 +18,14 @@ log = logging.getLogger(__name__)
 
 SETTINGS = ("return_delay", "drive_mode", "operating_mode", "homing_offset")
 
-ATTEMPTS = 5  # if one of six servos loses every twentieth answer, all five fail in one of 700 openings
+
+class HandshakeSettings:
+    attempts: int = 5  # if one of six servos loses every twentieth answer, all five fail in one of 700 openings
+    retry_s: float = 0.2  # after which opening is tried again
+
+
 # What a busy machine or a loose cable does too; not a wrong ID, rate or setting.
 PASSING = (Trouble.TIMEOUT, Trouble.FOREIGN, Trouble.WRONG_LENGTH, Trouble.EARLY)
-RETRY_S = 0.2
 GARBLED = "garbled answers: two servos with this ID, or a bad cable"
 SCAN = "`bodyschema scan --robot robot.toml` looks for them at all rates and IDs, and says what to do"
 
@@ -85,7 +89,7 @@ def require_all(findings: Iterable[Finding], ports: str) -> list[IdentifiedServo
     message = "\n  ".join([f"the servos on {ports} are not those of robot.toml:", *aligned(rows), SCAN])
     if all(finding.may_come_back for finding in wrong):
         brief = "; ".join(f"joint {f.config.joint!r} (ID {f.config.id}): {f.found}" for f in wrong)
-        raise SourceLost(message, retry_s=RETRY_S, brief=brief)
+        raise SourceLost(message, retry_s=HandshakeSettings.retry_s, brief=brief)
     raise SourceError(message)
 
 
@@ -99,7 +103,7 @@ def switch_torque_off(bus: Bus, servo: IdentifiedServo) -> IdentifiedServo:
     had_torque = torque_is_on(bus, servo)
     if had_torque:
         register = servo.model.layout["torque"]
-        for _ in range(ATTEMPTS):
+        for _ in range(HandshakeSettings.attempts):
             bus.write(servo.model, servo.id, register, register.bytes(0))
             if not torque_is_on(bus, servo):
                 break
@@ -115,7 +119,7 @@ def torque_is_on(bus: Bus, servo: IdentifiedServo) -> bool:
     """Return True if the servo's torque is on; raise SourceLost if it does not answer."""
     data, trouble = read_register(bus, servo.model, servo.id, servo.model.layout["torque"])
     if data is None:
-        raise SourceLost(f"joint {servo.joint!r} (ID {servo.id}): {trouble}", retry_s=RETRY_S)
+        raise SourceLost(f"joint {servo.joint!r} (ID {servo.id}): {trouble}", retry_s=HandshakeSettings.retry_s)
     return data != b"\x00"
 
 
@@ -135,7 +139,7 @@ def restore_torque(bus: Bus, servo: IdentifiedServo) -> None:
 def read_register(bus: Bus, model: Model, id: int, register: Register) -> tuple[bytes | None, Trouble | None]:
     """Return a register's bytes or the last trouble; repeat until two agree if the checksum is weak."""
     data, trouble = _read_once(bus, model, id, register)
-    for _ in range(ATTEMPTS):
+    for _ in range(HandshakeSettings.attempts):
         if data is None or not bus.is_weak(bus.read_request(model, id, register)):
             break
         before = data
@@ -153,7 +157,7 @@ def _read_once(bus: Bus, model: Model, id: int, register: Register) -> tuple[byt
 def ask_again(bus: Bus, request: Request) -> Exchange:
     """Repeat a request until it is answered, a few times at most."""
     exchange = Exchange(())
-    for _ in range(ATTEMPTS):
+    for _ in range(HandshakeSettings.attempts):
         exchange = bus.ask(request)
         if exchange.trouble is None:
             break
@@ -173,5 +177,5 @@ def _absence(bus: Bus, model: Model, id: int, trouble: Trouble | None) -> str:
 def _is_garbled(bus: Bus, model: Model, id: int) -> bool:
     """Return True if most measurements are garbled, as when two servos of one model, set up alike, share an ID."""
     request = bus.read_request(model, id, model.layout.block)
-    garbled = sum(bus.ask(request).trouble is Trouble.GARBLED for _ in range(ATTEMPTS))
-    return garbled > ATTEMPTS // 2
+    garbled = sum(bus.ask(request).trouble is Trouble.GARBLED for _ in range(HandshakeSettings.attempts))
+    return garbled > HandshakeSettings.attempts // 2

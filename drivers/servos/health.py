@@ -81,8 +81,9 @@ class Health:
         return known or ([f"hardware error {bits:#04x}"] if bits else [])
 
 
-EVERY_S = 0.1  # one servo in turn
-SUPPLY_EVERY = 11  # every 11th inspection reads voltage and temperature too
+class _Settings:
+    every_s: float = 0.1  # one servo in turn
+    supply_every: int = 11  # every 11th inspection reads voltage and temperature too
 
 
 class Inspection:
@@ -115,9 +116,9 @@ class Inspection:
             return
         self._looked += 1
         if self._looked >= len(self._servos):  # the first round is made at once
-            self._next_s = self._clock.now() + EVERY_S
+            self._next_s = self._clock.now() + _Settings.every_s
         self._judge(servo, exchange)
-        if self._looked % SUPPLY_EVERY == 0 or servo.joint not in self._health.supplies:
+        if self._looked % _Settings.supply_every == 0 or servo.joint not in self._health.supplies:
             self._ask_supply(servo)
 
     def first_silent(self) -> str | None:

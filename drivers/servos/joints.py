@@ -24,7 +24,7 @@ from bodyschema.interfaces.servos import BusStatus, ServoStatus
 from .bus import Bus, Counts, Request
 from .channel import Channel, Drive, Punctuality, Sample, middle
 from .config import ServoBusConfig, ServosConfig
-from .handshake import RETRY_S, identify, require_all, restore_torque, switch_torque_off
+from .handshake import HandshakeSettings, identify, require_all, restore_torque, switch_torque_off
 from .health import Health, Inspection
 from .servo import IdentifiedServo
 from .vendor import Plan, ServoVendor, plans_of
@@ -39,9 +39,9 @@ class _Settings:
     doubts: int = 5
     anchor_polls: int = 50
     slack_ticks: int = 3
+    improve_every_s: float = 10.0  # a failed attempt costs a reading or two
 
 
-IMPROVE_EVERY_S = 10.0  # a failed attempt costs a reading or two
 GOLDEN = 0.618034  # its multiples, modulo 1, are spread most evenly
 
 OpenPort = Callable[[Any, Clock], tuple[Port, float]]
@@ -237,7 +237,7 @@ class ServoJoints:
         self._punctuality = Punctuality()
         now = self._clock.now()
         self._believed_s, self._failures, self._next_poll, self._polls = now, 0, now, 0
-        self._improve_s = now + IMPROVE_EVERY_S
+        self._improve_s = now + _Settings.improve_every_s
         self._inspection = Inspection(self._buses, self.servos, self._health, self.drives, self._clock)
         self._why = "no answer"
 
@@ -258,7 +258,7 @@ class ServoJoints:
                 self._turns.check(raw)
                 self._believed_s, self._failures = self._clock.now(), 0
                 return
-        raise SourceLost(f"the servos cannot be read: {self._why}", retry_s=RETRY_S)
+        raise SourceLost(f"the servos cannot be read: {self._why}", retry_s=HandshakeSettings.retry_s)
 
     def _say_opened(self) -> None:
         switched = [servo.joint for servo in self.servos if servo.had_torque]
@@ -296,7 +296,7 @@ class ServoJoints:
             self.dropped += 1
             self._failures += 1
             if self._failures >= _Settings.few_polls and self._clock.now() - self._believed_s > LOST_AFTER_S:
-                raise SourceLost(self._inspection.first_silent() or self._why, retry_s=RETRY_S)
+                raise SourceLost(self._inspection.first_silent() or self._why, retry_s=HandshakeSettings.retry_s)
         else:
             self._believed_s, self._failures = self._clock.now(), 0
         return reading
@@ -305,7 +305,7 @@ class ServoJoints:
         """Try a faster read method at intervals, but not while a drive holds joints."""
         if self._clock.now() < self._improve_s or any(drive.holding for drive in self.drives):
             return
-        self._improve_s = self._clock.now() + IMPROVE_EVERY_S
+        self._improve_s = self._clock.now() + _Settings.improve_every_s
         for name, plan in self._plans.items():
             if plan.improve():
                 log.info("%s is read with %s from now on", name, plan.name)
@@ -337,7 +337,8 @@ class ServoJoints:
                 self._why = f"joint {self.joints[place]!r}: an answer from another time"
                 if channel.doubts >= _Settings.doubts:
                     raise SourceLost(
-                        f"joint {channel.servo.joint!r} (ID {channel.servo.id}) was restarted", retry_s=RETRY_S
+                        f"joint {channel.servo.joint!r} (ID {channel.servo.id}) was restarted",
+                        retry_s=HandshakeSettings.retry_s,
                     )
             elif exchange.trouble is None and self._is_confirmed(bus, question, channel, sample):
                 samples[place] = sample
@@ -370,7 +371,7 @@ class ServoJoints:
             servo = self.servos[refused]
             self._why = f"joint {servo.joint!r} (ID {servo.id}): a position where it cannot have come to"
             if self._gate.jumped:
-                raise SourceLost(self._why, retry_s=RETRY_S)
+                raise SourceLost(self._why, retry_s=HandshakeSettings.retry_s)
             return None
         if t <= self._last_t:
             return None

@@ -52,6 +52,7 @@ class Packets(Protocol):
 
 
 HEADER, LARGEST_ID = b"\xff\xff", 0xFD
+BROADCAST = 0xFE
 
 
 def summed(id: int, code: int, params: bytes = b"") -> bytes:

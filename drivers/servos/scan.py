@@ -7,7 +7,7 @@ from contextlib import closing
 from dataclasses import dataclass, field, replace
 
 from bodyschema.drivers.echo import BITS_PER_BYTE, HOST_S, Port, without_echo
-from bodyschema.drivers.serial_line import DEFAULT_LATENCY_S, SerialLine
+from bodyschema.drivers.serial_line import SerialLine, SerialLineSettings
 from bodyschema.drivers.servos.handshake import ask_again
 from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.protocols import Clock
@@ -19,7 +19,6 @@ from .packets import Garbled, Packets, Status
 from .settings import LARGEST_ID
 
 IDS = range(LARGEST_ID + 1)
-APART_S = 1e-3  # shortest time between two requests
 VOLT_PER_UNIT = 0.1  # for all series of all vendors; temperatures are in °C
 
 
@@ -106,9 +105,9 @@ class PingScanner:
         ids = {status.id for status in statuses}
         return sorted(ids if is_clean else ids | self._unclear(port, clock, latency_s, ids))
 
-    def _spacing_s(self, baud: int) -> float:
+    def _spacing_s(self, baud: int, shortest_s: float = 1e-3) -> float:
         """Return the time between two requests [s], so that the answer to the first has ended."""
-        return max(sum(self._ping_sizes) * BITS_PER_BYTE / baud + LARGEST_RETURN_DELAY_S, APART_S)
+        return max(sum(self._ping_sizes) * BITS_PER_BYTE / baud + LARGEST_RETURN_DELAY_S, shortest_s)
 
     def _unclear(self, port: Port, clock: Clock, latency_s: float, known: set[int]) -> set[int]:
         """Return the IDs that answer anything, asked one by one."""
@@ -225,7 +224,7 @@ def scan_port(
     tell: Tell,
     *,
     bauds: Sequence[int] = (),
-    latency_s: float = DEFAULT_LATENCY_S,
+    latency_s: float = SerialLineSettings.default_latency_s,
     open_port: Callable[[str, int, Clock], Port] = lambda port, baud, clock: SerialLine.open(port, baud, clock.now),
 ) -> ScannedBus:
     """Find the servos on a port at all rates, or at `bauds`.

@@ -10,7 +10,7 @@ from bodyschema.drivers.servos.bus import Bus, Request
 
 from .channel import Channel
 from .config import ServosConfig
-from .handshake import ATTEMPTS
+from .handshake import HandshakeSettings
 from .model import Model
 from .servo import IdentifiedServo
 from .settings import Setting
@@ -32,7 +32,7 @@ class Plan:
     def __init__(self, bus: Bus, groups: Sequence[Sequence[Way]]) -> None:
         """Try each group's methods, the fastest first, several times each. The last one is taken without a try."""
         self._bus, self._groups = bus, groups
-        self._taken = [self._first_answered(ways, ATTEMPTS) for ways in groups]
+        self._taken = [self._first_answered(ways, HandshakeSettings.attempts) for ways in groups]
 
     @property
     def requests(self) -> list[Request]:

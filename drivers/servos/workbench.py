@@ -14,13 +14,12 @@ from bodyschema.interfaces.protocols import Clock
 
 from .bus import Bus, Trouble
 from .config import ServoConfig
-from .handshake import ATTEMPTS, identify, read_register, switch_torque_off
+from .handshake import HandshakeSettings, identify, read_register, switch_torque_off
 from .model import Model, Register
 from .servo import IdentifiedServo
 from .settings import ID, Setting
 from .vendor import ServoVendor
 
-EEPROM_S = 0.02  # a servo may be deaf so long while it writes
 LOCK = "lock"
 
 OpenAt = Callable[[str, int], tuple[Port, float]]
@@ -135,7 +134,7 @@ class EepromEditor:
         """Write it, and read it back. Not for rates, see `write_bauds`. Torque has to be off."""
         self._unlock(bus, change.servo)
         done = self._tried(bus, change)
-        for _ in range(ATTEMPTS - 1):
+        for _ in range(HandshakeSettings.attempts - 1):
             if done.outcome is Outcome.KEPT:
                 done = self._tried(bus, change)
         return self._locked(bus, done)
@@ -177,11 +176,11 @@ class EepromEditor:
             return self._locked(self.bus(port, baud), Done(change, Outcome.KEPT, register.value(data), said))
         return _lost(change, trouble)
 
-    def _tell(self, bus: Bus, servo: IdentifiedServo, register: Register, value: int) -> None:
+    def _tell(self, bus: Bus, servo: IdentifiedServo, register: Register, value: int, deaf_s: float = 0.02) -> None:
         """Write, whatever is answered: under which ID and at which rate it is answered depends on the firmware."""
         bus.write(servo.model, servo.id, register, register.bytes(value))
         bus.settle()
-        bus.listen(self._clock.now() + EEPROM_S)
+        bus.listen(self._clock.now() + deaf_s)  # while it writes
 
     def _unlock(self, bus: Bus, servo: IdentifiedServo) -> None:
         """Unlock the servo's EEPROM; values written while it is locked are lost at power-off."""

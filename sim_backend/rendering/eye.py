@@ -38,6 +38,8 @@ class _Settings:
     supersampling: int = 3  # samples across one pixel around the marker
     noise_fields: int = 8
     noise_shift_px: int = 64
+    # Portraits: radius of the marker [px], and how far a tag is turned away [deg]. Several, as chance may spoil one.
+    portraits = ((40.0, 30.0), (60.0, 40.0), (30.0, 10.0), (60.0, 20.0))
 
 
 def cast_ball(
@@ -182,8 +184,6 @@ def _is_black(place: FloatArray, black: np.ndarray) -> np.ndarray:
 
 
 TO_LIGHT = np.array([0.35, 0.45, 0.82]) / np.linalg.norm([0.35, 0.45, 0.82])
-# Portraits: radius of the marker [px], and how far a tag is turned away [deg]. Several, as chance may spoil one.
-_PORTRAITS = ((40.0, 30.0), (60.0, 40.0), (30.0, 10.0), (60.0, 20.0))
 
 
 class StereoEyes:
@@ -324,7 +324,7 @@ def portraits(calibration: StereoCalibration, config: CameraConfig) -> Iterator[
     width, height = calibration.image_size_px
     middle_px = np.array([width - 1, height - 1]) / 2 - calibration.principal_point_px
     faced = rotation_of(np.array(config.tags[0].rpy)).T if config.tags else np.eye(3)
-    for radius_px, turn_deg in _PORTRAITS:
+    for radius_px, turn_deg in _Settings.portraits:
         # Limit the size so that the marker stays inside both images.
         z = calibration.focal_px * max(config.marker_radius_m / radius_px, 2.0 * calibration.baseline_m / width)
         x, y = middle_px * z / calibration.focal_px

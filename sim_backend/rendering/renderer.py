@@ -17,14 +17,12 @@ import numpy as np
 from bodyschema.interfaces.records import FloatArray, ImageArray
 from bodyschema.sim_backend.bullet import Body
 from bodyschema.sim_backend.geometry import turn_of_z
-from bodyschema.sim_backend.physics_urdf import ROD_RADIUS_M, SHORTEST_ROD_M
+from bodyschema.sim_backend.physics_urdf import UrdfSettings
 from kbmaps.rotations import quaternions
 
 from .eye import TO_LIGHT, StereoEyes
 from .raster import Raster
 from .render_messages import SLOTS, Frame, Message, Setup, Tool, frame_bytes, receive, slot_images
-
-_PARENT_CHECK_S = 1.0
 
 
 class Stick:
@@ -43,11 +41,11 @@ class Stick:
             self._id = -1
         length = float(np.linalg.norm(tip))
         # What stands in the world, before a camera that the arm carries, is on no stick.
-        if length < SHORTEST_ROD_M or self._body.stands(self._link):
+        if length < UrdfSettings.shortest_rod_m or self._body.stands(self._link):
             return
         shape = bullet.createVisualShape(
             bullet.GEOM_CYLINDER,
-            radius=ROD_RADIUS_M,
+            radius=UrdfSettings.rod_radius_m,
             length=length,
             rgbaColor=[0.16, 0.17, 0.18, 1],
             physicsClientId=client,
@@ -95,10 +93,10 @@ def _paint(frame: Frame, body: Body, stick: Stick, eyes: StereoEyes, images: tup
     eyes.paint(frame.number, T_world_camera, x_eyes, np.array(frame.R_camera_marker).reshape(3, 3), images)
 
 
-def _next(pipe: Connection) -> Message | None:
+def _next(pipe: Connection, check_s: float = 1.0) -> Message | None:
     """Return the next request; None if the parent closed the pipe or is gone (its fork may keep the pipe open)."""
     parent = os.getppid()
-    while not pipe.poll(_PARENT_CHECK_S):
+    while not pipe.poll(check_s):
         if os.getppid() != parent:
             return None
     return receive(pipe)

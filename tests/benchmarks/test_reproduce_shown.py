@@ -45,7 +45,7 @@ def test_table_has_row_per_test_column_per_count() -> None:
 
 
 def test_a_long_step_says_how_far_it_is(monkeypatch) -> None:
-    monkeypatch.setattr(screen, "TELL_EVERY_S", 0.0)
+    monkeypatch.setattr(screen.ScreenSettings, "tell_every_s", 0.0)
     said: list[str] = []
     assert list(screen.counted(said.append, "fits", [4, 5])) == [4, 5]
     assert said == ["fits", "fits: 0 of 2", "fits: 1 of 2"]

@@ -21,7 +21,7 @@ def snapshot(pairs: int, angle_rad: float | None = None) -> Snapshot:
 
 @pytest.fixture
 def lines(monkeypatch):
-    monkeypatch.setattr(view, "TELL_EVERY_S", 0.0)
+    monkeypatch.setattr(view.ScreenSettings, "tell_every_s", 0.0)
     console = Console(file=io.StringIO(), width=200, force_terminal=False, record=True)
 
     def shown(*pairs: int, angle_rad: float | None = None) -> list[str]:

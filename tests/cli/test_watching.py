@@ -13,7 +13,7 @@ from board_renderer import webcams
 from shown_board import known_rig
 from small_arm import write_small_arm
 
-from bodyschema.cli.cameras.watching import MOST_VIEWERS, MjpegServer
+from bodyschema.cli.cameras.watching import MjpegServer, _Settings
 from bodyschema.cli.hardware.robot_template import EXAMPLE, Seen, robot_toml
 from bodyschema.cli.main import app
 from bodyschema.daemon.config import Config
@@ -118,7 +118,7 @@ def test_pictures_are_served_to_this_machine(host: str) -> None:
 def test_too_many_viewers_of_pictures_are_refused() -> None:
     with MjpegServer(0) as server:
         server.show(b"picture")
-        streams = [asked(server, "/stream", ["localhost"]) for _ in range(MOST_VIEWERS)]
+        streams = [asked(server, "/stream", ["localhost"]) for _ in range(_Settings.most_viewers)]
         assert {answer.status for answer in streams} == {200}
         assert asked(server, "/stream", ["localhost"]).status == 503
         assert asked(server, "/", ["localhost"]).status == 200

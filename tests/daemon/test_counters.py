@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from small_arm import write_small_arm
 
-from bodyschema.daemon.sampler.counters import FEWEST_FRAMES, NEWEST_FRAMES, SamplerCounters
+from bodyschema.daemon.sampler.counters import SamplerCounters, _Settings
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.records import Reason
 from bodyschema.interfaces.rejections import REMEDIES, WORDS, words_of
@@ -37,9 +37,10 @@ def test_unknown_reason_of_newer_version_is_shown() -> None:
 
 @pytest.mark.parametrize("reason", [Reason.NO_MARKER, Reason.EPIPOLAR, Reason.STALE, Reason.MOVING])
 def test_frames_all_refused_name_reason_and_remedy(tally, reason) -> None:
-    refuse(tally, reason, FEWEST_FRAMES)
+    refuse(tally, reason, _Settings.fewest_frames)
     assert tally.complaints == [
-        f"{FEWEST_FRAMES} of the last {FEWEST_FRAMES} frames were rejected: {WORDS[reason]}. {REMEDIES[reason]}"
+        f"{_Settings.fewest_frames} of the last {_Settings.fewest_frames} frames were rejected: {WORDS[reason]}. "
+        f"{REMEDIES[reason]}"
     ]
 
 
@@ -53,19 +54,19 @@ def test_the_most_frequent_of_several_reasons_is_named(tally) -> None:
 
 
 def test_few_frames_are_no_reason_to_complain(tally) -> None:
-    refuse(tally, Reason.NO_MARKER, FEWEST_FRAMES - 1)
+    refuse(tally, Reason.NO_MARKER, _Settings.fewest_frames - 1)
     assert tally.complaints == []
 
 
 @pytest.mark.parametrize("reason", [Reason.TOO_NEAR, Reason.PAUSED])
 def test_an_arm_that_stands_still_is_in_order(tally, reason) -> None:
-    refuse(tally, reason, NEWEST_FRAMES)
+    refuse(tally, reason, _Settings.newest_frames)
     assert tally.complaints == []
 
 
 def test_pairs_end_the_complaint(tally) -> None:
-    refuse(tally, Reason.NO_MARKER, NEWEST_FRAMES)
-    for _ in range(NEWEST_FRAMES // 10):
+    refuse(tally, Reason.NO_MARKER, _Settings.newest_frames)
+    for _ in range(_Settings.newest_frames // 10):
         tally.accept(Q)
     assert tally.complaints
     tally.accept(Q)

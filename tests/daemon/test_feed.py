@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from guided_arm import STORE, Scene, make_pair, new_learning
 
-from bodyschema.daemon.learner.feed import RETRY_S, WAITING, PairFeed
+from bodyschema.daemon.learner.feed import RETRY_S, FeedSettings, PairFeed
 from bodyschema.daemon.sampler.history import Page, read_page
 from bodyschema.daemon.transport.wire import PairMessage, PairsReply, encode, pair_to_wire
 from bodyschema.interfaces.errors import BusError, RequestError
@@ -140,7 +140,7 @@ def test_queue_overflow_is_recovered_from_history() -> None:
     fed = Fed(stored=1)
     fed.settle()
     fed.history.pairs = PAIRS[:10]
-    fed.publish(*[PAIRS[1]] * (WAITING + 50))
+    fed.publish(*[PAIRS[1]] * (FeedSettings.most_waiting + 50))
     fed.settle()
     assert fed.learnt == (10, 10)
 

@@ -163,8 +163,8 @@ def test_flood_differing_only_in_numbers_is_cut_off() -> None:
         journal.say(f"pair {number} was refused")
     journal.handler.close()
     assert journal.lines[:2] == ["<4>bus: pair 0 was refused", "<4>bus: pair 1 was refused"]
-    assert len(journal.lines) == logs.OFTEN + 1
-    assert journal.lines[-1] == f"<4>bus: {500 - logs.OFTEN} more times in 0 s: pair # was refused"
+    assert len(journal.lines) == logs.RepeatSettings.often + 1
+    assert journal.lines[-1] == f"<4>bus: {500 - logs.RepeatSettings.often} more times in 0 s: pair # was refused"
 
 
 def test_same_warning_for_two_joints_names_both() -> None:
@@ -185,7 +185,7 @@ def test_number_of_remembered_messages_is_bounded() -> None:
     journal = Journal()
     for k in range(5000):
         journal.say("x" * (k % 1000))
-    assert len(journal.handler._said) <= logs.REMEMBERED
+    assert len(journal.handler._said) <= logs.RepeatSettings.remembered
 
 
 def test_a_signal_calls_for_an_orderly_end() -> None:

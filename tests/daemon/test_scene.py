@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bodyschema.cli.demo.scene import CUBE_M, prepare
+from bodyschema.cli.demo.scene import _Settings, prepare
 from bodyschema.daemon.config import Config
 from bodyschema.daemon.wiring.wiring import open_sources
 from bodyschema.interfaces.errors import ConfigError
@@ -45,8 +45,8 @@ def test_demo_cube_tags_face_outwards_in_three_dimensions(tmp_path) -> None:
     body = TagBody.cluster(vision.cluster, vision.tag)
     middles = np.array([corners.mean(axis=0) for corners in body.corners.values()])
     normals = np.array([np.cross(c[1] - c[0], c[0] - c[3]) for c in body.corners.values()]) / vision.tag.side_m**2
-    assert normals @ middles.T == pytest.approx(CUBE_M / 2 * (normals @ normals.T), abs=1e-9)
-    assert normals == pytest.approx(middles / (CUBE_M / 2), abs=1e-6)
+    assert normals @ middles.T == pytest.approx(_Settings.cube_m / 2 * (normals @ normals.T), abs=1e-9)
+    assert normals == pytest.approx(middles / (_Settings.cube_m / 2), abs=1e-6)
     assert np.linalg.matrix_rank(np.round(normals, 6)) == 3
 
 

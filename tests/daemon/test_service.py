@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from bodyschema.daemon.service.notify import START_LIMIT_S, Notifier
-from bodyschema.daemon.service.service import SETTLED_S, SIGNS_PER_WATCHDOG, Service, with_health
+from bodyschema.daemon.service.notify import Notifier, NotifySettings
+from bodyschema.daemon.service.service import Service, _Settings, with_health
 from bodyschema.interfaces.clock import SystemClock
 
 WATCHDOG_S = 8.0
@@ -61,7 +61,7 @@ def service(systemd: Heard, tmp_path: Path, clock: HandClock) -> Service:
 
 
 def a_round_of(service: Service, clock: HandClock, *loops: str) -> None:
-    clock.time += WATCHDOG_S / SIGNS_PER_WATCHDOG
+    clock.time += WATCHDOG_S / _Settings.signs_per_watchdog
     for loop in loops:
         service.beat(loop)
 
@@ -103,7 +103,7 @@ def test_a_start_that_works_is_given_more_time(systemd, tmp_path) -> None:
     notifier = Notifier(str(tmp_path / "notify"))
     for _ in range(100):
         notifier.starting()
-    assert systemd.all() == [f"EXTEND_TIMEOUT_USEC={START_LIMIT_S}000000"]
+    assert systemd.all() == [f"EXTEND_TIMEOUT_USEC={NotifySettings.start_limit_s}000000"]
 
 
 def test_reload_notifies_start_time_and_ready(service, systemd) -> None:
@@ -199,14 +199,14 @@ def test_openable_device_is_not_forbidden(owner) -> None:
 def test_persistently_unopenable_device_is_forbidden(owner, clock, permissions, plugged) -> None:
     permissions.granted = False
     assert owner.forbidden() is None  # its group may come yet
-    clock.time += SETTLED_S
+    clock.time += _Settings.settled_s
     assert owner.forbidden() == str(plugged)
 
 
 def test_device_permitted_late_is_not_forbidden(owner, clock, permissions) -> None:
     permissions.granted = False
     owner.forbidden()
-    clock.time += SETTLED_S
+    clock.time += _Settings.settled_s
     permissions.granted = True
     assert owner.forbidden() is None
     permissions.granted = False

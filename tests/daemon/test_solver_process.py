@@ -113,7 +113,7 @@ def test_restarted_solver_is_fed_from_the_beginning(solver: ScriptedSolver, solv
 def test_a_solver_that_hangs_is_replaced(monkeypatch) -> None:
     program = (sys.executable, "-S", "-c", "import signal; signal.pause()")
     monkeypatch.setattr(solver_process, "module_command", lambda _: program)
-    monkeypatch.setattr(solver_process, "HUNG_AFTER_S", 0.001)
+    monkeypatch.setattr(solver_process._Settings, "hung_after_s", 0.001)
     with solver_process.SolverProcess() as process:
         process.start(TASK)
         process.solve()
@@ -124,8 +124,8 @@ def test_a_solver_that_hangs_is_replaced(monkeypatch) -> None:
 
 def test_solver_that_reads_nothing_is_replaced(monkeypatch) -> None:
     monkeypatch.setattr(solver_process, "module_command", lambda _: ("sleep", "60"))
-    monkeypatch.setattr(solver_process, "READS_WITHIN_S", 0.0)
-    monkeypatch.setattr(solver_process, "HUNG_AFTER_S", 0.0)
+    monkeypatch.setattr(solver_process._Settings, "reads_within_s", 0.0)
+    monkeypatch.setattr(solver_process._Settings, "hung_after_s", 0.0)
     with solver_process.SolverProcess() as process:
         process.start(TASK)
         process.learn(np.zeros((10_000, 3)), np.zeros((10_000, 3)))
@@ -136,11 +136,11 @@ def test_solver_that_reads_nothing_is_replaced(monkeypatch) -> None:
 
 def test_polling_does_not_wait_for_blocked_solver(monkeypatch) -> None:
     monkeypatch.setattr(solver_process, "module_command", lambda _: ("sleep", "60"))
-    monkeypatch.setattr(solver_process, "READS_WITHIN_S", 0.0)
+    monkeypatch.setattr(solver_process._Settings, "reads_within_s", 0.0)
     with solver_process.SolverProcess() as process:
         process.start(TASK)
         process.learn(np.zeros((10_000, 3)), np.zeros((10_000, 3)))
-        monkeypatch.setattr(solver_process, "READS_WITHIN_S", 20.0)
+        monkeypatch.setattr(solver_process._Settings, "reads_within_s", 20.0)
         begin = time.monotonic()
         assert process.poll() is None
         assert time.monotonic() - begin < 10.0
@@ -151,7 +151,7 @@ def test_solver_with_unreadable_cpu_clock_is_kept(monkeypatch) -> None:
         raise OSError(22, "Invalid argument")
 
     monkeypatch.setattr(solver_process, "module_command", lambda _: ("sleep", "60"))
-    monkeypatch.setattr(solver_process, "HUNG_AFTER_S", 0.0)
+    monkeypatch.setattr(solver_process._Settings, "hung_after_s", 0.0)
     monkeypatch.setattr(solver_process.time, "clock_gettime", unknown)
     with solver_process.SolverProcess() as process:
         process.start(TASK)

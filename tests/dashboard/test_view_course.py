@@ -11,8 +11,8 @@ from told_statuses import LEARNER
 
 from bodyschema.daemon.transport.status import Change, LearnerStatus
 from bodyschema.daemon.transport.wire import PredictReply
-from bodyschema.dashboard.course import LARGEST_SERIES, Course, Series
-from bodyschema.dashboard.recent import KEPT, LARGEST_CLOUD, RecentPairs, cloud
+from bodyschema.dashboard.course import Course, Series, _Settings
+from bodyschema.dashboard.recent import RecentPairs, RecentSettings, cloud
 from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import Pair, frozen_array
 
@@ -47,7 +47,7 @@ def test_series_of_months_stays_small_and_complete() -> None:
     for t in range(100_000):
         series.add(float(t), error_m=0.001, expected_m=None, pairs_per_s=10.0, predict_s=None)
     t = series.document.t
-    assert LARGEST_SERIES / 4 < len(t) <= LARGEST_SERIES
+    assert _Settings.largest_series / 4 < len(t) <= _Settings.largest_series
     assert t[0] < 1000 < 99_000 < t[-1]
     assert np.ptp(np.diff(t)) == 0
 
@@ -125,15 +125,15 @@ def test_segment_counts_allow_an_unseen_beginning() -> None:
 
 def test_only_newest_pairs_of_store_are_kept() -> None:
     recent = RecentPairs()
-    recent.add(pair(seq) for seq in range(1, 2 * KEPT))
-    assert (len(recent), recent.newest.seq) == (KEPT, 2 * KEPT - 1)
+    recent.add(pair(seq) for seq in range(1, 2 * RecentSettings.kept))
+    assert (len(recent), recent.newest.seq) == (RecentSettings.kept, 2 * RecentSettings.kept - 1)
 
 
 def test_cloud_is_even_sample_of_current_tool() -> None:
     recent = RecentPairs()
     recent.add(pair(seq) for seq in range(1, 2501))
     chosen = [chosen.seq for chosen in recent.chosen(500, 2400)]
-    assert (len(chosen), chosen[0], chosen[-1]) == (LARGEST_CLOUD, 501, 2400)
+    assert (len(chosen), chosen[0], chosen[-1]) == (RecentSettings.largest_cloud, 501, 2400)
 
 
 def test_a_residual_is_measured_less_predicted() -> None:

@@ -36,7 +36,7 @@ bodies = st.sampled_from([b'{"process": "sampler", "command": "pause"}', b"[" * 
 @pytest.fixture(scope="module", autouse=True)
 def short_heartbeat() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("bodyschema.dashboard.app.HEARTBEAT_S", 0.01)
+        patch.setattr("bodyschema.dashboard.app.AppSettings.heartbeat_s", 0.01)
         yield
 
 

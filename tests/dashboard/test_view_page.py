@@ -13,7 +13,7 @@ import pytest
 httpx = pytest.importorskip("httpx")
 pytest.importorskip("starlette")
 
-from bodyschema.dashboard.app import LARGEST_BODY, STATIC, application  # noqa: E402
+from bodyschema.dashboard.app import STATIC, AppSettings, application  # noqa: E402
 from bodyschema.dashboard.documents import BodyDocument  # noqa: E402
 from bodyschema.dashboard.hub import MOST_FOLLOWERS, Hub  # noqa: E402
 from bodyschema.interfaces.errors import BusError, RequestError  # noqa: E402
@@ -210,7 +210,7 @@ def test_another_page_may_not_read_here_either(ask, address: str) -> None:
         b'{"process": "sampler", "command": "zero_force_off"}',
         b'{"process": "camera", "command": "pause"}',
         b'{"process": "sampler", "command": "pause", "also": 1}',
-        b'{"process": "sampler", "command": "pause"}' + b" " * LARGEST_BODY,
+        b'{"process": "sampler", "command": "pause"}' + b" " * AppSettings.largest_body,
     ],
 )
 def test_unknown_command_is_refused_without_effect(ask, processes, body: bytes) -> None:

@@ -10,7 +10,7 @@ import pytest
 from small_arm import ROBOT, URDF
 
 from bodyschema.dashboard import shapes
-from bodyschema.dashboard.shapes import MOST_TRIANGLES, Body, mesh_buffer, read_shapes
+from bodyschema.dashboard.shapes import Body, _Settings, mesh_buffer, read_shapes
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.meshes import stl_bytes
 
@@ -166,7 +166,7 @@ def test_files_that_are_no_meshes_are_not_read(tmp_path, name: str, monkeypatch)
 
 
 def test_heavy_meshes_become_light(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(shapes, "MOST_TRIANGLES", 500)
+    monkeypatch.setattr(shapes._Settings, "most_triangles", 500)
     robot(tmp_path, mesh("a.stl"), mesh("a.stl", "1 1 -1"))
     (tmp_path / "a.stl").write_bytes(stl_bytes(ball(20)))
     found = read_shapes(tmp_path / "arm.urdf")
@@ -176,7 +176,7 @@ def test_heavy_meshes_become_light(tmp_path, monkeypatch) -> None:
 
 def test_even_triangles_that_share_nothing_stay_light() -> None:
     loose = np.random.default_rng(0).uniform(size=(100, 3, 3))
-    assert len(mesh_buffer(loose)) / 100 * MOST_TRIANGLES < 2_000_000
+    assert len(mesh_buffer(loose)) / 100 * _Settings.most_triangles < 2_000_000
 
 
 def test_a_reader_that_dies_leaves_the_other_shapes(tmp_path, monkeypatch) -> None:
@@ -187,7 +187,7 @@ def test_a_reader_that_dies_leaves_the_other_shapes(tmp_path, monkeypatch) -> No
 
 
 def test_a_reader_that_takes_too_long_is_ended(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(shapes, "READ_LIMIT_S", 0.0)
+    monkeypatch.setattr(shapes._Settings, "read_limit_s", 0.0)
     document = Body(robot(tmp_path, mesh("a.stl"))).document()
     assert "could not be read" in document.said[0]
 

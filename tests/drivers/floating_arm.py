@@ -15,7 +15,7 @@ from wire_faults import Planned
 from bodyschema.drivers.dynamixel.bench.chain import Chain
 from bodyschema.drivers.dynamixel.bench.servo import CURRENT_MODE, Servo
 from bodyschema.drivers.dynamixel.config import BusConfig, DynamixelConfig, ServoConfig
-from bodyschema.drivers.dynamixel.guard import RAMP_S
+from bodyschema.drivers.dynamixel.guard import GuardSettings
 from bodyschema.drivers.dynamixel.joints import DynamixelJoints
 from bodyschema.drivers.dynamixel.models import BY_NAME, TORQUE_AT_CURRENT
 from bodyschema.drivers.dynamixel.powered_config import FloatingJoint, ZeroForceConfig
@@ -155,7 +155,7 @@ class FloatingArm:
     def float(self) -> None:
         """Switch on, ramp in while a hand holds the arm, and then let go."""
         self.switch_on()
-        self.run(RAMP_S + 0.1)
+        self.run(GuardSettings.ramp_s + 0.1)
         self.let_go()
 
     @property

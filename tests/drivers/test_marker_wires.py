@@ -165,13 +165,13 @@ def test_motive_s_latency_is_taken_off() -> None:
 
 
 def test_bodies_without_names_go_by_their_ids(monkeypatch) -> None:
-    monkeypatch.setattr("bodyschema.drivers.markers.natnet.client.ANSWER_S", 0.2)
+    monkeypatch.setattr("bodyschema.drivers.markers.natnet.client._Settings.answer_s", 0.2)
     with NatnetServer({}) as server, streaming(server, body=2) as stream:
         assert first_fix(stream).x == pytest.approx(AT)
 
 
 def test_absent_motive_is_reported(monkeypatch) -> None:
-    monkeypatch.setattr("bodyschema.drivers.markers.natnet.client.ANSWER_S", 0.2)
+    monkeypatch.setattr("bodyschema.drivers.markers.natnet.client._Settings.answer_s", 0.2)
     with pytest.raises(SourceLost, match="no NatNet server answers on"):
         opened(kind="natnet", command_port=free_udp_port()).__enter__()
 

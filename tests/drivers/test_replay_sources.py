@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from bodyschema.drivers.replay import AHEAD, Replay
+from bodyschema.drivers.replay import Replay, ReplaySettings
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.errors import SourceEnded, SourceError
 from bodyschema.interfaces.protocols import JointSource, MarkerSource
@@ -114,7 +114,7 @@ def test_neither_side_runs_away_from_the_other(leader: str) -> None:
     replay = Replay(recording(100), speed=0)
     with replay.joints as joints, replay.marker as marker:
         first, second = (joints, marker) if leader == "joints" else (marker, joints)
-        assert len(drain(first)) == AHEAD
+        assert len(drain(first)) == ReplaySettings.rows_ahead
         second.read(0.0)
         assert len(drain(first)) == 1
 

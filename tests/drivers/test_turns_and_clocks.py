@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from bodyschema.drivers.device_clock import DeviceClock, StreamClock
-from bodyschema.drivers.serial_line import DEFAULT_LATENCY_S, adapter_latency_s
+from bodyschema.drivers.serial_line import SerialLineSettings, adapter_latency_s
 from bodyschema.drivers.turns import SpeedGate, nearest_turn
 
 
@@ -71,7 +71,7 @@ def test_event_of_another_time_is_refused_harmlessly(late_s) -> None:
 def test_adapter_latency_comes_from_system_if_known(tmp_path) -> None:
     (tmp_path / "ttyUSB7").write_text("16\n")
     assert adapter_latency_s("/dev/ttyUSB7", str(tmp_path / "{}")) == 16e-3
-    assert adapter_latency_s("/dev/ttyACM0", str(tmp_path / "{}")) == DEFAULT_LATENCY_S
+    assert adapter_latency_s("/dev/ttyACM0", str(tmp_path / "{}")) == SerialLineSettings.default_latency_s
 
 
 @pytest.mark.parametrize("held_s", [1e-3, 16e-3])

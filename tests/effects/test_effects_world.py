@@ -10,7 +10,7 @@ from effect_arms import arm, everywhere, sized, walk
 
 from bodyschema.effects import EFFECT_TYPES, Motion, Simulation
 from bodyschema.sim_backend import ErrorConfig, SimConfig
-from bodyschema.sim_backend.posed import PERIOD_S, PosedWorld
+from bodyschema.sim_backend.posed import PosedWorld, _Settings
 
 CLOSE_M = 1e-6
 NO_ERRORS = ErrorConfig(
@@ -42,7 +42,9 @@ def shown(simulation: Simulation, postures, monkeypatch):
 
 
 def rows(postures) -> Motion:
-    return Motion(postures, PERIOD_S * np.arange(1.0, len(postures) + 1), np.zeros(len(postures), dtype=np.int64))
+    return Motion(
+        postures, _Settings.period_s * np.arange(1.0, len(postures) + 1), np.zeros(len(postures), dtype=np.int64)
+    )
 
 
 def test_a_simulation_that_has_run_can_be_pickled(robot) -> None:

@@ -95,7 +95,7 @@ def test_progress_prints_line_per_finished_recording(told: tuple[object, str, st
 
 def test_silent_scheduler_error_names_address(folder: Path, endpoint: str) -> None:
     address = endpoint.replace("tcp/", "tcp://")
-    with mock.patch("bodyschema.fleet.diagnosing.CONNECT_LIMIT_S", 0.5):
+    with mock.patch("bodyschema.fleet.diagnosing._Settings.connect_limit_s", 0.5):
         code, _, err = fleet(folder / "left.csv", "--robot", DESK_ARM, "--scheduler", address)
     assert code == 1
     assert f"no Dask scheduler answers on {address}" in err

@@ -13,7 +13,7 @@ from test_calibration import DESK_ARM, figures_of
 import bodyschema.daemon.learner.findings
 from bodyschema.calibration.chain_figures import ChainFigures, is_told, no_surer_than_possible
 from bodyschema.calibration.plausibility.verdict import FEWEST_ROWS
-from bodyschema.daemon.learner.findings import EVERY_S, SHARE, Findings, FindingTurns, figures
+from bodyschema.daemon.learner.findings import Findings, FindingTurns, _Settings, figures
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.data_outlook import LearnerEvidence, Scatter, forecast
@@ -302,7 +302,7 @@ def test_findings_renew_with_new_chain_after_the_interval() -> None:
     rested.append(findings.at_rest)
     findings.renew()
     assert findings.calibration is first
-    clock.time += EVERY_S
+    clock.time += _Settings.every_s
     findings.renew()
     assert findings.calibration.pairs > first.pairs
     assert rested == [False, True, False]  # they rest only while they are of the present chain
@@ -327,7 +327,7 @@ def test_of_several_robots_one_finds_at_a_time() -> None:
     for findings in found:
         findings.renew()
     assert [findings.calibration is not None for findings in found] == [True, False]
-    clock.time += SHARE * Slow.TICK_S
+    clock.time += _Settings.share * Slow.TICK_S
     found[1].renew()
     assert found[1].calibration is not None
 
@@ -337,7 +337,7 @@ def test_the_same_chain_is_not_gone_through_twice() -> None:
     findings = findings_of(arm, clock)
     findings.renew()
     first = findings.calibration
-    clock.time += 10.0 * EVERY_S
+    clock.time += 10.0 * _Settings.every_s
     findings.renew()
     assert findings.calibration is first
 

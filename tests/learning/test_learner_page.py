@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from bodyschema.daemon.config import LARGEST_MAP
+from bodyschema.daemon.config import _Settings
 from bodyschema.learning.changes.outlier_gate import CHANGE, DOUBT, FEWEST_FOR_CHANGE
 from bodyschema.learning.model_bank import TRUSTED
 from bodyschema.learning.nominal import PAIRS_TO_REFIT
@@ -29,7 +29,7 @@ def test_the_page_s_numbers_are_the_code_s() -> None:
     assert f"or any {words[CHANGE]} outliers in a row" in text
     assert f"After {words[PAIRS_TO_REFIT]} samples (at once if the change was detected)" in text
     assert f"at {LARGEST_NET:,} control points" in text
-    assert f"the other models at {LARGEST_MAP:,} (twelve)" in text
+    assert f"the other models at {_Settings.largest_map:,} (twelve)" in text
     assert f"the newest {WINDOW:,} samples" in text
     assert f"within {words[round(57.29578 * REGION_RAD)]} degrees a joint" in text
     assert ("less than a quarter of the prior's variance" in text) == (IN_SUPPORT == 0.25)

@@ -11,7 +11,7 @@ from bodyschema.robot import meshes
 from bodyschema.robot.meshes import MeshError, read_mesh, stl_bytes
 from bodyschema.sim_backend import SimConfig
 from bodyschema.sim_backend.bullet import Body
-from bodyschema.sim_backend.physics_urdf import MOST_LINKS, MOST_TRIANGLES, Meshes, physics_urdf
+from bodyschema.sim_backend.physics_urdf import Meshes, UrdfSettings, physics_urdf
 from bodyschema.sim_backend.truth import TrueRobot
 
 WEDGE = np.array([[[0, 0, 0], [0, 2, 0], [3, 0, 0]], [[0, 0, 0], [3, 0, 0], [0, 0, 5]]], dtype=float)
@@ -158,7 +158,7 @@ def test_heavy_meshes_keep_their_shape(tmp_path) -> None:
     names = [known.add("ball.stl", (1.0, 1.0, scale), drawn=True) for scale in (1.0, 1.0, -2.0)]
     files, said = known.files()
     shapes = [triangles_of(files[name]) for name in names]
-    assert MOST_TRIANGLES / 4 < sum(map(len, shapes)) <= MOST_TRIANGLES
+    assert UrdfSettings.most_triangles / 4 < sum(map(len, shapes)) <= UrdfSettings.most_triangles
     assert said.startswith("the meshes have 86,400 triangles")
     radii = np.linalg.norm(shapes[0], axis=2)
     assert np.abs(radii - 0.1).max() < 0.004
@@ -350,7 +350,11 @@ def frame(name):
     [
         ("", "300 0 0", "joint 'turn' is 300 m from the joint before it. Give metres"),
         (frame("x" * 1001), "0.3 0 0", "longer than 1000 bytes"),
-        ("".join(frame(f"l{k}") for k in range(MOST_LINKS)), "0.3 0 0", f"up to {MOST_LINKS} links, this one has"),
+        (
+            "".join(frame(f"l{k}") for k in range(UrdfSettings.most_links)),
+            "0.3 0 0",
+            f"up to {UrdfSettings.most_links} links, this one has",
+        ),
     ],
 )
 def test_robots_that_pybullet_cannot_take_are_refused(tmp_path, more, offset, message) -> None:

@@ -18,7 +18,7 @@ from bodyschema.vision.cameras.image_roll import ImageRoll
 from bodyschema.vision.cameras.look import of_image
 from bodyschema.vision.cameras.opened import eyes_of
 from bodyschema.vision.cameras.pairing import Pairing, Shot
-from bodyschema.vision.cameras.stamps import TRIALS, Stamps
+from bodyschema.vision.cameras.stamps import Stamps, _Settings
 from bodyschema.vision.cameras.v4l2.serials import connected, serial_of
 
 FILE = Path("robot.toml")
@@ -88,7 +88,7 @@ def stamped(pairs: list[tuple[float, float]]) -> tuple[Stamps, list[float | None
 def test_believable_stamps_are_taken_once_some_were_seen() -> None:
     stamps, times = stamped([(1.0 + k, 1.03 + k) for k in range(5)])
     assert stamps.source == "kernel"
-    assert times == [None] * (TRIALS - 1) + [1.0 + k for k in range(TRIALS - 1, 5)]
+    assert times == [None] * (_Settings.trial_frames - 1) + [1.0 + k for k in range(_Settings.trial_frames - 1, 5)]
 
 
 @pytest.mark.parametrize("kernel", [lambda k: 0.0, lambda k: 1.7e9 + k, lambda k: 5.0, lambda k: 1.2 + k])

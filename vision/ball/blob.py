@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray, ImageArray, Reason
 from bodyschema.vision.config import VisionConfig
-from bodyschema.vision.image_checks import WHITE
+from bodyschema.vision.image_checks import ImageSettings
 
 from .colour import Gate
 from .outline import Outline, fit_outline, refine_outline
@@ -211,7 +211,7 @@ def _level(image: ImageArray, box: Region, centre_px: FloatArray, radius_px: flo
 
 def _washed_out(image: ImageArray, patch: Patch) -> bool:
     """Return True if much of the ball is white in all channels, so that neither colour nor shading is usable."""
-    white = cv2.inRange(patch.box.crop(image), (WHITE,) * 3, (255,) * 3)
+    white = cv2.inRange(patch.box.crop(image), (ImageSettings.white,) * 3, (255,) * 3)
     if cv2.countNonZero(white) <= _Settings.most_white * np.pi / 4 * white.size:
         return False
     # The corners of the box show the background.

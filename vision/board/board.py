@@ -19,9 +19,12 @@ Pattern = Literal["charuco", "chessboard"]
 MARKER_SHARE = 0.75
 SIZES = (50, 100, 250, 1000)
 _DICTIONARY = re.compile(r"(?:[4-7]X[4-7]_(?:50|100|250|1000)|ARUCO_ORIGINAL|APRILTAG_(?:16h5|25h9|36h10|36h11))")
-_MOST_COLUMNS = 24
-# Allowed deviation of a marker's corners from a perspective image of a plane, due to lens distortion [sides].
-_FITTING = 0.25
+
+
+class _Settings:
+    most_columns = 24  # of another board that is tried
+    # Allowed deviation of a marker's corners from a perspective image of a plane, due to lens distortion [sides].
+    fitting_sides = 0.25
 
 
 @dataclass(frozen=True)
@@ -146,11 +149,14 @@ def squares_seen(numbers: Sequence[int], corners_px: Sequence[FloatArray], board
         corners_px: their corners, shape (4, 2) each, clockwise from the upper left.
     """
     seen = np.stack(corners_px)
-    if max(numbers) < len(board.marker_squares) and _misfit(numbers, seen, board.columns, board) < _FITTING:
+    if (
+        max(numbers) < len(board.marker_squares)
+        and _misfit(numbers, seen, board.columns, board) < _Settings.fitting_sides
+    ):
         return None
-    fits = {columns: _misfit(numbers, seen, columns, board) for columns in range(3, _MOST_COLUMNS + 1)}
+    fits = {columns: _misfit(numbers, seen, columns, board) for columns in range(3, _Settings.most_columns + 1)}
     columns = min(fits, key=lambda each: fits[each])
-    if fits[columns] > _FITTING:
+    if fits[columns] > _Settings.fitting_sides:
         return f"{board.columns}x{board.rows}"
     rows = max(_place(number, columns)[1] for number in numbers) + 1
     return f"{columns}x{max(rows, 3)}"

@@ -14,7 +14,7 @@ from bodyschema.interfaces.records import FloatArray, ImageArray
 
 from .board import SIZES, Board, dictionary, smallest_size, squares_seen
 from .refine import refined
-from .sharpness import MOST_BLUR_PX, blur_px, image_fault
+from .sharpness import SharpnessSettings, blur_px, image_fault
 
 IntArray = NDArray[np.int64]
 Why = Literal[
@@ -23,9 +23,13 @@ Why = Literal[
 # Reasons that mean that another board is in view.
 OTHER_BOARD: tuple[Why, ...] = ("mirrored", "other_dictionary", "other_pattern", "other_squares")
 
-_LEAST_CORNERS = 6
-_LEAST_MARKERS = 3
-_SMALLEST_GRID = (4, 3)  # corners of an unknown chessboard: smaller ones are found in any texture
+
+class _Settings:
+    least_corners = 6  # of a usable image
+    least_markers = 3  # that show which board is in view
+    smallest_grid = (4, 3)  # corners of an unknown chessboard: smaller ones are found in any texture
+
+
 _FAMILIES = ("4X4_1000", "5X5_1000", "6X6_1000", "7X7_1000", "APRILTAG_36h11", "ARUCO_ORIGINAL")
 
 
@@ -77,7 +81,7 @@ class BoardDetector:
             fault = image_fault(grey)
             return found if fault is None else NotFound(*fault)
         blur = blur_px(grey, self.board, found.numbers, found.px)
-        if blur > MOST_BLUR_PX:
+        if blur > SharpnessSettings.most_blur_px:
             text = f"blurred: edges have a 1-sigma of {blur:.1f} px. Hold the board still, focus, shorten the exposure"
             return NotFound("blurred", text)
         return Corners(found.numbers, found.px, blur)
@@ -85,7 +89,7 @@ class BoardDetector:
     def _marked(self, grey: ImageArray) -> Corners | NotFound:
         px, numbers, marker_px, marker_numbers = self._charuco.detectBoard(grey)  # pyright: ignore
         markers = [] if marker_numbers is None else [int(number) for number in np.ravel(marker_numbers)]
-        if len(markers) >= _LEAST_MARKERS:
+        if len(markers) >= _Settings.least_markers:
             seen = squares_seen(
                 markers, [np.reshape(each, (4, 2)).astype(np.float64) for each in marker_px], self.board
             )
@@ -95,12 +99,12 @@ class BoardDetector:
                 if seen == wanted:
                     text = "the markers are not where this board has them: bent, or not made by this program"
                 return self._mirrored(grey, len(markers)) or NotFound("other_squares", text)
-        if numbers is None or len(numbers) < _LEAST_CORNERS:
+        if numbers is None or len(numbers) < _Settings.least_corners:
             return self._nothing(grey, len(markers))
         order = np.argsort(np.ravel(numbers))
         rough = np.ravel(numbers)[order].astype(np.int64), np.reshape(px, (-1, 2))[order].astype(np.float64)
         found = refined(grey, self.board, *rough)
-        return Corners(*found) if len(found[0]) >= _LEAST_CORNERS else self._nothing(grey, len(markers))
+        return Corners(*found) if len(found[0]) >= _Settings.least_corners else self._nothing(grey, len(markers))
 
     def _nothing(self, grey: ImageArray, markers: int) -> NotFound:
         mirrored = self._mirrored(grey, markers)
@@ -123,7 +127,7 @@ class BoardDetector:
     def _mirrored(self, grey: ImageArray, markers: int) -> NotFound | None:
         """Return the fault if a mirrored image has more markers; some of them mirrored look like others."""
         mirrored = _markers(np.ascontiguousarray(grey[:, ::-1]), self.board.dictionary_name)
-        if len(mirrored) < max(_LEAST_MARKERS, markers + 1):
+        if len(mirrored) < max(_Settings.least_markers, markers + 1):
             return None
         return NotFound("mirrored", "the board is mirrored: print it again as it is, or mirror the images back")
 
@@ -163,7 +167,7 @@ class BoardDetector:
         for names in self._tried(grey, families):
             seen = {name: _markers(grey, name) for name in names if name != wanted}
             best = max(seen, key=lambda name: len(seen[name]), default="")
-            if best and len(seen[best]) >= _LEAST_MARKERS:
+            if best and len(seen[best]) >= _Settings.least_markers:
                 self._other_family = best
                 bits, _, size = best.partition("_")
                 return f"{bits}_{smallest_size(max(seen[best]) + 1)}" if size == str(SIZES[-1]) else best
@@ -175,7 +179,9 @@ class BoardDetector:
             yield [self._other_family]
         largest, smallest = f"_{SIZES[-1]}", f"_{SIZES[0]}"
         sized = [name for name in families if name.endswith(largest)]
-        yield [name for name in sized if len(_markers(grey, name.replace(largest, smallest))) >= _LEAST_MARKERS]
+        yield [
+            name for name in sized if len(_markers(grey, name.replace(largest, smallest))) >= _Settings.least_markers
+        ]
         yield list(families)
 
 
@@ -196,7 +202,7 @@ def _plain_squares(grey: ImageArray) -> tuple[int, int] | None:
 
 def any_grid(grey: ImageArray) -> FloatArray | None:
     """Return the corners (rows, columns, 2) [px], more columns than rows, of as much of a chessboard as is in view."""
-    found, px, grid = cv2.findChessboardCornersSBWithMeta(grey, _SMALLEST_GRID, cv2.CALIB_CB_LARGER)
+    found, px, grid = cv2.findChessboardCornersSBWithMeta(grey, _Settings.smallest_grid, cv2.CALIB_CB_LARGER)
     if not found:
         return None
     corners = np.reshape(np.asarray(px, dtype=np.float64), (*np.shape(grid)[:2], 2))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.vision.printing.sheet import AROUND_MM, Page, Rectangle, pattern, sheets
+from bodyschema.vision.printing.sheet import Layout, Page, Rectangle, pattern, sheets
 from bodyschema.vision.printing.sheet import page as drawn_page
 
 from .board import Board, marker_bits
@@ -20,7 +20,8 @@ def page(board: Board, paper: str = "A4") -> Page:
     width, height = (1e3 * side for side in board.size_m)
     made = drawn_page((width, height), paper, board.name, [*_squares(board), *_markers(board)])
     if made is None:
-        largest = max(min((w - AROUND_MM) / board.columns, (h - AROUND_MM) / board.rows) for w, h in sheets(paper))
+        around = Layout.around_mm
+        largest = max(min((w - around) / board.columns, (h - around) / board.rows) for w, h in sheets(paper))
         raise ConfigError(
             f"{board.columns}x{board.rows} squares of {1e3 * board.square_m:g} mm with rulers do not fit on {paper}",
             remedy=f"There is room for squares of {math.floor(2 * largest) / 2:g} mm; or take larger paper",

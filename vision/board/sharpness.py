@@ -14,10 +14,11 @@ from bodyschema.vision.image_checks import is_black, too_white
 
 from .board import Board
 
-_ALONG = 0.3  # of a square: where edges are sampled, away from corner and marker
-_STEEPEST = 0.999
-# Corner accuracy is a small share of the edge width; with more blur that share is too large.
-MOST_BLUR_PX = 2.5
+
+class SharpnessSettings:
+    along = 0.3  # of a square: where edges are sampled, away from corner and marker
+    steepest = 0.999  # quantile of the slopes that counts as the steepest
+    most_blur_px = 2.5  # corner accuracy is a small share of the edge width; with more blur that share is too large
 
 
 def blur_px(grey: ImageArray, board: Board, numbers: NDArray[np.int64], px: FloatArray) -> float:
@@ -41,7 +42,7 @@ def _across(grey: ImageArray, numbers: NDArray[np.int64], px: FloatArray, board:
     if not pairs:
         return 0.0
     first, second = px[[a for a, _ in pairs]], px[[b for _, b in pairs]]
-    middle = first + _ALONG * (second - first)
+    middle = first + SharpnessSettings.along * (second - first)
     along = second - first
     normal = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1)[:, None]
     levels = _sampled(grey, np.stack([middle - normal, middle + normal]))
@@ -60,7 +61,7 @@ def sharpest_edge_px(grey: FloatArray) -> float:
     right, down = smooth[1:-1, 2:] - smooth[1:-1, :-2], smooth[2:, 1:-1] - smooth[:-2, 1:-1]
     low, high = np.quantile(smooth, [0.01, 0.99])
     directions = (right, down, (right + down) / np.sqrt(2.0), (right - down) / np.sqrt(2.0))
-    steepest = min(float(np.quantile(np.abs(each), _STEEPEST)) for each in directions)
+    steepest = min(float(np.quantile(np.abs(each), SharpnessSettings.steepest)) for each in directions)
     return _sigma(steepest / max(high - low, 1.0))
 
 
@@ -90,6 +91,6 @@ def image_fault(grey: ImageArray) -> tuple[Literal["dark", "over_exposed", "blur
     if (white := too_white(grey)) is not None:
         return "over_exposed", f"over-exposed: {white:.0%} of the image is white. Shorten the exposure, less light"
     edge = sharpest_edge_px(np.asarray(grey, dtype=np.float64))
-    if edge > MOST_BLUR_PX:
+    if edge > SharpnessSettings.most_blur_px:
         return "blurred", f"blurred: the sharpest edge has a 1-sigma of {edge:.1f} px. Focus; hold the board still"
     return None

@@ -16,9 +16,13 @@ from .guidance import Coverage
 from .image_pairs import ImagePair, require_equal_sizes
 from .view import EYES, ONE_EYE, Eye, View, image_of
 
-_MOST_NAMES = 4
-# Number of pairs after which another board is certain, and interval of progress messages.
-_SURE_PAIRS, _TOLD_PAIRS = 3, 10
+
+class _Settings:
+    most_names = 4  # of images in a message
+    # Number of pairs after which another board is certain, and interval of progress messages.
+    sure_pairs, told_pairs = 3, 10
+
+
 _NUMBERS = re.compile(r"\d+(\.\d+)?")
 
 
@@ -75,9 +79,13 @@ def gathered(pairs: Iterable[ImagePair], board: Board, tell: Callable[[str], Non
         found.unusable += unusable
         if view.left is not None or view.right is not None:
             found.add(view, pair)
-        if number == _SURE_PAIRS and not found.views and all(one.fault.why in OTHER_BOARD for one in found.unusable):
+        if (
+            number == _Settings.sure_pairs
+            and not found.views
+            and all(one.fault.why in OTHER_BOARD for one in found.unusable)
+        ):
             break
-        if number % _TOLD_PAIRS == 0:
+        if number % _Settings.told_pairs == 0:
             tell(f"{number} pairs looked at; the board is in {len(found.views)}")
     for line in summarised(found.unusable, found.eyes):
         tell(line)
@@ -101,9 +109,9 @@ def _kind(unusable: Unusable) -> str:
 
 def _named(group: Sequence[Unusable]) -> str:
     names = [each.name for each in group]
-    if len(names) <= _MOST_NAMES:
+    if len(names) <= _Settings.most_names:
         return ", ".join(names)
-    return f"{', '.join(names[: _MOST_NAMES - 1])} and {len(names) - _MOST_NAMES + 1} more"
+    return f"{', '.join(names[: _Settings.most_names - 1])} and {len(names) - _Settings.most_names + 1} more"
 
 
 def _usual(texts: Sequence[str]) -> str:

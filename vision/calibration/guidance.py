@@ -17,11 +17,8 @@ from .settings import ViewSettings as _Settings
 from .start import pose_of
 from .view import EYES, Eye, View, all_px, image_of, seen_by
 
-GRID = (3, 3)
 _ROWS, _COLUMNS = ("upper", "middle", "lower"), ("left", "middle", "right")
-CORNERS_A_CELL = 8
-TILTED_EACH_WAY = 2
-WANTED_VIEWS = 20
+GRID = (len(_ROWS), len(_COLUMNS))
 
 
 @dataclass(frozen=True)
@@ -50,7 +47,7 @@ class Coverage:
 
     def covered(self, eye: Eye) -> NDArray[np.bool_]:
         """Return the cells of an eye's image that have enough corners, shape (3, 3)."""
-        return self.cells[self.eyes.index(eye)] >= CORNERS_A_CELL
+        return self.cells[self.eyes.index(eye)] >= _Settings.corners_a_cell
 
     @property
     def largest_tilts_deg(self) -> FloatArray:
@@ -64,9 +61,9 @@ class Coverage:
     @property
     def progress(self) -> float:
         """Share of the wanted coverage that is reached, 0 to 1."""
-        wanted = len(self.tilted()) + len(self.eyes) * GRID[0] * GRID[1] + 2 + WANTED_VIEWS
+        wanted = len(self.tilted()) + len(self.eyes) * GRID[0] * GRID[1] + 2 + _Settings.wanted_views
         lacking = len(self._tilts_missing()) + len(self._cells_missing()) + len(self._distances_missing())
-        return 1.0 - (lacking + max(WANTED_VIEWS - self.whole_views, 0)) / wanted
+        return 1.0 - (lacking + max(_Settings.wanted_views - self.whole_views, 0)) / wanted
 
     def tilted(self) -> dict[str, int]:
         """Return the number of views in which each edge of the board is farther away than the opposite one."""
@@ -93,7 +90,7 @@ class Coverage:
         return [
             f"tilt the board's {edge} edge away from the camera{'s' * (len(self.eyes) > 1)}, by 30°"
             for edge, count in self.tilted().items()
-            if count < TILTED_EACH_WAY
+            if count < _Settings.tilted_each_way
         ]
 
     def _cells_missing(self) -> list[str]:
@@ -112,7 +109,7 @@ class Coverage:
         return texts
 
     def _views_missing(self) -> list[str]:
-        lacking = WANTED_VIEWS - self.whole_views
+        lacking = _Settings.wanted_views - self.whole_views
         return [f"{lacking} more view{'s' if lacking > 1 else ''}, tilted and anywhere"] if lacking > 0 else []
 
 

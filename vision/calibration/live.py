@@ -13,7 +13,7 @@ from bodyschema.interfaces.records import StereoFrame
 from bodyschema.vision.board import Board, BoardDetector
 
 from .gather import Detector, Gathered, Unusable, eyes_of, looked_at
-from .guidance import CORNERS_A_CELL, cell_counts, rough_tilt_deg
+from .guidance import cell_counts, rough_tilt_deg
 from .image_pairs import ImagePair
 from .settings import ViewSettings as _Settings
 from .view import EYES, Eye, View, all_px
@@ -88,7 +88,7 @@ class LiveViews:
 
     def _fills(self, view: View, eye: Eye) -> bool:
         """Return True if an eye sees the board in a part of its image that is not covered yet."""
-        shown = cell_counts(all_px([view], eye), self.found.image_size_px) >= CORNERS_A_CELL
+        shown = cell_counts(all_px([view], eye), self.found.image_size_px) >= _Settings.corners_a_cell
         return bool((shown & ~self.coverage.covered(eye)).any())
 
     def _is_new(self, view: View, seeing: Sequence[Eye]) -> bool:

@@ -14,16 +14,15 @@ from .guidance import Coverage, cell_name
 from .settings import ViewSettings as _Settings
 from .view import image_of
 
-LEAST_VIEWS = 8
-
 
 def lacking(coverage: Coverage) -> list[str]:
     """Return the requirements that the views do not meet, before a fit."""
     reasons = []
     who = "both eyes saw" if len(coverage.eyes) > 1 else "the camera saw"
-    if coverage.whole_views < LEAST_VIEWS:
+    if coverage.whole_views < _Settings.least_views:
         reasons.append(
-            f"too few views: {who} the board in {coverage.whole_views}, at least {LEAST_VIEWS} are needed, 20 are good"
+            f"too few views: {who} the board in {coverage.whole_views}, at least {_Settings.least_views} are needed, "
+            f"{_Settings.wanted_views} are good"
         )
     tilted = np.count_nonzero(coverage.largest_tilts_deg > _Settings.tilted_deg)
     if coverage.whole_views and tilted < _Settings.least_tilted:

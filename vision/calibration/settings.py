@@ -36,10 +36,12 @@ class ViewSettings:
 
     They refuse a calibration or ask for more views, and change no result. Of six sets of the tests, `least_cells` and
     `least_tilted` at 3 times refuse four or five more, `tilted_deg` two; at 0.3 times none changes more than one.
-    `still_px`, `new_share` and `new_tilt_deg` were not measured.
+    `least_views`, `wanted_views`, `corners_a_cell`, `tilted_each_way`, `still_px`, `new_share` and `new_tilt_deg` were
+    not measured.
     """
 
-    least_cells = 6  # of nine, in which corners were seen
+    least_views, wanted_views = 8, 20  # seen by all eyes: fewer are refused, more are not asked for
+    least_cells, corners_a_cell = 6, 8  # of nine cells, in which so many corners were seen
     tilted_deg, least_tilted = 10.0, 3  # so many views with a tilt that tells focal length from distance
     # Sigmas are those of whole views, two to six times those of independent corners: fifteen good pairs at 640×480
     # leave 0.9 %, 0.5 % and 2.2 %. A principal point that is off turns the frame, and changes little else.
@@ -49,7 +51,7 @@ class ViewSettings:
     most_turned_rad = np.radians(45.0)  # more, and a camera lies on its side
     most_hand_error_m = 0.0015  # of a baseline measured with a ruler
     usual_focal = 0.9  # share of the image's width: focal length of a typical webcam, used before calibration
-    tilt_deg = 15.0  # of the views that are advised
+    tilt_deg, tilted_each_way = 15.0, 2  # of the views that are advised
     near, far = 0.55, 0.40  # extent of the board as a share of the image
     still_px = 1.0  # between two frames; the median of all corners
     # A view is new if its corners differ by this share of the image's width from all others, or its tilt by this angle.

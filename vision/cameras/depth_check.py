@@ -12,11 +12,13 @@ import numpy as np
 from bodyschema.interfaces.protocols import MarkerSource
 from bodyschema.interfaces.records import MarkerFix, MarkerMiss
 
-# Frames that are judged, and the share of them that has to contradict: a reflection may be taken for the marker at
-# times.
-JUDGED, MANY = 20, 0.2
-SIGMAS = 4.0
-DEPTH_ERROR = 0.02  # of the distance, as the maker promises up to 2 m
+
+class _Settings:
+    # Frames that are judged, and the share of them that has to contradict: a reflection may be taken for the marker at
+    # times.
+    frames, contradicting_share = 20, 0.2
+    sigmas = 4.0  # between the two distances: more is a contradiction
+    depth_error = 0.02  # of the distance, as the maker promises up to 2 m
 
 
 class DepthImage(Protocol):
@@ -36,19 +38,19 @@ class DepthChecked:
             in_front_m: the marker's surface is so much nearer than its centre: a ball's radius [m].
         """
         self._marker, self._depth, self._in_front_m = marker, depth, in_front_m
-        self._apart: deque[tuple[float, float, float]] = deque(maxlen=JUDGED)
+        self._apart: deque[tuple[float, float, float]] = deque(maxlen=_Settings.frames)
 
     @property
     def health(self) -> tuple[str, ...]:
         """A persistent contradiction, with what to do."""
-        wrong = [(eyes, depth) for eyes, depth, sigmas in self._apart if sigmas > SIGMAS]
-        if len(self._apart) < JUDGED or len(wrong) < MANY * JUDGED:
+        wrong = [(eyes, depth) for eyes, depth, sigmas in self._apart if sigmas > _Settings.sigmas]
+        if len(self._apart) < _Settings.frames or len(wrong) < _Settings.contradicting_share * _Settings.frames:
             return ()
         eyes, depth = np.median(wrong, axis=0)
         return (
             f"the depth image has the marker at {depth:.3f} m where the two eyes measure {eyes:.3f} m, in {len(wrong)} "
-            f"of {JUDGED} frames: is something else taken for the marker? If not, run the device's own calibration "
-            "(RealSense Viewer, On-Chip Calibration)",
+            f"of {_Settings.frames} frames: is something else taken for the marker? If not, run the device's own "
+            "calibration (RealSense Viewer, On-Chip Calibration)",
         )
 
     def __enter__(self) -> Self:
@@ -68,6 +70,6 @@ class DepthChecked:
             surface = self._depth.depth_m(*seen.centres_px[:2])
             if surface is not None:
                 depth, eyes = surface + self._in_front_m, float(seen.x[2])
-                sigma = math.hypot(math.sqrt(float(seen.cov[2, 2])), DEPTH_ERROR * eyes)
+                sigma = math.hypot(math.sqrt(float(seen.cov[2, 2])), _Settings.depth_error * eyes)
                 self._apart.append((eyes, depth, abs(depth - eyes) / sigma))
         return seen

@@ -23,8 +23,10 @@ from .v4l2.capture import Capture
 from .v4l2.device import CameraDevice, OpenCapture, open_v4l2
 from .v4l2.serials import serial_of
 
-FIRST_IMAGE_S = 5.0
-MANY_APART = 10
+
+class _Settings:
+    first_image_s = 5.0  # longest wait for the first whole image of each camera
+    unpaired_images = 10  # more suggest that the two cameras run at different rates
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,12 +129,12 @@ class LiveEyes:
     def _await_first(self) -> None:
         """Raise SourceLost if an opened camera sends nothing."""
         with self._changed:
-            self._changed.wait_for(lambda: not self._missing() or self._failed() is not None, FIRST_IMAGE_S)
+            self._changed.wait_for(lambda: not self._missing() or self._failed() is not None, _Settings.first_image_s)
         if (failure := self._failed()) is not None:
             raise failure
         for capture in self._missing():
             raise SourceLost(
-                f"the {capture.device.name} sent no whole image within {FIRST_IMAGE_S:.0f} s "
+                f"the {capture.device.name} sent no whole image within {_Settings.first_image_s:.0f} s "
                 f"({capture.device.damaged} damaged ones). Try another cable, a port of its own, or a smaller "
                 "image_size_px"
             )
@@ -188,7 +190,7 @@ class LiveEyes:
                 )
             if device.damaged > capture.look.frames:
                 yield f"the {device.name} sends more damaged images than whole ones: try another cable or port"
-        if self._pairing.too_far > MANY_APART and self._pairing.apart_s is not None:
+        if self._pairing.too_far > _Settings.unpaired_images and self._pairing.apart_s is not None:
             yield (
                 f"{self._pairing.too_far} times the two eyes' images were too far apart, last "
                 f"{1e3 * self._pairing.apart_s:.0f} ms: do both cameras have the same fps and exposure_s?"

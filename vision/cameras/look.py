@@ -11,16 +11,18 @@ import numpy as np
 from bodyschema.interfaces.records import ImageArray
 from bodyschema.vision.image_checks import is_black, too_white
 
-EVERY_S = 0.5  # an image is looked at
-OVER_S = 3.0  # the frame rate is measured
-FEWEST = 5  # frames that make a rate
-SLOW = 0.8  # of the configured rate
-STEP_PX = 8  # between the pixels that are looked at
+
+class LookSettings:
+    every_s = 0.5  # interval between two images that are looked at
+    rate_over_s = 3.0  # time over which the frame rate is measured
+    fewest_frames = 5  # that make a rate
+    slow_share = 0.8  # of the configured rate
+    step_px = 8  # between the pixels that are looked at
 
 
 def of_image(image: ImageArray, name: str) -> str | None:
     """Return what is wrong with the light in an image, or None."""
-    levels = image[::STEP_PX, ::STEP_PX]
+    levels = image[:: LookSettings.step_px, :: LookSettings.step_px]
     if is_black(levels):
         return f"the {name}'s image is black: is the lens cap on? Else more light, or a longer exposure_s"
     if (white := too_white(levels.min(axis=2))) is not None:
@@ -43,9 +45,9 @@ class Look:
         """Check the newest image, taken at the time t [s]."""
         self.frames += 1
         self._times.append(t)
-        while self._times[-1] - self._times[0] > OVER_S:
+        while self._times[-1] - self._times[0] > LookSettings.rate_over_s:
             self._times.popleft()
-        if t - self._looked_s >= EVERY_S:
+        if t - self._looked_s >= LookSettings.every_s:
             self._looked_s = t
             self._light = of_image(image, self._name)
             self.fps = self._rate()
@@ -55,14 +57,14 @@ class Look:
 
         Single lost frames do not change the median, but a camera that loses every second one is slow.
         """
-        if len(self._times) < FEWEST:
+        if len(self._times) < LookSettings.fewest_frames:
             return None
         return 1.0 / float(np.median([later - earlier for earlier, later in pairwise(self._times)]))
 
     def complaints(self) -> Iterator[str]:
         """Yield each problem with its remedy."""
         fps = self.fps
-        if fps is not None and fps < SLOW * self._fps:
+        if fps is not None and fps < LookSettings.slow_share * self._fps:
             yield (
                 f"the {self._name} sends {fps:.1f} frames/s instead of {self._fps:g}: shorten exposure_s, take fourcc "
                 '"MJPG" or a smaller image, give it a USB port of its own, or set buffers = 2'

@@ -22,9 +22,13 @@ from bodyschema.interfaces.waits import SILENT_AFTER_S
 from .config import CamerasConfig, RealsenseConfig
 from .stamps import Stamps
 
-WAITING = 16  # images in the SDK's queue: five frames of three images
-SKEW = 1e-3  # of rectified images: different focal lengths or turned eyes, relative or [rad]
-WINDOW_PX = 3  # around the marker's centre, in the depth image
+
+class _Settings:
+    queued_images = 16  # in the SDK's queue: five frames of three images
+    most_skew = 1e-3  # of rectified images: different focal lengths or turned eyes, relative or [rad]
+    window_px = 3  # around the marker's centre, in the depth image
+
+
 FindDevice = Callable[[str | None], Any]
 
 
@@ -124,7 +128,7 @@ class RealsenseCamera:
         sensor, profiles = self._profiles(device)
         self._calibration = self._seen_by(profiles["left"], profiles["right"])
         self._apply(rs, sensor)
-        self._queue = rs.frame_queue(WAITING, True)
+        self._queue = rs.frame_queue(_Settings.queued_images, True)
         self._stamps, self._parts, self.depth_image_m = Stamps(), {}, None
         try:
             sensor.open(list(profiles.values()))
@@ -177,7 +181,8 @@ class RealsenseCamera:
             return None
         row, column = round(v), round(u)
         window = self.depth_image_m[
-            max(row - WINDOW_PX, 0) : row + WINDOW_PX + 1, max(column - WINDOW_PX, 0) : column + WINDOW_PX + 1
+            max(row - _Settings.window_px, 0) : row + _Settings.window_px + 1,
+            max(column - _Settings.window_px, 0) : column + _Settings.window_px + 1,
         ]
         known = window[window > 0]
         return float(np.median(known)) if known.size else None
@@ -228,7 +233,7 @@ class RealsenseCamera:
         distortion = max(abs(value) for eye in eyes for value in eye.coeffs)
         turn = float(np.abs(np.reshape(pose.rotation, (3, 3)) - np.eye(3)).max())
         baseline_m = -pose.translation[0]
-        if max(*unlike, distortion, turn) > SKEW or baseline_m <= 0:
+        if max(*unlike, distortion, turn) > _Settings.most_skew or baseline_m <= 0:
             raise SourceError(
                 "the RealSense does not rectify these images: calibrate the eyes like two cameras (`bodyschema "
                 "calibrate cameras`), and name the file as calibration in [vision.cameras]"
@@ -254,7 +259,7 @@ class RealsenseCamera:
         part = self._parts.setdefault(number, {})
         part[name] = image
         if not {"left", "right"} <= part.keys() or (self._settings.depth_check and "depth" not in part):
-            self._parts = {key: value for key, value in self._parts.items() if key > number - WAITING}
+            self._parts = {key: value for key, value in self._parts.items() if key > number - _Settings.queued_images}
             return None
         self._parts = {key: value for key, value in self._parts.items() if key > number}
         t = self._stamps.stamp(self._on_our_clock(rs, part["left"], now), now)

@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from itertools import pairwise
 
-TRIALS = 3  # frames checked before the first is returned
-FARTHEST_S = 1.0  # largest delay from the kernel's stamp to the arrival
-KERNEL_SIGMA_S = 1e-3
-ARRIVAL_SIGMA_S = 0.02  # of arrival times: decoding, scheduling, a busy bus
+
+class _Settings:
+    trial_frames = 3  # checked before the first is returned
+    longest_delay_s = 1.0  # from the kernel's stamp to the arrival
+    kernel_sigma_s = 1e-3
+    arrival_sigma_s = 0.02  # of arrival times: decoding, scheduling, a busy bus
 
 
 class Stamps:
@@ -31,7 +33,7 @@ class Stamps:
     @property
     def sigma_s(self) -> float:
         """1-sigma of the stamps [s]."""
-        return KERNEL_SIGMA_S if self.source == "kernel" else ARRIVAL_SIGMA_S
+        return _Settings.kernel_sigma_s if self.source == "kernel" else _Settings.arrival_sigma_s
 
     def stamp(self, kernel_s: float, arrival_s: float) -> float | None:
         """Return the time of a frame [s]; None for the first ones, and for one with an implausible stamp.
@@ -42,7 +44,7 @@ class Stamps:
         """
         if self.source is None:
             self._seen.append((kernel_s, arrival_s))
-            if len(self._seen) < TRIALS:
+            if len(self._seen) < _Settings.trial_frames:
                 return None
             self.source = "kernel" if self._are_believable() else "arrival"
         t = kernel_s if self.source == "kernel" else arrival_s
@@ -59,4 +61,4 @@ class Stamps:
 
 
 def _near(kernel_s: float, arrival_s: float) -> bool:
-    return kernel_s > 0 and -KERNEL_SIGMA_S <= arrival_s - kernel_s < FARTHEST_S
+    return kernel_s > 0 and -_Settings.kernel_sigma_s <= arrival_s - kernel_s < _Settings.longest_delay_s

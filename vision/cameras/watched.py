@@ -15,8 +15,6 @@ from bodyschema.vision.trackers import tracker_of
 
 from .annotate import Annotator
 
-MOSTLY = 0.5  # share of the frames above which a reason for misses gets advice
-
 
 class WatchedCamera:
     """Camera frames annotated with the tracker's result.
@@ -66,7 +64,7 @@ class WatchedCamera:
         if self.frames:
             text += f", the marker in {self.fixes}"
         text += "".join(f"; {WORDS[reason]}: {count}" for reason, count in counts)
-        if counts and counts[0][1] > MOSTLY * self.frames:
+        if counts and counts[0][1] > 0.5 * self.frames:
             text += f". {REMEDIES[counts[0][0]]}"
         return text
 

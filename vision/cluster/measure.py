@@ -23,13 +23,15 @@ from bodyschema.vision.triangulate import triangulate
 
 from .shapes import rpy_of
 
-# A tag in a view whose corners are this many sigmas off (RMS) is none: covered, bent, or another of its number.
-_MOST_OFF = 6.0
-# ... in units of what is usual, which calibrated cameras bring to so much at most.
-_MOST_USUAL = 5.0
-# Largest share of all views, and of the views of one tag, with outliers; a single one is always allowed.
-_MOST_LEFT_OUT = 0.34
-_LEAST_VIEWS = 3
+
+class _Settings:
+    # A tag in a view whose corners are this many sigmas off (RMS) is none: covered, bent, or another of its number.
+    most_off_sigmas = 6.0
+    most_usual = 5.0  # ... in units of what is usual, which calibrated cameras bring to so much at most
+    # Largest share of all views, and of the views of one tag, with outliers; a single one is always allowed.
+    most_left_out = 0.34
+    least_views = 3  # for a rigid cluster
+
 
 Motion = tuple[FloatArray, FloatArray]  # rotation (3, 3) and place (3,) [m]
 
@@ -90,10 +92,11 @@ def measure_cluster(
             the tags do not fit one rigid body.
     """
     usable = _usable(views)
-    if len(usable) < _LEAST_VIEWS:
+    if len(usable) < _Settings.least_views:
         raise CalibrationError(
             f"{len(usable)} of {len(views)} pairs of images show two tags or more to both eyes, at least "
-            f"{_LEAST_VIEWS} are needed, 20 are good. Turn the cluster slowly, all its edges towards the cameras"
+            f"{_Settings.least_views} are needed, 20 are good. Turn the cluster slowly, all its edges towards the "
+            "cameras"
         )
     every, left_out = usable, list[tuple[str, int]]()
     while True:
@@ -104,7 +107,7 @@ def measure_cluster(
             return problem.result(left_out, [view.name for view in views if view.name not in used])
         left_out.append(worst)
         usable = _usable([_without(view, worst) for view in usable])
-        if len(usable) < _LEAST_VIEWS or _is_odd(left_out, every):
+        if len(usable) < _Settings.least_views or _is_odd(left_out, every):
             odd = _odd_one(every, calibration, side_m, other_sides_m)
             raise CalibrationError(_not_rigid(left_out, odd))
 
@@ -123,22 +126,22 @@ def _odd_one(
     fits: dict[int, float] = {}
     for id in sorted(set[int]().union(*(view.ids for view in views))):
         rest = _usable([_only(view, lambda other, id=id: other != id) for view in views])
-        if len(rest) < _LEAST_VIEWS:
+        if len(rest) < _Settings.least_views:
             continue
         with suppress(CalibrationError):
             problem = _Problem(rest, calibration, side_m, other_sides_m or {})
             if problem.worst() is None:
                 fits[id] = problem.misfit
     best = min(fits, key=lambda id: fits[id], default=None)
-    return best if best is not None and fits[best] < _MOST_USUAL else None
+    return best if best is not None and fits[best] < _Settings.most_usual else None
 
 
 def _is_odd(left_out: Sequence[tuple[str, int]], views: Sequence[ClusterView]) -> bool:
     """Return True if too many views, or too many views of one tag, have outliers for this to be chance."""
     shown, times = Counter(id for view in views for id in view.ids), Counter(id for _, id in left_out)
-    if len({name for name, _ in left_out}) > max(1.0, _MOST_LEFT_OUT * len(views)):
+    if len({name for name, _ in left_out}) > max(1.0, _Settings.most_left_out * len(views)):
         return True
-    return any(count > max(1.0, _MOST_LEFT_OUT * shown[id]) for id, count in times.items())
+    return any(count > max(1.0, _Settings.most_left_out * shown[id]) for id, count in times.items())
 
 
 def _not_rigid(left_out: Sequence[tuple[str, int]], odd: int | None) -> str:
@@ -343,7 +346,7 @@ class _Problem:
         off = {key: float(np.sqrt(np.mean(np.concatenate(each)))) for key, each in squares.items()}
         key = max(off, key=lambda each: off[each])
         usual = float(np.median(list(off.values())))
-        return key if off[key] > _MOST_OFF * min(max(usual, 1.0), _MOST_USUAL) else None
+        return key if off[key] > _Settings.most_off_sigmas * min(max(usual, 1.0), _Settings.most_usual) else None
 
     def result(self, left_out: Sequence[tuple[str, int]], unused: Sequence[str]) -> MeasuredCluster:
         """Return the solution with its uncertainty, scaled up if the residuals exceed the assumed noise."""

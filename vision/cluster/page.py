@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 
 from bodyschema.interfaces.errors import ConfigError
-from bodyschema.vision.printing.sheet import AROUND_MM, LINE_MM, TEXT_MM, Page, Rectangle, Text, page, pattern, sheets
+from bodyschema.vision.printing.sheet import Layout, Page, Rectangle, Text, page, pattern, sheets
 from bodyschema.vision.tags.config import Dictionary
 from bodyschema.vision.tags.dictionary import tag_modules
 from bodyschema.vision.tags.edge import MODULES
@@ -15,9 +15,11 @@ from .shapes import Cell, Shape
 
 # Width of a tag's face in sides of the tag: a white margin of one module all around, and a little for cutting.
 FACE_SIDES = 1.0 + 2.5 / MODULES
-_DASH_MM = 2.0
-# Gap between single tags, with room for their numbers.
-_GAP_MM = 6.0
+
+
+class _Settings:
+    dash_mm = 2.0  # of the lines to fold along, and the gap between two
+    gap_mm = 6.0  # between single tags, with room for their numbers
 
 
 def shape_page(shape: Shape, ids: Sequence[int], dictionary: Dictionary, side_mm: float, paper: str) -> Page:
@@ -40,7 +42,8 @@ def shape_page(shape: Shape, ids: Sequence[int], dictionary: Dictionary, side_mm
     name = f"{shape.name[0].upper()}{shape.name[1:]}, {dictionary} {_listed(ids)}, black squares of {side_mm:g} mm"
     made = page((columns * width, rows * width), paper, name, black)
     if made is None:
-        room = max(min((w - AROUND_MM) / columns, (h - AROUND_MM) / rows) for w, h in sheets(paper)) / FACE_SIDES
+        around = Layout.around_mm
+        room = max(min((w - around) / columns, (h - around) / rows) for w, h in sheets(paper)) / FACE_SIDES
         raise _too_large(f"{shape.name} with tags of {side_mm:g} mm", paper, room)
     return made
 
@@ -52,21 +55,21 @@ def tags_page(ids: Sequence[int], dictionary: Dictionary, side_mm: float, paper:
         ConfigError: there is no such tag or paper, or the tags do not fit.
     """
     width = FACE_SIDES * side_mm
-    pitch = width + _GAP_MM
+    pitch = width + _Settings.gap_mm
     _, (room, _) = sheets(paper)
-    columns = min(len(ids), math.floor((room - AROUND_MM + _GAP_MM) / pitch))
+    columns = min(len(ids), math.floor((room - Layout.around_mm + _Settings.gap_mm) / pitch))
     if columns < 1:
-        raise _too_large(f"a tag of {side_mm:g} mm", paper, (room - AROUND_MM) / FACE_SIDES)
+        raise _too_large(f"a tag of {side_mm:g} mm", paper, (room - Layout.around_mm) / FACE_SIDES)
     black: list[Rectangle] = []
     numbers: list[Text] = []
     for place, id in enumerate(ids):
         row, column = divmod(place, columns)
         x, y = column * pitch, row * pitch
         black += [*_tag(dictionary, id, x, y, side_mm), *_outline(x, y, width)]
-        numbers.append(Text(x, y + width + TEXT_MM + 0.5, f"{dictionary} {id}, {side_mm:g} mm"))
+        numbers.append(Text(x, y + width + Layout.text_mm + 0.5, f"{dictionary} {id}, {side_mm:g} mm"))
     rows = math.ceil(len(ids) / columns)
     name = f"{dictionary} {_listed(ids)}, black squares of {side_mm:g} mm"
-    made = page((columns * pitch - _GAP_MM, rows * pitch), paper, name, black, numbers)
+    made = page((columns * pitch - _Settings.gap_mm, rows * pitch), paper, name, black, numbers)
     if made is None:
         raise ConfigError(f"{len(ids)} tags of {side_mm:g} mm do not fit on {paper}", remedy="Print them on two pages")
     return made
@@ -85,21 +88,22 @@ def _tag(dictionary: Dictionary, id: int, x: float, y: float, side: float) -> li
 
 
 def _outline(x: float, y: float, width: float) -> list[Rectangle]:
-    long = width + LINE_MM
-    near, far = -0.5 * LINE_MM, width - 0.5 * LINE_MM
-    level = [Rectangle(x + near, y + at, long, LINE_MM) for at in (near, far)]
-    return [*level, *(Rectangle(x + at, y + near, LINE_MM, long) for at in (near, far))]
+    long = width + Layout.line_mm
+    near, far = -0.5 * Layout.line_mm, width - 0.5 * Layout.line_mm
+    level = [Rectangle(x + near, y + at, long, Layout.line_mm) for at in (near, far)]
+    return [*level, *(Rectangle(x + at, y + near, Layout.line_mm, long) for at in (near, far))]
 
 
 def _between(cell: Cell, other: Cell, width: float, *, dashed: bool) -> list[Rectangle]:
     """Return the line between two neighbouring cells, centred on their common edge."""
     column, row = max(cell[0], other[0]), max(cell[1], other[1])
     x, y = column * width, row * width
-    count = math.floor(width / (2 * _DASH_MM)) if dashed else 1
-    pieces = [((2 * k + 0.5) * _DASH_MM, _DASH_MM) for k in range(count)] if dashed else [(0.0, width)]
+    dash = _Settings.dash_mm
+    count = math.floor(width / (2 * dash)) if dashed else 1
+    pieces = [((2 * k + 0.5) * dash, dash) for k in range(count)] if dashed else [(0.0, width)]
     if cell[0] != other[0]:
-        return [Rectangle(x - 0.5 * LINE_MM, y + at, LINE_MM, long) for at, long in pieces]
-    return [Rectangle(x + at, y - 0.5 * LINE_MM, long, LINE_MM) for at, long in pieces]
+        return [Rectangle(x - 0.5 * Layout.line_mm, y + at, Layout.line_mm, long) for at, long in pieces]
+    return [Rectangle(x + at, y - 0.5 * Layout.line_mm, long, Layout.line_mm) for at, long in pieces]
 
 
 def _listed(ids: Sequence[int]) -> str:

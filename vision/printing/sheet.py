@@ -20,16 +20,15 @@ PAPERS_MM = {
     "legal": (215.9, 355.6),
     "tabloid": (279.4, 431.8),
 }
-# Most printers leave about 5 mm of the sheet white.
-MARGIN_MM = 7.0
-# What the rulers and the line of text need below and beside the drawing.
-_RULER_MM = 14.0
-# Of the sheet's sides, what the drawing does not get.
-AROUND_MM = 2 * MARGIN_MM + _RULER_MM
-LINE_MM = 0.2
-TEXT_MM = 3.0
-# Helvetica's letters are half as wide as high, on the mean.
-_LETTER = 0.52
+
+
+class Layout:
+    margin_mm = 7.0  # most printers leave about 5 mm of the sheet white
+    ruler_mm = 14.0  # what the rulers and the line of text need below and beside the drawing
+    around_mm = 2 * margin_mm + ruler_mm  # of the sheet's sides, what the drawing does not get
+    line_mm = 0.2  # width of a thin line
+    text_mm = 3.0  # height of the letters
+    letter_width = 0.52  # Helvetica's letters are half as wide as high, on the mean
 
 
 @dataclass(frozen=True)
@@ -50,7 +49,7 @@ class Text:
     y_mm: float
     text: str
     turned: bool = False
-    size_mm: float = TEXT_MM
+    size_mm: float = Layout.text_mm
 
 
 @dataclass(frozen=True)
@@ -87,13 +86,15 @@ def page(
         ConfigError: there is no such paper.
     """
     width, height = size_mm
-    fitting = [each for each in sheets(paper) if each[0] >= width + AROUND_MM and each[1] >= height + AROUND_MM]
+    fitting = [
+        each for each in sheets(paper) if each[0] >= width + Layout.around_mm and each[1] >= height + Layout.around_mm
+    ]
     if not fitting:
         return None
     sheet = max(fitting, key=lambda each: min(each[0] - width, each[1] - height))
-    x, y = (MARGIN_MM + 0.5 * (side - own - AROUND_MM) for side, own in zip(sheet, size_mm, strict=True))
+    x, y = (Layout.margin_mm + 0.5 * (side - own - Layout.around_mm) for side, own in zip(sheet, size_mm, strict=True))
     rulers = rulers_mm(size_mm)
-    below, beside = y + height + 0.35 * _RULER_MM, x + width + 0.35 * _RULER_MM
+    below, beside = y + height + 0.35 * Layout.ruler_mm, x + width + 0.35 * Layout.ruler_mm
     lines = [*_ruler(x, below, rulers[0], upright=False), *_ruler(beside, y, rulers[1], upright=True)]
     told = f"Print at 100 %, then measure: this line is {rulers[0]:g} mm, the upright one {rulers[1]:g} mm."
     words = [_line(said, x, below + 7.0 + k * 4.0, sheet[0]) for k, said in enumerate((told, name))]
@@ -105,8 +106,8 @@ def page(
 
 def _line(text: str, x: float, y: float, sheet_mm: float) -> Text:
     """Return a line of text that begins at x, or further left if it would leave the sheet."""
-    longest = _LETTER * TEXT_MM * len(text)
-    return Text(max(min(x, sheet_mm - MARGIN_MM - longest), MARGIN_MM), y, text)
+    longest = Layout.letter_width * Layout.text_mm * len(text)
+    return Text(max(min(x, sheet_mm - Layout.margin_mm - longest), Layout.margin_mm), y, text)
 
 
 def rulers_mm(size_mm: tuple[float, float]) -> tuple[float, float]:
@@ -140,9 +141,11 @@ def _black_runs(cells: list[float]) -> list[tuple[int, int]]:
 
 def _ruler(x: float, y: float, length: float, *, upright: bool) -> list[Rectangle]:
     """Return a line with a tick at each centimetre; the outer edges of its end ticks are `length` apart."""
-    ticks = [min(max(10.0 * k - 0.5 * LINE_MM, 0.0), length - LINE_MM) for k in range(int(length / 10.0) + 1)]
-    ticks[-1] = length - LINE_MM
+    ticks = [
+        min(max(10.0 * k - 0.5 * Layout.line_mm, 0.0), length - Layout.line_mm) for k in range(int(length / 10.0) + 1)
+    ]
+    ticks[-1] = length - Layout.line_mm
     if upright:
-        line = Rectangle(x + 1.5, y, LINE_MM, length)
-        return [line, *(Rectangle(x, y + at, 3.0, LINE_MM) for at in ticks)]
-    return [Rectangle(x, y + 1.5, length, LINE_MM), *(Rectangle(x + at, y, LINE_MM, 3.0) for at in ticks)]
+        line = Rectangle(x + 1.5, y, Layout.line_mm, length)
+        return [line, *(Rectangle(x, y + at, 3.0, Layout.line_mm) for at in ticks)]
+    return [Rectangle(x, y + 1.5, length, Layout.line_mm), *(Rectangle(x + at, y, Layout.line_mm, 3.0) for at in ticks)]

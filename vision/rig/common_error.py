@@ -14,12 +14,13 @@ from .lens import Lens
 from .rectified import Rectification
 from .stereo_rig import Rig, StereoRig
 
-# Distance of the positions that decide which turn of the frame is no error, and that are taken for typical [m].
-AHEAD_M = 0.6
-# Nearer, the two eyes of a pair share no view.
-_NEAREST_M = 0.1 * AHEAD_M
-_GRID = 9  # points across the image, and down
-_STEP = 1e-3  # of a direction, for the growth of a small marker
+
+class CommonErrorSettings:
+    # Distance of the positions that decide which turn of the frame is no error, and that are taken for typical [m].
+    ahead_m = 0.6
+    nearest_m = 0.1 * ahead_m  # nearer, the two eyes of a pair share no view
+    grid_points = 9  # points across the image, and down
+    step = 1e-3  # of a direction, for the growth of a small marker
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,14 +49,14 @@ class CommonError:
 
     @cached_property
     def typical(self) -> FloatArray:
-        """1-sigma of each coordinate (3,) [m] at `AHEAD_M`: the RMS over the view."""
+        """1-sigma of each coordinate (3,) [m] at `ahead_m`: the RMS over the view."""
         return np.asarray(np.sqrt(self.variance(self._grid).mean(axis=0)), np.float64)
 
     @cached_property
     def _grid(self) -> FloatArray:
         """Positions all over the view (n, 3) [m]."""
-        across, down = np.meshgrid(*np.linspace(self._view[0], self._view[1], _GRID).T)
-        return AHEAD_M * np.column_stack([across.ravel(), down.ravel(), np.ones(across.size)])
+        across, down = np.meshgrid(*np.linspace(self._view[0], self._view[1], CommonErrorSettings.grid_points).T)
+        return CommonErrorSettings.ahead_m * np.column_stack([across.ravel(), down.ravel(), np.ones(across.size)])
 
     @cached_property
     def _rectification(self) -> Rectification:
@@ -85,7 +86,7 @@ class CommonError:
 
     def _within_view(self, x: FloatArray) -> FloatArray:
         """Return the positions x (n, 3), each moved to where the cameras could see it: models may predict others."""
-        ahead = np.maximum(x[:, 2:], _NEAREST_M)
+        ahead = np.maximum(x[:, 2:], CommonErrorSettings.nearest_m)
         return np.concatenate([ahead * np.clip(x[:, :2] / ahead, *self._view), ahead], axis=1)
 
     def _raw(self, x: FloatArray) -> FloatArray:
@@ -116,9 +117,9 @@ def _by_one_eye(lens: Lens, x: FloatArray) -> FloatArray:
     grow differently look like a tilt; which side counts depends on the marker's tilt, and the mean is taken.
     """
     seen = x[:, None, :2] / x[:, None, 2:]
-    steps = _STEP * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+    steps = CommonErrorSettings.step * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
     moved = _moved(lens, (seen + steps).reshape(-1, 2)).reshape(len(x), len(steps), 2, -1)
-    spread = (moved[:, 1, 0] - moved[:, 2, 0] + moved[:, 3, 1] - moved[:, 4, 1]) / (2.0 * _STEP)
+    spread = (moved[:, 1, 0] - moved[:, 2, 0] + moved[:, 3, 1] - moved[:, 4, 1]) / (2.0 * CommonErrorSettings.step)
     # Of the solid angle, from that in the image's plane, and with the length of (x/z, y/z, 1).
     outward = (seen @ moved[:, 0])[:, 0] / (1.0 + np.square(seen).sum(axis=2))
     growth = 0.5 * (spread - outward)

@@ -20,21 +20,20 @@ DISTORTION_NAMES: dict[Model, tuple[str, ...]] = {
     "fisheye": ("k1", "k2", "k3", "k4"),
     "rational": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
 }
-# The largest x/z and y/z that a rectified image shows: beyond them a fisheye's image would be stretched too much.
-WIDEST = 1.2
-# Number of rays from the axis on which a lens is examined, and of points on each.
-RAYS = 64
 
 
-class _Settings:
-    """Settings of the inverse of a lens.
+class LensSettings:
+    """Settings of the inverse of a lens, and of its examination.
 
-    Sensitivity: each at 0.3 and 3 times changes no calibration of six sets of views.
+    Sensitivity: each of the inverse at 0.3 and 3 times changes no calibration of six sets of views.
     """
 
     iterations, converged = 30, 1e-12  # steps of Newton's method; a smaller step ends it [focal lengths]
     widest_rad = 1.5  # off the axis, beyond which a fisheye's polynomial says nothing
     least_slope = 0.05  # lower bound of the derivative: keeps steps short where a lens folds over
+    # The largest x/z and y/z that a rectified image shows: beyond them a fisheye's image would be stretched too much.
+    widest = 1.2
+    rays = 64  # number of rays from the axis on which a lens is examined, and of points on each
 
 
 @dataclass(frozen=True)
@@ -102,12 +101,12 @@ class Lens:
         """Return False if the lens folds over within the image: two directions would be seen at one point of it.
 
         Far from the axis a distortion polynomial folds over; a fit to corners does not keep this out of the image.
-        Directions beyond `WIDEST` do not count.
+        Directions beyond `widest` do not count.
         """
-        turn = 2.0 * np.pi * np.arange(RAYS) / RAYS
-        across = WIDEST / np.maximum(np.abs(np.cos(turn)), np.abs(np.sin(turn)))
+        turn = 2.0 * np.pi * np.arange(LensSettings.rays) / LensSettings.rays
+        across = LensSettings.widest / np.maximum(np.abs(np.cos(turn)), np.abs(np.sin(turn)))
         rays = np.stack([np.cos(turn), np.sin(turn)], axis=1) * across[:, None]
-        ahead = np.linspace(0.0, 1.0, RAYS)[:, None, None] * rays
+        ahead = np.linspace(0.0, 1.0, LensSettings.rays)[:, None, None] * rays
         px = self.project(np.concatenate([ahead, np.ones((*ahead.shape[:2], 1))], axis=2).reshape(-1, 3))
         px = px.reshape(*ahead.shape[:2], 2)
         outward = np.sum(np.diff(px, axis=0) * rays, axis=2) > 0.0
@@ -120,14 +119,14 @@ class Lens:
         # Kannala & Brandt 2006, eq. (6)
         powers = np.array([3, 5, 7, 9])
         k = np.array(self.distortion)
-        angle = np.minimum(seen, _Settings.widest_rad)
-        for _ in range(_Settings.iterations):
+        angle = np.minimum(seen, LensSettings.widest_rad)
+        for _ in range(LensSettings.iterations):
             value = angle + (angle[..., None] ** powers) @ k
             slope = 1.0 + (angle[..., None] ** (powers - 1)) @ (k * powers)
             moved = np.clip(
-                angle - (value - seen) / np.maximum(slope, _Settings.least_slope), 0.0, _Settings.widest_rad
+                angle - (value - seen) / np.maximum(slope, LensSettings.least_slope), 0.0, LensSettings.widest_rad
             )
-            done = np.max(np.abs(moved - angle), initial=0.0) < _Settings.converged
+            done = np.max(np.abs(moved - angle), initial=0.0) < LensSettings.converged
             angle = moved
             if done:
                 break
@@ -137,15 +136,15 @@ class Lens:
         found = start
         h = 1e-6
         shifts = h * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-        for _ in range(_Settings.iterations):
+        for _ in range(LensSettings.iterations):
             ahead = np.column_stack([found, np.ones(len(found))])
             value, right, down = self.project((ahead + shifts[:, None]).reshape(-1, 3)).reshape(3, -1, 2)
             (a, c), (b, d) = ((right - value) / h).T, ((down - value) / h).T
             u, v = (value - px).T
             # Where a lens folds the image over there is no direction; the step is kept short, and says nothing.
-            determinant = np.maximum(a * d - b * c, _Settings.least_slope * self.focal_px[0] * self.focal_px[1])
+            determinant = np.maximum(a * d - b * c, LensSettings.least_slope * self.focal_px[0] * self.focal_px[1])
             step = np.column_stack([d * u - b * v, a * v - c * u]) / determinant[:, None]
             found = found - step
-            if np.max(np.abs(step), initial=0.0) < _Settings.converged:
+            if np.max(np.abs(step), initial=0.0) < LensSettings.converged:
                 break
         return found

@@ -16,7 +16,7 @@ from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.protocols import StereoEyes
 from bodyschema.interfaces.records import FloatArray, ImageArray, StereoFrame
 
-from .lens import RAYS, WIDEST, Lens
+from .lens import Lens, LensSettings
 from .stereo_rig import CalibrationError, OneEyeRig, Rig
 
 
@@ -116,13 +116,15 @@ class Rectification:
 def _filled(lens: Lens, R: FloatArray, size_px: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
     """Return the limits (x/z, y/z) of an upright rectangle that one eye's image fills."""
     width, height = size_px
-    along = np.linspace(0.0, 1.0, RAYS)
+    along = np.linspace(0.0, 1.0, LensSettings.rays)
     ends = np.zeros_like(along)
     sides = [
         np.column_stack([x * (width - 1), y * (height - 1)])
         for x, y in ((ends, along), (along, ends), (ends + 1.0, along), (along, ends + 1.0))
     ]
-    left, top, right, bottom = (np.clip(_turned(lens.directions(side), R), -WIDEST, WIDEST) for side in sides)
+    left, top, right, bottom = (
+        np.clip(_turned(lens.directions(side), R), -LensSettings.widest, LensSettings.widest) for side in sides
+    )
     low = np.array([left[:, 0].max(), top[:, 1].max()])
     return low, np.array([right[:, 0].min(), bottom[:, 1].min()])
 

@@ -21,7 +21,6 @@ from .stereo_rig import Made, OneEyeRig, Rig, StereoRig, parameter_names
 
 FORMAT, FORMAT_OF_ONE = "bodyschema stereo rig 1", "bodyschema camera 1"
 _AGAIN = "Take the file from a copy, or calibrate again: `bodyschema calibrate cameras`"
-_SYMMETRY = 1e-6
 
 NotNegative = Annotated[float, Meta(ge=0)]
 Pixels = Annotated[int, Meta(ge=16, le=LARGEST_SIDE_PX)]
@@ -194,10 +193,10 @@ def _covariance(uncertainty: _Uncertainty) -> FloatArray:
     n = len(uncertainty.sigma)
     if len(uncertainty.correlation) != n or any(len(row) != n for row in uncertainty.correlation):
         raise ValueError(f"not {n} rows of {n} numbers")
-    correlation = np.array(uncertainty.correlation)
-    if np.abs(correlation - correlation.T).max() > _SYMMETRY or np.abs(np.diag(correlation) - 1.0).max() > _SYMMETRY:
+    correlation, rounding = np.array(uncertainty.correlation), 1e-6
+    if np.abs(correlation - correlation.T).max() > rounding or np.abs(np.diag(correlation) - 1.0).max() > rounding:
         raise ValueError("not symmetric with 1 on its diagonal")
-    if np.linalg.eigvalsh(correlation)[0] < -_SYMMETRY * n:
+    if np.linalg.eigvalsh(correlation)[0] < -rounding * n:
         raise ValueError("not positive")
     sigma = np.array(uncertainty.sigma)
     return correlation * np.outer(sigma, sigma)

@@ -19,18 +19,8 @@ from scipy.special import ndtr
 from bodyschema.interfaces.records import FloatArray, ImageArray
 
 from .edge import SQUARE, Mask, leave, sampled
-
-# Most samples along a row of modules; else one a pixel.
-_MOST = 80
-# Most rounds of the fit: a fourth moves bleeding of a pixel by 0.002 px; converged when the last moved it by less than
-# this [px], as corners are. Step of the derivative, in parts of the blur.
-_ROUNDS, _SETTLED_PX, _STEP = 3, 0.003, 0.01
-# Bleeding by this share of a module leaves nothing of it.
-_WIDEST = 0.5
-# Share of the samples that the pattern has to explain; the usual bleeding, in parts of the blur, where it does not.
-_FITS, _UNSEEN = 0.9, 0.3
-# Relative error on nine photographed grids (RMS): modules inside are not drawn and lit exactly as the edges are.
-_DIFFERENT = 0.25
+from .settings import BleedSettings as _Settings
+from .settings import TagSettings
 
 
 def bleed(grey: ImageArray, corners_px: FloatArray, blur_px: float, modules: FloatArray) -> tuple[float, float]:
@@ -46,13 +36,13 @@ def bleed(grey: ImageArray, corners_px: FloatArray, blur_px: float, modules: Flo
         blur_px: 1-sigma.
         modules: the tag's modules with its black border (n, n), 1 white and 0 black.
     """
-    unseen = 0.0, (_UNSEEN * blur_px) ** 2
+    unseen = 0.0, (_Settings.usual * blur_px) ** 2
     length = float(len(modules))
     to_px = cv2.getPerspectiveTransform(length * SQUARE, corners_px.astype(np.float32))
     sides = np.linalg.norm(np.roll(corners_px, -1, axis=0) - corners_px, axis=1) / length
     width, height = float(sides[::2].mean()), float(sides[1::2].mean())
     # From the middle of one black border to that of the other.
-    counts = [int(min(round((length - 1.0) * module), _MOST)) for module in (width, height)]
+    counts = [int(min(round((length - 1.0) * module), _Settings.most_samples)) for module in (width, height)]
     x, y = (0.5 + (np.arange(count) + 0.5) * (length - 1.0) / count for count in counts)
     across, down = np.meshgrid(x, y)
     there = np.asarray(to_px, np.float64) @ np.stack([across.ravel(), down.ravel(), np.ones(across.size)])
@@ -73,8 +63,8 @@ def bleed(grey: ImageArray, corners_px: FloatArray, blur_px: float, modules: Flo
         drawn = _bled(printed, bled_px)
         return white_y @ drawn @ white.T, white_y @ drawn @ wide.T + wide_y @ drawn @ white.T
 
-    fit = _fitted(levels, lit, pattern_at, _STEP * blur_px)
-    if fit is None or not abs(fit.moved) < _WIDEST * min(width, height):
+    fit = _fitted(levels, lit, pattern_at, _Settings.step_share * blur_px)
+    if fit is None or not abs(fit.moved) < _Settings.widest * min(width, height):
         return unseen
     moved, found, cov, design, kept = fit
     # What a module pulls at the shift: its samples share pixels, and print and light.
@@ -91,7 +81,7 @@ def bleed(grey: ImageArray, corners_px: FloatArray, blur_px: float, modules: Flo
     bleeds = odds / (1.0 + odds)
     share = unseen[1] / usual
     moved *= share
-    variance = bleeds * (share * by_chance + (_DIFFERENT * moved) ** 2) + bleeds * (1.0 - bleeds) * moved * moved
+    variance = bleeds * (share * by_chance + (_Settings.unlike * moved) ** 2) + bleeds * (1.0 - bleeds) * moved * moved
     return bleeds * moved, variance
 
 
@@ -111,14 +101,15 @@ def _fitted(
     """Fit levels (n,) by the pattern at the shift that explains them best; None if something hides it."""
     moved, kept = 0.0, np.ones(levels.shape, np.bool_)
     fit = None
-    for _ in range(_ROUNDS):
+    for _ in range(_Settings.rounds):
         pattern, wider = pattern_at(moved)
         bled = (pattern_at(moved + step_px)[0] - pattern) / step_px
         design = np.concatenate([lit, lit * pattern, [wider, bled]]).reshape(8, -1)
         try:
             found = np.linalg.solve((design * kept) @ design.T, design @ (levels * kept))
             kept = np.abs(levels - found @ design) < 0.5 * found[3]  # the rest show the other colour
-            if not found[3] >= 1.0 or kept.mean() < _FITS:  # white is not one grey level brighter than black, or hidden
+            # White is not one grey level brighter than black, or hidden.
+            if not found[3] >= 1.0 or kept.mean() < _Settings.explained:
                 return None
             cov = np.linalg.inv((design * kept) @ design.T)
         except np.linalg.LinAlgError:  # too few modules, or too sharp, to tell shift and blur apart
@@ -129,7 +120,7 @@ def _fitted(
         if not math.isfinite(moved):
             return None
         fit = _Fit(moved, found, cov, design, kept)
-        if abs(change) < _SETTLED_PX:
+        if abs(change) < TagSettings.settled_px:
             break
     return fit
 

@@ -69,3 +69,16 @@ class TagSettings:
     # share of the angle between the two.
     stayed = 1.0 / 3.0
     apart_share = 0.03  # squares are two where their corners are on the mean so far apart, as a share of the perimeter
+
+
+class BleedSettings:
+    """Settings of the bleeding of white into black, which were not varied. It has converged as corners have."""
+
+    most_samples = 80  # along a row of modules; else one a pixel
+    rounds = 3  # of the fit: a fourth moves bleeding of a pixel by 0.002 px
+    step_share = 0.01  # step of the derivative, in parts of the blur
+    widest = 0.5  # bleeding by this share of a module leaves nothing of it
+    # Share of the samples that the pattern has to explain; the usual bleeding, in parts of the blur, where it does not.
+    explained, usual = 0.9, 0.3
+    # Relative error on nine photographed grids (RMS): modules inside are not drawn and lit exactly as the edges are.
+    unlike = 0.25

@@ -25,10 +25,11 @@ if TYPE_CHECKING:
     from bodyschema.cli.hardware.joints_watch import JointsWatch, Seen
     from bodyschema.daemon.sampler.sources import Powered
 
-READ_S = 0.5
-PRINT_EVERY_S = 0.5
-FIRST_READING_S = 5.0
-PORT = 8080
+
+class _Settings:
+    read_s: float = 0.5  # one look at all sources
+    print_every_s: float = 0.5  # interval of the lines or the screen
+    first_reading_s: float = 5.0  # how long the first reading is waited for
 
 
 def watch(
@@ -47,7 +48,7 @@ def watch(
     port: Annotated[
         int,
         Parameter(help="Cameras: for the browser on this machine; 0: a free one.", validator=Number(gte=0, lte=65535)),
-    ] = PORT,
+    ] = 8080,
     every: Annotated[
         float, Parameter(help="Cameras, with --out: time between two pictures [s].", validator=Number(gte=0))
     ] = 0.5,
@@ -108,7 +109,10 @@ def _joints(robot: Path, *, once: bool, json: bool, zero_force: bool) -> None:
             console.file.write(as_json(seen) + "\n") if json else console.print(screen(seen))
         elif json or not console.is_terminal:
             _follow(
-                watch, flags, PRINT_EVERY_S, lambda now: _line(as_json(now)) if json else console.print(screen(now))
+                watch,
+                flags,
+                _Settings.print_every_s,
+                lambda now: _line(as_json(now)) if json else console.print(screen(now)),
             )
         else:
             with Live(screen(seen), console=console, auto_refresh=False, screen=True) as live:
@@ -133,7 +137,7 @@ def _cameras(robot: Path, out: Path | None, port: int, every: float, count: int 
         stack.enter_context(watched.camera)
         stack.enter_context(on_termination(watching.stop))
         tell_at = time.monotonic() + LINE_EVERY_S
-        while watching.step(READ_S):
+        while watching.step(_Settings.read_s):
             if time.monotonic() >= tell_at:
                 tell_at = time.monotonic() + LINE_EVERY_S
                 say(watched.camera.said, *watched.eyes.health)
@@ -159,7 +163,7 @@ def _marker(robot: Path, seconds: float | None) -> None:
             tell_at = min(clock.now() + STATUS_EVERY_S, end)
             while clock.now() < tell_at and not flags.ending:
                 for each in watches:
-                    each.read(READ_S / 10)
+                    each.read(_Settings.read_s / 10)
             for each in watches:
                 say(*each.lines())
 
@@ -171,7 +175,7 @@ def _line(text: str) -> None:
 
 def _first(watch: JointsWatch) -> Seen:
     """Return the first complete state. SourceError if there is none in time."""
-    end = time.monotonic() + FIRST_READING_S
+    end = time.monotonic() + _Settings.first_reading_s
     while time.monotonic() < end:
         if watch.look() is not None:
             watch.know_temperatures()

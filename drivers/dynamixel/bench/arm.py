@@ -19,19 +19,21 @@ from bodyschema.drivers.dynamixel.config import DynamixelConfig, ServoConfig
 from bodyschema.drivers.dynamixel.crc16 import crc16
 from bodyschema.drivers.dynamixel.models import baud_value
 
-FASTEST_RAD_S = math.radians(180.0)  # about what a servo of the X series does without a load
-KEPT = 1024  # moves that are remembered: about a second, at the rate at which a driver reads
+
+class _Settings:
+    fastest_rad_s: float = math.radians(180.0)  # about what a servo of the X series does without a load
+    moves_kept: int = 1024  # about a second, at the rate at which a driver reads
 
 
 class DrivenShaft:
     """The angle of a servo's shaft: it goes where the servo holds it, and stays where nothing does."""
 
-    def __init__(self, angle: float, fastest_rad_s: float = FASTEST_RAD_S) -> None:
+    def __init__(self, angle: float, fastest_rad_s: float = _Settings.fastest_rad_s) -> None:
         """Start at `angle` [rad], 0 in the middle of the servo's range."""
         self.servo: Servo | None = None  # the servo that turns it, if any
         self.jammed = False  # the shaft does not move, whatever the servo does
         self._fastest = fastest_rad_s
-        self._moves = deque([(-math.inf, angle)], maxlen=KEPT)
+        self._moves = deque([(-math.inf, angle)], maxlen=_Settings.moves_kept)
         self._lock = threading.RLock()  # its servo moves it in one thread, cameras see it in others
 
     def __call__(self, t: float) -> float:

@@ -8,10 +8,9 @@ from enum import IntEnum
 from typing import Literal
 
 from bodyschema.drivers.dynamixel.crc16 import crc16
-from bodyschema.drivers.servos.packets import summed
+from bodyschema.drivers.servos.packets import BROADCAST, summed
 
 HEADER1, HEADER2 = b"\xff\xff", b"\xff\xff\xfd\x00"
-BROADCAST = 0xFE
 LONGEST = 1024
 STATUS = 0x55
 Protocol = Literal[1, 2]

@@ -18,7 +18,6 @@ GOALS = ("goal_current", "goal")
 WATCHDOG_UNIT_S = 0.02
 FIRED = -1  # Bus Watchdog
 REVERSE = 0x01  # Drive Mode
-VELOCITY_STEP_S = 0.01
 TICKS_PER_REPLY_DELAY_US = 2
 
 _COMMON = {"id": 1, "baud": 1, "return_delay": 250, "status_return": 2, "temperature": 31}
@@ -314,9 +313,9 @@ class Servo(EmulatedServo):
         lowest = self.model.zero_ticks - turn // 2
         self._base = math.floor((self.count(t) - lowest) / turn) * turn
 
-    def _sense(self, t: float) -> None:
+    def _sense(self, t: float, step_s: float = 0.01) -> None:
         """Write the measured values at `t` into the control table."""
-        rad_s = (self._angle(t) - self._angle(t - VELOCITY_STEP_S)) / VELOCITY_STEP_S
+        rad_s = (self._angle(t) - self._angle(t - step_s)) / step_s
         velocity = round(rad_s / self.model.velocity_unit)
         if self.model.protocol == 1:
             self["velocity"] = min(abs(velocity), 1023) | (0x400 if velocity < 0 else 0)

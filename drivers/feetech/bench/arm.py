@@ -14,7 +14,7 @@ from bodyschema.drivers.bench.servo_arm import AT_THE_START, ServoArm
 from bodyschema.drivers.feetech.bench.servo import Servo
 from bodyschema.drivers.feetech.config import FeetechConfig, ServoConfig
 from bodyschema.drivers.feetech.models import BAUDS
-from bodyschema.drivers.servos.packets import HEADER, summed
+from bodyschema.drivers.servos.packets import BROADCAST, HEADER, summed
 
 
 def swapped(reply: Reply, rng: Random) -> Reply:
@@ -23,9 +23,6 @@ def swapped(reply: Reply, rng: Random) -> Reply:
     data[2] = (reply.id + rng.choice((-1, 1))) % 253
     data[-1] = ~sum(data[2:-1]) & 0xFF
     return replace(reply, data=bytes(data))
-
-
-BROADCAST = 0xFE
 
 
 class Code(IntEnum):
@@ -76,11 +73,6 @@ def instructions_in(stream: bytearray) -> tuple[list[Instruction], int]:
             at += 1
 
 
-# Shorter than the 3 ms per ID, besides the bytes, that scan_port of huggingface/lerobot waits, and longer than the
-# longest return delay.
-PING_GAP_S = 1e-3
-
-
 class Chain(ServoChain[Servo]):
     """Feetech servos on one half-duplex wire; see `ServoChain`. A damaged instruction is not answered."""
 
@@ -124,7 +116,9 @@ class Chain(ServoChain[Servo]):
         """
         at_once = [servo for servo in servos if not servo.knows_sync_read]
         groups = [[servo for servo in servos if servo.knows_sync_read and servo.id == id] for id in range(BROADCAST)]
-        slot_s = self.overhead * self._byte_s + PING_GAP_S
+        # Shorter than the 3 ms per ID, besides the bytes, that scan_port of huggingface/lerobot waits, and longer than
+        # the longest return delay.
+        slot_s = self.overhead * self._byte_s + 1e-3
         replies = [
             Reply(group[0].id, t + id * slot_s + group[0].return_delay_s, mixed(self._pongs(group)))
             for id, group in enumerate(groups)

@@ -9,7 +9,6 @@ from bodyschema.drivers.bench.device import Angle
 from bodyschema.drivers.feetech.models import BAUDS, SCS
 from bodyschema.drivers.servos.model import Model
 
-VELOCITY_STEP_S = 0.01
 RETURN_DELAY_UNIT_US = 2
 CALIBRATE = 128  # written to the torque register: makes the present position the middle of the range
 FACTORY = {"firmware": 0x030A, "baud": 0, "id": 1, "return_delay": 250, "status_return": 1}
@@ -180,10 +179,10 @@ class Servo(EmulatedServo):
         ticks = round(self._angle(t) / self.model.rad_per_tick) + self.model.zero_ticks
         return ticks - self["homing_offset"]
 
-    def _sense(self, t: float) -> None:
+    def _sense(self, t: float, step_s: float = 0.01) -> None:
         """Write the measured values at `t` into the control table."""
         layout = self.model.layout
-        rad_s = (self._angle(t) - self._angle(t - VELOCITY_STEP_S)) / VELOCITY_STEP_S
+        rad_s = (self._angle(t) - self._angle(t - step_s)) / step_s
         velocity = round(rad_s / self.model.velocity_unit)
         measured = {
             "velocity": min(max(velocity, -LARGEST_SPEED), LARGEST_SPEED),

@@ -17,10 +17,12 @@ from bodyschema.interfaces.protocols import Clock
 from . import packets
 from .packets import Message, ServerInfo
 
-ANSWER_S, ASK_EVERY_S = 2.0, 0.4
-RETRY_S = 10.0  # opening takes ANSWER_S where no server is
-ALIVE_EVERY_S = 1.0  # a server forgets clients that are silent for seconds
-GONE_AFTER_S = 4.0
+
+class _Settings:
+    answer_s, ask_every_s = 2.0, 0.4  # how long the server is waited for, and how often it is asked meanwhile
+    retry_s: float = 10.0  # opening takes `answer_s` where no server is
+    alive_every_s: float = 1.0  # a server forgets clients that are silent for seconds
+    gone_after_s: float = 4.0  # a server that is silent for so long
 
 
 class NatnetReceiver:
@@ -47,7 +49,7 @@ class NatnetReceiver:
             self._commands = listening("0.0.0.0", 0)
             self._await_server()
             self._join()
-            until = self._clock.now() + ANSWER_S  # without an answer the bodies' IDs are used
+            until = self._clock.now() + _Settings.answer_s  # without an answer the bodies' IDs are used
             while not self.names and self._clock.now() < until:
                 self._ask(packets.packet(Message.REQUEST_MODEL), lambda: bool(self.names))
         except BaseException:
@@ -72,7 +74,7 @@ class NatnetReceiver:
             if now >= until:
                 return None
             if got is None:
-                await_any(sockets, min(until, now + ALIVE_EVERY_S), self._clock)
+                await_any(sockets, min(until, now + _Settings.alive_every_s), self._clock)
 
     def silence(self) -> str:
         if self.server is None:
@@ -94,7 +96,10 @@ class NatnetReceiver:
         stamp_ns = found.sent * NANO // rate if is_dated else round(found.time_s * NANO)
         age_s = (found.sent - found.exposed) / rate if is_dated else 0.0
         now = self._clock.now()
-        if any(body.id not in self.names for body in found.bodies) and now - self._asked_names > ALIVE_EVERY_S:
+        if (
+            any(body.id not in self.names for body in found.bodies)
+            and now - self._asked_names > _Settings.alive_every_s
+        ):
             self._asked_names = now
             self._send(packets.packet(Message.REQUEST_MODEL))
         for body in found.bodies:
@@ -113,11 +118,11 @@ class NatnetReceiver:
         begin = self._clock.now()
         while self.server is None and self._commands is not None:
             now = self._clock.now()
-            if now - begin > ANSWER_S:
+            if now - begin > _Settings.answer_s:
                 raise SourceLost(
                     f"no NatNet server answers on {self._table.server}:{self._table.command_port}. Start Motive, "
                     "switch on its Data Streaming on that network interface, and let its firewall pass UDP",
-                    retry_s=RETRY_S,
+                    retry_s=_Settings.retry_s,
                 )
             self._ask(packets.connect(), lambda: self.server is not None)
         if self.server is not None and not packets.OLDEST <= self.server.version[0] <= packets.NEWEST:
@@ -128,9 +133,9 @@ class NatnetReceiver:
             )
 
     def _ask(self, question: bytes, is_answered: Callable[[], bool]) -> None:
-        """Send a question and take what comes until it is answered, for `ASK_EVERY_S` at most."""
+        """Send a question and take what comes until it is answered, for `ask_every_s` at most."""
         self._send(question)
-        until = self._clock.now() + ASK_EVERY_S
+        until = self._clock.now() + _Settings.ask_every_s
         # Frames may come all the time, so the time is looked at, too.
         while not is_answered() and self._commands is not None and self._clock.now() < until:
             if await_any([self._commands], until, self._clock):
@@ -151,7 +156,7 @@ class NatnetReceiver:
                 f"the multicast group {self.server.group}:{self.server.data_port} cannot be joined: {error.strerror}. "
                 "Set local in [marker_source] to this machine's address in Motive's network, or Transmission Type: "
                 "Unicast in Motive",
-                retry_s=RETRY_S,
+                retry_s=_Settings.retry_s,
             ) from error
 
     def _send(self, data: bytes) -> None:
@@ -167,9 +172,9 @@ class NatnetReceiver:
 
     def _keep_alive(self) -> None:
         now = self._clock.now()
-        if now - self._heard > GONE_AFTER_S:
-            raise SourceLost(f"the NatNet server {self._table.server} has fallen silent", retry_s=RETRY_S)
-        if now - self._asked > ALIVE_EVERY_S:
+        if now - self._heard > _Settings.gone_after_s:
+            raise SourceLost(f"the NatNet server {self._table.server} has fallen silent", retry_s=_Settings.retry_s)
+        if now - self._asked > _Settings.alive_every_s:
             # CONNECT is answered, so that a server without frames still shows that it lives.
             self._send(packets.packet(Message.KEEP_ALIVE))
             self._send(packets.connect())

@@ -19,7 +19,6 @@ from .board import EncoderBoard
 
 KINDS = FaultKinds(ON_THE_WIRE, ("sensor", "glitch"))
 BUS = "board"
-TICKS_PER_TURN = 4096  # default if robot.toml gives none
 
 
 class EncoderArm(BenchArm):
@@ -66,7 +65,7 @@ class EncoderArm(BenchArm):
 
 
 def _ticks(encoder: EncoderConfig) -> int:
-    return encoder.ticks_per_turn or TICKS_PER_TURN
+    return encoder.ticks_per_turn or 4096  # where robot.toml gives none
 
 
 def _shaft(encoder: EncoderConfig, angle: Angle) -> Angle:

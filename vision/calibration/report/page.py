@@ -17,8 +17,7 @@ from bodyschema.vision.calibration.view import Eye, View, all_px, image_of
 from bodyschema.vision.rig.rectified import Rectification
 from bodyschema.vision.rig.stereo_rig import StereoRig
 
-_NORMAL_95 = 1.96
-_ARROW_SHARE = 0.04  # of the image's width: arrow length for the 95 % quantile of the residuals
+NORMAL_95 = 1.96
 
 
 def page(found: Calibrated, gathered: Gathered) -> str:
@@ -58,7 +57,7 @@ def _tiles(found: Calibrated) -> str:
 def _baseline(found: Calibrated) -> Iterator[tuple[str, str]]:
     rig = found.rig
     if isinstance(rig, StereoRig):
-        half = _NORMAL_95 * 1e3 * rig.baseline_sigma_m
+        half = NORMAL_95 * 1e3 * rig.baseline_sigma_m
         yield f"{1e3 * rig.baseline_m:.2f} ± {half:.2f} mm", "baseline, 95 %"
 
 
@@ -89,7 +88,8 @@ def _coverage(found: Calibrated) -> str:
 def _residuals(found: Calibrated) -> str:
     off = {eye: np.concatenate([np.zeros((0, 2)), *_eye_residuals(found, eye)]) for eye in found.coverage.eyes}
     lengths = np.linalg.norm(np.concatenate(list(off.values())), axis=1)
-    stretch = _round(_ARROW_SHARE * _size(found)[0] / float(np.quantile(lengths, 0.95)))
+    # The 95 % quantile of the residuals becomes an arrow of 4 % of the image's width.
+    stretch = _round(0.04 * _size(found)[0] / float(np.quantile(lengths, 0.95)))
     figures = "".join(
         f"<figure>{pictures.residuals(all_px(found.fitted.views, eye), off[eye], stretch, _size(found), eye)}"
         f"<figcaption>{eye if len(found.coverage.eyes) > 1 else ''}</figcaption></figure>"
@@ -105,7 +105,7 @@ def _residuals(found: Calibrated) -> str:
 def _parameters(found: Calibrated) -> str:
     rig = found.rig
     rows = "".join(
-        "<tr><td>{}<td>{}<td>{}".format(name, *to_its_interval(value, _NORMAL_95 * sigma))
+        "<tr><td>{}<td>{}<td>{}".format(name, *to_its_interval(value, NORMAL_95 * sigma))
         for name, value, sigma in zip(rig.names, rig.vector.tolist(), rig.sigma.tolist(), strict=True)
     )
     return (

@@ -13,15 +13,14 @@ from bodyschema.vision.calibration.guidance import GRID
 from bodyschema.vision.calibration.view import Eye
 from bodyschema.vision.image_file import jpeg, shrunk
 
-_WIDTH_PX = 400
 _GREEN = (60, 210, 60)
 _FIRST = (30, 60, 240)
 
 
-def photograph(image: ImageArray, corners: Corners | None, alt: str) -> str:
+def photograph(image: ImageArray, corners: Corners | None, alt: str, widest_px: int = 400) -> str:
     """Return a small image with the detected corners; the first one is red, to reveal a rotated board."""
-    scale = min(1.0, _WIDTH_PX / image.shape[1])
-    small = shrunk(image, _WIDTH_PX)
+    scale = min(1.0, widest_px / image.shape[1])
+    small = shrunk(image, widest_px)
     if small.ndim == 2:
         small = np.asarray(cv2.cvtColor(small, cv2.COLOR_GRAY2BGR), np.uint8)
     if corners is not None:

@@ -11,7 +11,7 @@ import numpy as np
 
 from bodyschema.interfaces.errors import SourceError
 from bodyschema.vision.cameras.config import SideBySideConfig, UvcSettings
-from bodyschema.vision.cameras.look import EVERY_S
+from bodyschema.vision.cameras.look import LookSettings
 
 EXPOSURE_UNIT_S = 1e-4  # V4L2_CID_EXPOSURE_ABSOLUTE
 MANUAL_EXPOSURE = 1  # V4L2_EXPOSURE_MANUAL
@@ -133,7 +133,7 @@ class FocusWatch:
 
     def look(self, capture: VideoCapture, now_s: float) -> None:
         """Read the focus of the open camera, if it was not just read."""
-        if now_s - self._read_s < EVERY_S:
+        if now_s - self._read_s < LookSettings.every_s:
             return
         self._read_s = now_s
         # A camera without such a control answers with 0 or -1.

@@ -20,7 +20,6 @@ from bodyschema.vision.cameras.stamps import Stamps
 from .controls import FocusWatch, VideoCapture, apply, raw_size_px, sends_jpeg
 
 JPEG_END = b"\xff\xd9"
-PADDING_BYTES = 64  # that some cameras append
 # Timeout of a read [s]; OpenCV's default is 10, and closing has to wait for it.
 SELECT_TIMEOUT = ("OPENCV_VIDEOIO_V4L_SELECT_TIMEOUT", "1")
 
@@ -127,7 +126,7 @@ class CameraDevice:
     def _decoded(self, raw: np.ndarray) -> ImageArray | None:
         """Decode an image; return None if a part of it is missing."""
         data = raw.reshape(-1)
-        if self._is_jpeg and JPEG_END not in data[-PADDING_BYTES:].tobytes():
+        if self._is_jpeg and JPEG_END not in data[-64:].tobytes():  # some cameras append a few bytes
             return None
         flags = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
         image = cv2.imdecode(data, flags) if self._is_jpeg else raw
