@@ -40,7 +40,7 @@ from bodyschema.learning.status import ChangeRecord, KindOfChange
 from bodyschema.learning.uncertainty import PredictiveUncertainty
 from kbmaps import ChainBelief, ChainParameters, ChainTolerances, Explanation, learning_bases
 from kbmaps.changes.kinds import log_ratios
-from kbmaps.robust import OUTLIER_SIGMAS
+from kbmaps.robust import RobustSettings
 
 # Pairs that the chain knows (half as many more validate it), range of pairs until the change, and pairs to notice it.
 KNOWN, CHANGED_WITHIN, LONGEST = 1000, (20, 80), 600
@@ -152,7 +152,7 @@ def reference(arm: RoughArm, q: FloatArray, x: FloatArray, covs: FloatArray) -> 
     belief = fitted_belief(ChainBelief.from_tolerances(ChainParameters(arm.drawing), TOLERANCES), q, x)
     bases = learning_bases(np.full(q.shape[1], -np.pi), np.full(q.shape[1], np.pi), [False] * q.shape[1])
     kbmap = belief.chain.to_kbmap(bases)
-    known, good = len(q), np.linalg.norm(x - belief.predict(q), axis=1) < OUTLIER_SIGMAS * belief.noise
+    known, good = len(q), np.linalg.norm(x - belief.predict(q), axis=1) < RobustSettings.outlier_sigmas * belief.noise
     q, x, covs = (each[good][-LOOKED_BACK:] for each in (q, x, covs))
     variance = covs.diagonal(axis1=1, axis2=2).mean(axis=0)
     return Reference(kbmap, kbmap, belief, belief, None, PredictiveUncertainty(np.zeros(3)), known, q, x, variance)

@@ -28,7 +28,7 @@ from kbmaps import (
     rotation_matrices,
     unexplained_variance,
 )
-from kbmaps.robust import ROUNDING_M
+from kbmaps.robust import RobustSettings
 
 from .chain_figures import ChainFigures, is_told
 
@@ -202,7 +202,7 @@ def _learners(
     common: FloatArray | None,
 ) -> tuple[tuple[RigidLearner, ...], FloatArray]:
     """Return learners of all pairs with the tolerances that a sample of the pairs makes probable, and their shares."""
-    told = None if recording.cov is None else recording.cov + ROUNDING_M**2 * np.eye(3)
+    told = None if recording.cov is None else recording.cov + RobustSettings.rounding_m**2 * np.eye(3)
     some = np.unique(np.linspace(0, len(recording) - 1, _Settings.judged_pairs).astype(np.intp))
 
     def learner(tolerances: ChainTolerances, rows: IntArray) -> RigidLearner:
@@ -239,7 +239,7 @@ def _told(recording: Recording, learner: RigidLearner, rows: IntArray, common: F
     """Return the stated covariances (n, 3, 3) [m²], the arm's share added in some rows; None if none are stated."""
     if recording.cov is None:
         return None
-    return recording.cov + (ROUNDING_M**2 + _of_the_arm(learner, recording, rows, common)) * np.eye(3)
+    return recording.cov + (RobustSettings.rounding_m**2 + _of_the_arm(learner, recording, rows, common)) * np.eye(3)
 
 
 def _of_the_arm(learner: RigidLearner, recording: Recording, rows: IntArray, common: FloatArray | None) -> float:
@@ -248,7 +248,7 @@ def _of_the_arm(learner: RigidLearner, recording: Recording, rows: IntArray, com
     good = rows[learner.inliers]
     residuals = _residuals(learner, recording, rows, common)[learner.inliers]
     freedom = max(learner.scatter.freedom, 1.0)
-    return unexplained_variance(residuals, recording.cov[good] + ROUNDING_M**2 * np.eye(3), freedom)
+    return unexplained_variance(residuals, recording.cov[good] + RobustSettings.rounding_m**2 * np.eye(3), freedom)
 
 
 def fewest_pairs(joints: int, trusted: Trusted) -> int:

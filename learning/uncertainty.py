@@ -21,8 +21,8 @@ from bodyschema.learning.variance_terms import (
     VarianceTerm,
 )
 from kbmaps import ChainBelief, JointBasis, PrequentialComparison, Recent, ResidualModel, SupportSet
-from kbmaps.contest import CLEARLY
-from kbmaps.robust import OUTLIER_SIGMAS
+from kbmaps.contest import ContestSettings
+from kbmaps.robust import RobustSettings
 
 DISCOUNT = 0.98  # Weight of the error one pair back: the memory is about 50 pairs long
 
@@ -404,12 +404,12 @@ def model_discrepancy(
         taken = max(scatter**2 / max(float(square.mean()), 1e-300), 1.0)
         variance = taken * square - noise.mean(axis=0)
         chance = np.sqrt(2.0 * taken * np.square(noise).mean(axis=0) / n)
-    seen = np.where(variance > CLEARLY * chance, variance, 0.0)
+    seen = np.where(variance > ContestSettings.clearly * chance, variance, 0.0)
     missing = max(WARM - n, 0.0)
     return np.sqrt((n * seen + missing * np.square(before)) / max(n, WARM))
 
 
 def _near(errors: FloatArray, scatter: float) -> NDArray[np.bool_]:
     """Return True for errors that the fit has not left out; for all if these are the minority: then the fit is off."""
-    near = np.linalg.norm(errors, axis=1) <= OUTLIER_SIGMAS * scatter
+    near = np.linalg.norm(errors, axis=1) <= RobustSettings.outlier_sigmas * scatter
     return near if near.mean() > 0.5 else np.ones_like(near)

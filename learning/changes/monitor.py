@@ -14,7 +14,7 @@ from bodyschema.interfaces.records import FloatArray, Pair
 from bodyschema.learning.model_bank import LearntModel
 from bodyschema.learning.uncertainty import PredictiveUncertainty
 from kbmaps import ChainBelief, ChangeDetector, ChangeKind, ChangeScore, KBMap, ResidualModel, SharedNoise, WhiteNoise
-from kbmaps.changes.detector import MOST_SURPRISES
+from kbmaps.changes.detector import DetectorSettings
 from kbmaps.variance_components import inverse_roots
 
 
@@ -128,7 +128,7 @@ class _Shown:
     def with_newer(self, other: _Shown) -> _Shown:
         return _Shown(
             *(
-                np.concatenate([getattr(self, name), getattr(other, name)])[-MOST_SURPRISES:]
+                np.concatenate([getattr(self, name), getattr(other, name)])[-DetectorSettings.most_surprises :]
                 for name in ("q", "claimed", "off")
             )
         )

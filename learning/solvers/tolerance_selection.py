@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from bodyschema.interfaces.records import FloatArray
 from kbmaps import ChainBelief, ChainTolerances
 from kbmaps.arrays import evenly_spread
-from kbmaps.robust import ROUNDING_M
+from kbmaps.robust import RobustSettings
 
 # Candidate tilts of an axis [rad] and shifts [m], 1-sigma, from a milled arm to a kit.
 WORKMANSHIP = ((0.0003, 0.0001), (0.001, 0.0005), (0.003, 0.001), (0.01, 0.003), (0.03, 0.01), (0.06, 0.03))
@@ -63,7 +63,7 @@ def _lost_in_the_curve(belief: ChainBelief, narrowed: Sequence[ChainBelief], q: 
     """
     x, jacobian = belief.parameters.linearised(belief.mean, q)
     spread = jacobian @ belief.root
-    roots = np.linalg.cholesky(spread @ spread.mT + ROUNDING_M**2 * np.eye(3))
+    roots = np.linalg.cholesky(spread @ spread.mT + RobustSettings.rounding_m**2 * np.eye(3))
 
     def square(columns: FloatArray) -> float:
         return float(np.square(np.linalg.solve(roots, columns)).sum(axis=2).mean())

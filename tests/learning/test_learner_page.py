@@ -12,7 +12,7 @@ from bodyschema.learning.nominal import PAIRS_TO_REFIT
 from bodyschema.learning.online_learner import REGION_RAD
 from bodyschema.learning.snapshot import IN_SUPPORT
 from bodyschema.learning.solvers.solver import KEPT, LARGEST_NET, WINDOW
-from kbmaps.contest import CLEARLY, SHORTEST
+from kbmaps.contest import ContestSettings
 
 PAGE = (Path(__file__).parents[2] / "docs" / "learner.md").read_text(encoding="utf-8")
 
@@ -33,6 +33,6 @@ def test_the_page_s_numbers_are_the_code_s() -> None:
     assert f"the newest {WINDOW:,} samples" in text
     assert f"within {words[round(57.29578 * REGION_RAD)]} degrees a joint" in text
     assert ("less than a quarter of the prior's variance" in text) == (IN_SUPPORT == 0.25)
-    assert f"the last {words[SHORTEST]} samples" in text
-    assert f"by {words[round(CLEARLY)]} standard errors" in text
+    assert f"the last {words[ContestSettings.shortest]} samples" in text
+    assert f"by {words[round(ContestSettings.clearly)]} standard errors" in text
     assert f"the newest {KEPT:,} samples" in text

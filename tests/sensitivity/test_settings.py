@@ -14,8 +14,8 @@ from figures import Figures
 # By scene and class: the settings, and how far half or twice of each may move a figure of the scene.
 LIMITS: dict[tuple[Callable[[], Figures], str], dict[str, float]] = {
     (figures.learner, "kbmaps.chains.rigid_fit._Settings"): {"scales_per_sigma": 0.01, "least_share": 0.01},
-    (figures.learner, "kbmaps.contest._Settings"): {"worse": 0.01, "lately": 0.01, "cap": 0.01},
-    (figures.learner, "kbmaps.maps.block_choice._Settings"): {"first_precision": 0.01},
+    (figures.learner, "kbmaps.contest.ContestSettings"): {"worse": 0.01, "lately": 0.01, "cap": 0.01},
+    (figures.learner, "kbmaps.maps.block_choice.BlockSettings"): {"first_precision": 0.01},
     (figures.learner, "bodyschema.learning.changes.monitor._Settings"): {"fewest_known": 0.01},
     (figures.learner, "bodyschema.learning.regime._Settings"): {
         "recent": 0.01,
@@ -29,7 +29,7 @@ LIMITS: dict[tuple[Callable[[], Figures], str], dict[str, float]] = {
         "retune": 0.01,
     },
     (figures.models, "kbmaps.chains.rigid_fit._Settings"): {"misfit_chance": 0.01},
-    (figures.models, "kbmaps.residual.evidence._Settings"): {"window": 0.01, "least_gain": 0.05, "settled": 0.01},
+    (figures.models, "kbmaps.residual.evidence.GroupSettings"): {"window": 0.01, "least_gain": 0.05, "settled": 0.01},
     (figures.models, "kbmaps.residual.features._Settings"): {"path_correlation": 0.01},
     (figures.models, "kbmaps.residual.fit._Settings"): {"misfit_sigmas": 0.01},
     (figures.ball, "bodyschema.vision.ball.settings.OutlineSettings"): {
