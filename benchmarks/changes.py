@@ -34,7 +34,7 @@ from benchmarks.first_pairs import REACH
 from benchmarks.rough_arm import RoughArm, rough_arm
 from bodyschema.interfaces.records import FloatArray, Pair, frozen_array
 from bodyschema.learning.changes.known_arm import KnownArm, Origin
-from bodyschema.learning.changes.monitor import LOOKED_BACK, ChangeMonitor, Reference
+from bodyschema.learning.changes.monitor import ChangeMonitor, MonitorSettings, Reference
 from bodyschema.learning.solvers.solver import fitted_belief
 from bodyschema.learning.status import ChangeRecord, KindOfChange
 from bodyschema.learning.uncertainty import PredictiveUncertainty
@@ -153,7 +153,7 @@ def reference(arm: RoughArm, q: FloatArray, x: FloatArray, covs: FloatArray) -> 
     bases = learning_bases(np.full(q.shape[1], -np.pi), np.full(q.shape[1], np.pi), [False] * q.shape[1])
     kbmap = belief.chain.to_kbmap(bases)
     known, good = len(q), np.linalg.norm(x - belief.predict(q), axis=1) < RobustSettings.outlier_sigmas * belief.noise
-    q, x, covs = (each[good][-LOOKED_BACK:] for each in (q, x, covs))
+    q, x, covs = (each[good][-MonitorSettings.looked_back :] for each in (q, x, covs))
     variance = covs.diagonal(axis1=1, axis2=2).mean(axis=0)
     return Reference(kbmap, kbmap, belief, belief, None, PredictiveUncertainty(np.zeros(3)), known, q, x, variance)
 

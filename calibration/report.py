@@ -11,7 +11,7 @@ import numpy as np
 from bodyschema.calibration.plausibility.verdict import Plausibility
 from bodyschema.calibration.rigid_chain import Calibration, Trusted
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning.solvers.tolerance_selection import WORKMANSHIP
+from bodyschema.learning.solvers.tolerance_selection import ToleranceSettings
 from bodyschema.recordings.recording import Recording
 from bodyschema.robot.calibrated_files import CAMERA_LINK
 from bodyschema.robot.description import RobotDescription
@@ -324,7 +324,7 @@ def _many_left_out(calibration: Calibration, first: int) -> list[str]:
 
 def _badly_made(calibration: Calibration) -> list[str]:
     """Return a message if the geometric errors reach the largest that are considered; else an empty list."""
-    made, (axes, points) = calibration.workmanship, WORKMANSHIP[-1]
+    made, (axes, points) = calibration.workmanship, ToleranceSettings.workmanship[-1]
     if made is None or made.axes < axes:
         return []
     return [

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning.solvers.tolerance_selection import WORKMANSHIP, probable
+from bodyschema.learning.solvers.tolerance_selection import ToleranceSettings, probable
 from bodyschema.recordings.recording import Recording
 from bodyschema.robot.description import RobotDescription
 from kbmaps import (
@@ -179,7 +179,7 @@ class Calibration:
 
         The prior allows an arm of the worst workmanship.
         """
-        report, (axes, points) = self.learner.report(), WORKMANSHIP[-1]
+        report, (axes, points) = self.learner.report(), ToleranceSettings.workmanship[-1]
         parameters = ChainParameters(self.placed.chain)
         before = ChainBelief.from_tolerances(parameters, replace(self.learner.tolerances, axes=axes, points=points))
         _, jacobian = parameters.linearised(self.learner.change, self.recording.q)
@@ -264,7 +264,7 @@ def _tolerances(
 
     The frame's pose is a turn about this origin and a shift: from afar, a small turn of the arm is a long shift.
     """
-    links = WORKMANSHIP if trusted == "nothing" else ((0.0, 0.0),)
+    links = ToleranceSettings.workmanship if trusted == "nothing" else ((0.0, 0.0),)
     free_zeros = trusted != "urdf"
     pose_known, marker_known = robot.camera.pose_known, robot.robot.marker_known
     fitted_place_m = max(_Settings.fitted_place_m, _Settings.fitted_turn_rad * distance_m)

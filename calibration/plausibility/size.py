@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning.solvers.tolerance_selection import WORKMANSHIP
+from bodyschema.learning.solvers.tolerance_selection import ToleranceSettings
 from kbmaps import ChainParameters, ChainTolerances, RigidChain
 from kbmaps.chains.parameters import WIDE
 from kbmaps.chains.placement import Placements, place
@@ -156,7 +156,7 @@ def _made(parameters: ChainParameters) -> Iterator[FloatArray]:
     """Yield roots (p, k) of the covariance of each workmanship, and of the same with one link of any length."""
     _, _, tangents, _, marker = parameters.tables
     joints = len(tangents)
-    for axes, points in WORKMANSHIP:
+    for axes, points in ToleranceSettings.workmanship:
         tolerances = ChainTolerances(
             axes=axes,
             points=points,

@@ -19,7 +19,7 @@ from bodyschema.interfaces.protocols import Clock
 from bodyschema.learning.data_outlook import LearnerEvidence, Scatter, forecast
 from bodyschema.learning.model_bank import SOLVED
 from bodyschema.learning.online_learner import OnlineLearner
-from bodyschema.learning.solvers.tolerance_selection import WORKMANSHIP, probable
+from bodyschema.learning.solvers.tolerance_selection import ToleranceSettings, probable
 from bodyschema.learning.status import (
     JOINT,
     ChainCalibration,
@@ -183,7 +183,9 @@ def figures(robot: RobotDescription, known: LearnerEvidence) -> tuple[ChainFigur
     """
     wide = known.tolerances
     made = [(wide.axes, wide.points)]
-    made += [(axes, points) for axes, points in WORKMANSHIP if axes < wide.axes and points < wide.points]
+    made += [
+        (axes, points) for axes, points in ToleranceSettings.workmanship if axes < wide.axes and points < wide.points
+    ]
     prior = known.nominal.belief(known.wide.parameters.reference, wide)
     belief = no_surer_than_possible(known.wide, prior, robot)
     beliefs = [belief.tightened(wide, replace(wide, axes=axes, points=points)) for axes, points in made]

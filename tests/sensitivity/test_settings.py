@@ -16,13 +16,13 @@ LIMITS: dict[tuple[Callable[[], Figures], str], dict[str, float]] = {
     (figures.learner, "kbmaps.chains.rigid_fit._Settings"): {"scales_per_sigma": 0.01, "least_share": 0.01},
     (figures.learner, "kbmaps.contest.ContestSettings"): {"worse": 0.01, "lately": 0.01, "cap": 0.01},
     (figures.learner, "kbmaps.maps.block_choice.BlockSettings"): {"first_precision": 0.01},
-    (figures.learner, "bodyschema.learning.changes.monitor._Settings"): {"fewest_known": 0.01},
-    (figures.learner, "bodyschema.learning.regime._Settings"): {
+    (figures.learner, "bodyschema.learning.changes.monitor.MonitorSettings"): {"fewest_known": 0.01},
+    (figures.learner, "bodyschema.learning.regime.RegimeSettings"): {
         "recent": 0.01,
         "judged_late": 0.01,
         "judged_anew": 0.01,
     },
-    (figures.learner, "bodyschema.learning.solvers.solver._Settings"): {
+    (figures.learner, "bodyschema.learning.solvers.solver.SolverSettings"): {
         "shared": 0.02,
         "growth": 0.01,
         "first_growth": 0.01,
