@@ -12,7 +12,7 @@ import numpy as np
 
 from bodyschema.calibration.chain_figures import ChainFigures, is_told, no_surer_than_possible
 from bodyschema.calibration.plausibility.check import plausibility
-from bodyschema.calibration.plausibility.search import ROWS
+from bodyschema.calibration.plausibility.search import SearchSettings
 from bodyschema.calibration.plausibility.verdict import FEWEST_ROWS
 from bodyschema.daemon.transport.status import UNDECIDED, Change
 from bodyschema.interfaces.protocols import Clock
@@ -132,7 +132,7 @@ class Findings:
         if count < max(FEWEST_ROWS, 2 * self._checked) or begin < self._turns.due_at:
             return
         spent = self._turns.spent()
-        q, x = self._learning.kept(ROWS)
+        q, x = self._learning.kept(SearchSettings.rows)
         if len(q) < FEWEST_ROWS:  # the others are doubted
             return
         self._checked = count
