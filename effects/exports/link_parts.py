@@ -14,7 +14,7 @@ import numpy as np
 
 from bodyschema.interfaces.errors import RobotError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.robot.meshes import find_mesh
+from bodyschema.robot.meshes import STL_HEAD_BYTES, STL_TRIANGLE, find_mesh
 from bodyschema.robot.rpy import rotation_of
 from bodyschema.robot.shapes import Shape, link_shapes
 from bodyschema.robot.urdf import parse_urdf
@@ -31,7 +31,6 @@ class PartSettings:
     least_inertia_kgm2 = 1e-9
 
 
-_STL_HEADER, _STL_TRIANGLE = 84, 50
 _GREY = "0.7 0.7 0.72 1"
 
 
@@ -145,10 +144,9 @@ def _readable(file: Path) -> bool:
     if file.suffix.lower() != ".stl":
         return True
     with file.open("rb") as stream:
-        head = stream.read(_STL_HEADER)
-    if len(head) < _STL_HEADER:
+        head = stream.read(STL_HEAD_BYTES)
+    if len(head) < STL_HEAD_BYTES:
         return False
     (triangles,) = struct.unpack("<I", head[-4:])
-    return (
-        0 < triangles <= PartSettings.most_triangles and file.stat().st_size == _STL_HEADER + _STL_TRIANGLE * triangles
-    )
+    size = STL_HEAD_BYTES + STL_TRIANGLE.itemsize * triangles
+    return 0 < triangles <= PartSettings.most_triangles and file.stat().st_size == size

@@ -157,7 +157,7 @@ def test_a_long_description_of_a_bag_is_refused(tmp_path) -> None:
 
 def test_a_chunk_that_unpacks_to_more_than_memory_is_refused(tmp_path, monkeypatch) -> None:
     zstd = pytest.importorskip("backports.zstd")
-    monkeypatch.setattr(recording_bag, "MOST_MEMORY_BYTES", 2**26)
+    monkeypatch.setattr(recording_bag.FileLimits, "memory_bytes", 2**26)
     unpacked = 2**28
 
     def text(value: bytes) -> bytes:
