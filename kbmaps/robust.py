@@ -24,6 +24,7 @@ class RobustSettings:
     clipped_sigmas = 4.0
 
 
+HALF_WIDTH_95 = 1.959964  # of a 95 % interval, in standard deviations of a Gaussian
 _ONE_SIGMA = 0.841344746
 
 

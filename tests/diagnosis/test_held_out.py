@@ -97,7 +97,7 @@ def test_errors_on_rows_held_out_are_larger_than_those_on_fitted_rows(small) -> 
 @pytest.mark.parametrize("folds", [2, 15])
 def test_the_held_out_error_hardly_depends_on_the_folds(small, monkeypatch, folds) -> None:
     usual = np.linalg.norm(held_out_errors(small, Blocks.cut(60)))
-    monkeypatch.setattr("bodyschema.diagnosis.search.held_out._Settings.folds", folds)
+    monkeypatch.setattr("bodyschema.diagnosis.search.held_out.HeldOutSettings.folds", folds)
     assert np.linalg.norm(held_out_errors(small, Blocks.cut(60))) == pytest.approx(usual, rel=0.05)
 
 

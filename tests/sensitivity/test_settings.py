@@ -66,9 +66,9 @@ LIMITS: dict[tuple[Callable[[], Figures], str], dict[str, float]] = {
         "smoothed_waves": 0.02,
     },
     (figures.diagnosis, "bodyschema.diagnosis.assess.explanation._Settings"): {"margin": 0.01},
-    (figures.diagnosis, "bodyschema.diagnosis.fit.fit._Settings"): {"slack": 0.01, "untold": 0.01},
-    (figures.diagnosis, "bodyschema.diagnosis.fit.noise._Settings"): {"noise_alike": 0.01},
-    (figures.diagnosis, "bodyschema.diagnosis.search.scan._Settings"): {"between": 0.01},
+    (figures.diagnosis, "bodyschema.diagnosis.fit.fit.FitSettings"): {"slack": 0.01, "untold": 0.01},
+    (figures.diagnosis, "bodyschema.diagnosis.fit.noise.NoiseSettings"): {"noise_alike": 0.01},
+    (figures.diagnosis, "bodyschema.diagnosis.search.scan.ScanSettings"): {"between": 0.01},
     (figures.diagnosis, "bodyschema.diagnosis.search.search._Settings"): {
         "clearly": 0.01,
         "equal": 0.01,
