@@ -35,13 +35,13 @@ from benchmarks.rough_arm import RoughArm, rough_arm
 from benchmarks.tables import Column, Table, tables_option
 from bodyschema.interfaces.records import FloatArray, Pair, frozen_array
 from bodyschema.learning.changes.known_arm import KnownArm, Origin
-from bodyschema.learning.changes.monitor import LOOKED_BACK, ChangeMonitor, Reference
+from bodyschema.learning.changes.monitor import ChangeMonitor, MonitorSettings, Reference
 from bodyschema.learning.solvers.solver import fitted_belief
 from bodyschema.learning.status import ChangeRecord, KindOfChange
 from bodyschema.learning.uncertainty import PredictiveUncertainty
 from kbmaps import ChainBelief, ChainParameters, ChainTolerances, Explanation, learning_bases
 from kbmaps.changes.kinds import log_ratios
-from kbmaps.robust import OUTLIER_SIGMAS
+from kbmaps.robust import RobustSettings
 
 # Pairs that the chain knows (half as many more validate it), range of pairs until the change, and pairs to notice it.
 KNOWN, CHANGED_WITHIN, LONGEST = 1000, (20, 80), 600
@@ -153,8 +153,8 @@ def reference(arm: RoughArm, q: FloatArray, x: FloatArray, covs: FloatArray) -> 
     belief = fitted_belief(ChainBelief.from_tolerances(ChainParameters(arm.drawing), TOLERANCES), q, x)
     bases = learning_bases(np.full(q.shape[1], -np.pi), np.full(q.shape[1], np.pi), [False] * q.shape[1])
     kbmap = belief.chain.to_kbmap(bases)
-    known, good = len(q), np.linalg.norm(x - belief.predict(q), axis=1) < OUTLIER_SIGMAS * belief.noise
-    q, x, covs = (each[good][-LOOKED_BACK:] for each in (q, x, covs))
+    known, good = len(q), np.linalg.norm(x - belief.predict(q), axis=1) < RobustSettings.outlier_sigmas * belief.noise
+    q, x, covs = (each[good][-MonitorSettings.looked_back :] for each in (q, x, covs))
     variance = covs.diagonal(axis1=1, axis2=2).mean(axis=0)
     return Reference(kbmap, kbmap, belief, belief, None, PredictiveUncertainty(np.zeros(3)), known, q, x, variance)
 

@@ -26,8 +26,8 @@ from benchmarks.changes import KNOWN, TOLERANCES, reference, walk
 from benchmarks.rough_arm import rough_arm
 from bodyschema.interfaces.records import FloatArray
 from kbmaps import ChangeDetector, SharedNoise
-from kbmaps.changes.detector import PAIRS_BETWEEN_FALSE_ALARMS
-from kbmaps.changes.kinds import SIZES
+from kbmaps.changes.detector import DetectorSettings
+from kbmaps.changes.kinds import KindSettings
 
 QUIET, LONGEST = (20, 120), 600
 
@@ -55,7 +55,7 @@ def drawn_change(detector: ChangeDetector, size: int, sigma: float, rng: np.rand
     """Sample a change of the parameters (size,) from the detector's prior."""
     kind = detector.kinds[int(rng.choice(len(detector.kinds), p=[each.share for each in detector.kinds]))]
     change = np.zeros(size)
-    change[kind.columns] = sigma * rng.choice(SIZES) * rng.normal(size=len(kind.columns)) * kind.units
+    change[kind.columns] = sigma * rng.choice(KindSettings.sizes) * rng.normal(size=len(kind.columns)) * kind.units
     return change
 
 
@@ -89,7 +89,7 @@ def main() -> None:
         ]
     )
     rate, spread = float(inverse.mean()), float(inverse.std()) / math.sqrt(len(inverse))
-    limit = math.exp(ChangeDetector.log_limit(PAIRS_BETWEEN_FALSE_ALARMS))
+    limit = math.exp(ChangeDetector.log_limit(DetectorSettings.pairs_between_false_alarms))
     print(
         f"d = {arguments.joints}, sigma {arguments.sigma:g} mm, {len(inverse)} changes: one false alarm in "
         f"{1.0 / rate:,.0f} pairs ({1.0 / (rate + 2.0 * spread):,.0f} at least, 2 standard errors); "

@@ -16,6 +16,7 @@ from bodyschema.robot.hand_eye import HandEye, pose_covariance
 from bodyschema.robot.rpy import pose_of, rpy_of
 from bodyschema.robot.urdf import inverse
 from kbmaps import ChainBelief, ChainParameters
+from kbmaps.robust import HALF_WIDTH_95
 
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.intp]
@@ -29,9 +30,6 @@ class _Settings:
     poses: int = 100
     exact_m: float = 1e-6
     relinearised: int = 4  # from one linearisation to the next the error along a curve is squared
-
-
-HALF_WIDTH_95 = 1.959964
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,10 +16,12 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.recordings.recording import Recording
 from kbmaps.chains.align import rigid_motion
 
-# Rows whose joints differ by more are not at the same joint angles [rad, m].
-SAME_ANGLES = 1e-6
-WORST = 5
-_FEWEST_ALIGNED = 4  # a rigid alignment of fewer points leaves no residual
+
+class _Settings:
+    # Rows whose joints differ by more are not at the same joint angles [rad, m].
+    same_angles = 1e-6
+    worst_rows = 5
+    fewest_aligned = 4  # a rigid alignment of fewer points leaves no residual
 
 
 class Distances(msgspec.Struct, frozen=True):
@@ -140,9 +142,9 @@ def compared(first: Recording, second: Recording, names: tuple[str, str]) -> Com
 def _matched(q: FloatArray, other: FloatArray) -> _Match:
     """Match row by row where the row counts agree; otherwise each row with the nearest unmatched one of the other."""
     if len(q) == len(other):
-        rows = np.flatnonzero(np.abs(q - other).max(axis=1) <= SAME_ANGLES)
+        rows = np.flatnonzero(np.abs(q - other).max(axis=1) <= _Settings.same_angles)
         return _Match(rows, rows)
-    near = KDTree(other).query_ball_point(q, SAME_ANGLES, p=np.inf, return_sorted=True)
+    near = KDTree(other).query_ball_point(q, _Settings.same_angles, p=np.inf, return_sorted=True)
     free = np.ones(len(other), dtype=bool)
     pairs = []
     for row, candidates in enumerate(near):
@@ -173,7 +175,7 @@ def _most(left_out: LeftOut) -> str:
 
 
 def _aligned(x: FloatArray, other: FloatArray) -> Aligned | None:
-    if len(x) < _FEWEST_ALIGNED:
+    if len(x) < _Settings.fewest_aligned:
         return None
     moved, turn = laid_on(x, other)
     angle = float(np.degrees(Rotation.from_matrix(turn).magnitude()))
@@ -196,7 +198,7 @@ def _worst(first: Recording, match: _Match, apart: FloatArray) -> tuple[WorstRow
             _three(1e3 * apart[k]),
             tuple(first.q[match.first[k]].tolist()),
         )
-        for k in np.argsort(-distance, kind="stable")[:WORST]
+        for k in np.argsort(-distance, kind="stable")[: _Settings.worst_rows]
     )
 
 

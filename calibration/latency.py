@@ -22,11 +22,8 @@ from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.records import FloatArray, frozen_array
 from kbmaps import ChainParameters, ChainTolerances, DegenerateDataError, RigidChain, align
 
-EARLIEST_S, LATEST_S = -0.05, 0.25  # search range
-STEP_S = 0.004
 
-
-class _Settings:
+class LatencySettings:
     fewest_fixes: int = 60
     blocks: int = 10
     rival: float = 1.15  # a second minimum is a rival if its residual is below this multiple of the best one's
@@ -45,10 +42,10 @@ class _Settings:
     little_m: float = 0.01
     settling: int = 5  # steps to reach the loosely fitted chain; from there two are enough
     refined_s: float = 0.024  # on both sides of the smooth function's estimate
-
-
-# Prior deviations of an arm from its URDF; they only constrain what the pairs do not determine.
-LOOSE = ChainTolerances(axes=0.02, points=0.005, zeros=0.1, tool=0.1, base_rotation=0.5, base_translation=0.5)
+    earliest_s, latest_s = -0.05, 0.25  # search range
+    step_s: float = 0.004
+    # Prior deviations of an arm from its URDF; they only constrain what the pairs do not determine.
+    loose = ChainTolerances(axes=0.02, points=0.005, zeros=0.1, tool=0.1, base_rotation=0.5, base_translation=0.5)
 
 
 class LatencyError(BodyschemaError):
@@ -90,7 +87,7 @@ class Wiggle:
     @cached_property
     def _places(self) -> tuple[FloatArray, FloatArray]:
         """Times [s], and the indices of the readings at them."""
-        numbers = np.linspace(0.0, len(self.q) - 1.0, _Settings.finer * (len(self.q) - 1) + 1)
+        numbers = np.linspace(0.0, len(self.q) - 1.0, LatencySettings.finer * (len(self.q) - 1) + 1)
         return np.asarray(_smooth(self.t_joints)(numbers), dtype=np.float64), numbers
 
 
@@ -123,21 +120,21 @@ def latency_of(wiggle: Wiggle, chain: RigidChain) -> Latency:
     """
     _require_motion(wiggle, chain)
     fit = _Fit.of(wiggle, chain)
-    grid = np.arange(EARLIEST_S, LATEST_S + STEP_S, STEP_S)
+    step_s, ends_s = LatencySettings.step_s, (LatencySettings.earliest_s, LatencySettings.latest_s)
+    grid = np.arange(ends_s[0], ends_s[1] + step_s, step_s)
     cost = np.array([fit.cost(lag) for lag in grid])
     best = int(np.argmin(cost))
     _require_following(fit, cost[best])
     if best in (0, len(grid) - 1):
         raise LatencyError(
-            f"{_strange(fit, cost[best])} They agree best at {1e3 * (LATEST_S if best else EARLIEST_S):.0f} ms, the "
-            "end of the search: the real latency may be beyond (fewer buffers, a higher rate or a shorter exposure: "
-            "docs/cameras.md)"
+            f"{_strange(fit, cost[best])} They agree best at {1e3 * ends_s[best > 0]:.0f} ms, the end of the search: "
+            "the real latency may be beyond (fewer buffers, a higher rate or a shorter exposure: docs/cameras.md)"
         )
     _require_one(grid, cost, best)
     fit, near_s, residual_m = _nearest(fit, grid[best])
     lag = _minimum(fit, near_s)
     sigma_s = _sigma(fit, lag)
-    if sigma_s > _Settings.largest_sigma_s:
+    if sigma_s > LatencySettings.largest_sigma_s:
         raise LatencyError(
             f"the latency is known to {1e3 * sigma_s:.1f} ms only. Move the arm faster, to and fro, or longer "
             "(--seconds), the marker in sight of both eyes"
@@ -160,13 +157,14 @@ class _Fit:
     @classmethod
     def of(cls, wiggle: Wiggle, chain: RigidChain) -> _Fit:
         t = wiggle.t_marker
-        inside = (t - LATEST_S - STEP_S >= wiggle.t_joints[0]) & (t - EARLIEST_S + STEP_S <= wiggle.t_joints[-1])
-        if inside.sum() < _Settings.fewest_fixes:
+        inside = t - LatencySettings.latest_s - LatencySettings.step_s >= wiggle.t_joints[0]
+        inside &= t - LatencySettings.earliest_s + LatencySettings.step_s <= wiggle.t_joints[-1]
+        if inside.sum() < LatencySettings.fewest_fixes:
             raise LatencyError(_too_few(wiggle, int(inside.sum())))
         centre = wiggle.q.mean(axis=0)
         _, size, directions = np.linalg.svd(wiggle.q - centre, full_matrices=False)
         size = size / math.sqrt(len(wiggle.q))
-        moving = size > _Settings.small * size[0]
+        moving = size > LatencySettings.small * size[0]
         axes = directions[moving].T / size[moving]
         return cls(wiggle, chain, t[inside], wiggle.x[inside], centre, axes)
 
@@ -192,7 +190,7 @@ class _Fit:
         A, x = self.terms(lag)[keep], self.x[keep]
         scale = np.linalg.norm(A, axis=0) + np.finfo(float).tiny
         A = A / scale
-        weights = np.linalg.solve(A.T @ A + _Settings.ridge * np.eye(A.shape[1]), A.T @ x)
+        weights = np.linalg.solve(A.T @ A + LatencySettings.ridge * np.eye(A.shape[1]), A.T @ x)
         return x - A @ weights
 
     def whitened(self, lag: float) -> _Fit:
@@ -242,7 +240,7 @@ class _RigidFit:
         The residual has shape (m, 3) [m].
         """
         q, x, change = self.wiggle.angles(self.t - lag)[keep], self.x[keep], self.start
-        information = self.parameters.standard_deviations(LOOSE) ** -2.0
+        information = self.parameters.standard_deviations(LatencySettings.loose) ** -2.0
         for _ in range(steps):
             positions, jacobian = self.parameters.linearised(change, q)
             J = (self.white @ jacobian).reshape(-1, len(change))
@@ -257,15 +255,14 @@ class _RigidFit:
 
     def whitened(self, lag: float) -> _RigidFit:
         """Return the same fit with residuals whitened by their covariance at `lag` (larger in depth)."""
-        start, left = self.fitted(lag, steps=_Settings.settling)
+        start, left = self.fitted(lag, steps=LatencySettings.settling)
         return replace(self, start=start, white=_whitening(left))
 
     def cost(self, lag: float, keep: NDArray[np.bool_] | slice = slice(None)) -> float:
         """Return the sum of squares of residual and parameter changes, each divided by its sigma."""
         change, left = self.fitted(lag, keep)
-        return float(
-            np.sum((left @ self.white.T) ** 2) + np.sum((change / self.parameters.standard_deviations(LOOSE)) ** 2)
-        )
+        prior = self.parameters.standard_deviations(LatencySettings.loose)
+        return float(np.sum((left @ self.white.T) ** 2) + np.sum((change / prior) ** 2))
 
 
 _AnyFit = _Fit | _RigidFit
@@ -280,7 +277,8 @@ def _nearest(smooth: _Fit, lag: float) -> tuple[_AnyFit, float, float]:
     unexplained = smooth.whitened(lag), lag, _rms(left)
     try:
         rigid = _RigidFit.of(smooth, lag).whitened(lag)
-        grid = lag + np.arange(-_Settings.refined_s, _Settings.refined_s + STEP_S, STEP_S)
+        refined_s, step_s = LatencySettings.refined_s, LatencySettings.step_s
+        grid = lag + np.arange(-refined_s, refined_s + step_s, step_s)
         near_s = float(grid[int(np.argmin([rigid.cost(each) for each in grid]))])
         rigid = rigid.whitened(near_s)
     except (DegenerateDataError, np.linalg.LinAlgError):
@@ -307,7 +305,7 @@ def _volume(left: FloatArray, unknowns: int) -> float:
 def _whitening(residual: FloatArray) -> FloatArray:
     """Return the matrix, shape (3, 3), that transforms residuals (m, 3) to unit covariance."""
     noise = residual.T @ residual / len(residual)
-    least = _Settings.small * float(np.trace(noise)) + np.finfo(float).tiny
+    least = LatencySettings.small * float(np.trace(noise)) + np.finfo(float).tiny
     return np.asarray(np.linalg.inv(np.linalg.cholesky(noise + least * np.eye(3))), dtype=np.float64)
 
 
@@ -316,7 +314,7 @@ def _require_motion(wiggle: Wiggle, chain: RigidChain) -> None:
     if len(wiggle.t_joints) < 2:
         raise LatencyError("there are no encoder readings")
     span = np.ptp(wiggle.q, axis=0)
-    if not (span > np.where(chain.prismatic, _Settings.least_slide_m, _Settings.least_turn_rad)).any():
+    if not (span > np.where(chain.prismatic, LatencySettings.least_slide_m, LatencySettings.least_turn_rad)).any():
         turned = np.degrees(span[~chain.prismatic])
         most = f"{turned.max():.1f}° at most" if len(turned) else f"{1e3 * span.max():.1f} mm at most"
         raise LatencyError(
@@ -329,9 +327,9 @@ def _require_following(fit: _Fit, cost: float) -> None:
     """Raise LatencyError if the marker hardly moves with the joints."""
     residual_m = math.sqrt(cost / len(fit.x))
     moved_m = fit.motion_m
-    if moved_m > _Settings.follows * residual_m:
+    if moved_m > LatencySettings.follows * residual_m:
         return
-    if moved_m < _Settings.little_m:
+    if moved_m < LatencySettings.little_m:
         raise LatencyError(
             f"the marker moved by {1e3 * moved_m:.1f} mm only (RMS), hardly more than its noise. Move joints that "
             "bring it far: not one that turns it on the spot"
@@ -342,9 +340,10 @@ def _require_following(fit: _Fit, cost: float) -> None:
 def _strange(fit: _Fit, cost: float) -> str:
     """Return the message for a marker that does not move with the joints."""
     moved_m, residual_m = fit.motion_m, math.sqrt(cost / len(fit.x))
+    earliest_ms, latest_ms = 1e3 * LatencySettings.earliest_s, 1e3 * LatencySettings.latest_s
     return (
         f"the marker does not follow the joints: of {1e3 * moved_m:.0f} mm of motion (RMS) {1e3 * residual_m:.0f} mm "
-        f"do not go with them at any latency from {1e3 * EARLIEST_S:.0f} to {1e3 * LATEST_S:.0f} ms. Is it the marker "
+        f"do not go with them at any latency from {earliest_ms:.0f} to {latest_ms:.0f} ms. Is it the marker "
         "that is found (`bodyschema watch cameras`), are the joints in the order of robot.toml (`bodyschema watch "
         "joints`), and do the cameras stand still?"
     )
@@ -352,13 +351,14 @@ def _strange(fit: _Fit, cost: float) -> str:
 
 def _too_few(wiggle: Wiggle, fixes: int) -> str:
     """Return the reason for too few fixes with known angles at every latency: short, slow or out of sight."""
-    t, usable = wiggle.t_marker, f"the marker was seen {fixes} times, {_Settings.fewest_fixes} are needed"
+    t, usable = wiggle.t_marker, f"the marker was seen {fixes} times, {LatencySettings.fewest_fixes} are needed"
     span_s = min(t[-1], wiggle.t_joints[-1]) - max(t[0], wiggle.t_joints[0])
-    if span_s < _Settings.shortest_s:
+    if span_s < LatencySettings.shortest_s:
         return f"{usable}: encoders and cameras looked on together for {max(span_s, 0.0):.1f} s only. Move for 5 s"
     rate_hz = 1.0 / max(float(np.quantile(np.diff(t), 0.1)), 1e-3)
-    if rate_hz * (span_s - LATEST_S + EARLIEST_S) < 1.2 * _Settings.fewest_fixes:
-        seconds = math.ceil(1.2 * _Settings.fewest_fixes / rate_hz + LATEST_S - EARLIEST_S)
+    earliest_s, latest_s, fewest = LatencySettings.earliest_s, LatencySettings.latest_s, LatencySettings.fewest_fixes
+    if rate_hz * (span_s - latest_s + earliest_s) < 1.2 * fewest:
+        seconds = math.ceil(1.2 * fewest / rate_hz + latest_s - earliest_s)
         return (
             f"{usable}: the cameras give {rate_hz:.1f} images a second. Give --seconds {seconds}, or make them faster: "
             "a shorter exposure, or buffers = 2 (docs/cameras.md)"
@@ -367,7 +367,7 @@ def _too_few(wiggle: Wiggle, fixes: int) -> str:
 
 
 def _minimum(fit: _AnyFit, near_s: float, keep: NDArray[np.bool_] | slice = slice(None)) -> float:
-    span = near_s - 2 * STEP_S, near_s + 2 * STEP_S
+    span = near_s - 2 * LatencySettings.step_s, near_s + 2 * LatencySettings.step_s
     found: Any = minimize_scalar(
         lambda lag: fit.cost(lag, keep), bounds=span, method="bounded", options={"xatol": 1e-6}
     )
@@ -379,9 +379,9 @@ def _sigma(fit: _AnyFit, lag: float) -> float:
 
     The jackknife accounts for correlated residuals. The result is at least the sigma for independent residuals.
     """
-    blocks = np.arange(len(fit.x)) * _Settings.blocks // len(fit.x)
-    without = np.array([_minimum(fit, lag, blocks != block) for block in range(_Settings.blocks)])
-    jackknife = math.sqrt((_Settings.blocks - 1) * float(np.mean((without - without.mean()) ** 2)))
+    blocks = np.arange(len(fit.x)) * LatencySettings.blocks // len(fit.x)
+    without = np.array([_minimum(fit, lag, blocks != block) for block in range(LatencySettings.blocks)])
+    jackknife = math.sqrt((LatencySettings.blocks - 1) * float(np.mean((without - without.mean()) ** 2)))
     residual, step = fit.residual(lag), 1e-3
     slope = (fit.residual(lag + step) - fit.residual(lag - step)) / (2 * step)
     free = max(residual.size - fit.unknowns - 1, 1)
@@ -394,8 +394,8 @@ def _require_one(grid: FloatArray, cost: FloatArray, best: int) -> None:
     inner = np.r_[False, (cost[1:-1] <= cost[:-2]) & (cost[1:-1] <= cost[2:]), False]
     rivals = (
         inner
-        & (np.abs(grid - grid[best]) > _Settings.apart_s)
-        & (np.sqrt(cost) < _Settings.rival * math.sqrt(cost[best]))
+        & (np.abs(grid - grid[best]) > LatencySettings.apart_s)
+        & (np.sqrt(cost) < LatencySettings.rival * math.sqrt(cost[best]))
     )
     if rivals.any():
         other = grid[rivals][0]

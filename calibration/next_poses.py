@@ -20,11 +20,14 @@ from kbmaps import ChainPosterior, ExperimentDesign, next_poses
 from .rigid_chain import Calibration
 
 JSON, CSV = ".json", ".csv"
-# Shares of a joint's range at each end, and of the image at each edge, that poses keep away from.
-_JOINT_MARGIN, _IMAGE_MARGIN = 0.03, 0.05
-# More candidates gain less than 2 %.
-_CANDIDATES, _REGION = 600, 200
-_BATCH, _BATCHES = 2000, 50
+
+
+class _Settings:
+    # Shares of a joint's range at each end, and of the image at each edge, that poses keep away from.
+    joint_margin, image_margin = 0.03, 0.05
+    # More candidates gain less than 2 %.
+    candidates, region = 600, 200
+    batch, batches = 2000, 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,9 +53,9 @@ class NextPoses:
         """
         rng = np.random.default_rng(seed)
         allowed = np.empty((0, len(calibration.robot.joints)))
-        for _ in range(_BATCHES):
+        for _ in range(_Settings.batches):
             allowed = np.concatenate([allowed, allowed_poses(calibration, rng)])
-            if len(allowed) >= _CANDIDATES + _REGION:
+            if len(allowed) >= _Settings.candidates + _Settings.region:
                 break
         if len(allowed) < 2 * count:
             raise RecordingError(
@@ -61,7 +64,8 @@ class NextPoses:
                 file=calibration.recording.file,
                 remedy="Record poses that are farther apart, or ask for fewer",
             )
-        region, candidates = np.split(allowed[: _CANDIDATES + _REGION], [min(_REGION, len(allowed) // 2)])
+        half = min(_Settings.region, len(allowed) // 2)
+        region, candidates = np.split(allowed[: _Settings.candidates + _Settings.region], [half])
         posterior = ChainPosterior.of(calibration.learner)
         design = ExperimentDesign(posterior, region)
         chosen = next_poses(posterior, region, candidates, count)
@@ -110,15 +114,15 @@ def check_target(file: Path, *, replace: bool) -> None:
 def allowed_poses(calibration: Calibration, rng: np.random.Generator) -> FloatArray:
     """Draw joint readings (n, d), and return those that a next pose may have."""
     robot, recording = calibration.robot, calibration.recording
-    margin = _JOINT_MARGIN * (robot.upper - robot.lower)
-    q = rng.uniform(robot.lower + margin, robot.upper - margin, (_BATCH, len(robot.joints)))
+    margin = _Settings.joint_margin * (robot.upper - robot.lower)
+    q = rng.uniform(robot.lower + margin, robot.upper - margin, (_Settings.batch, len(robot.joints)))
     kept = _lowest(calibration, q) >= _lowest(calibration, recording.q).min()
     if robot.calibration is not None:
         size = np.array(robot.calibration.image_size_px * (2 if robot.calibration.is_stereo else 1))
         x = calibration.learner.predict(q)
         with np.errstate(divide="ignore", invalid="ignore"):
             pixels = robot.calibration.project(x)[:, : len(size)]
-        inside = (pixels > _IMAGE_MARGIN * size) & (pixels < (1.0 - _IMAGE_MARGIN) * size)
+        inside = (pixels > _Settings.image_margin * size) & (pixels < (1.0 - _Settings.image_margin) * size)
         kept &= (x[:, 2] > 0.0) & inside.all(axis=1)
     return q[kept]
 

@@ -11,7 +11,7 @@ import numpy as np
 from bodyschema.calibration.plausibility.verdict import Plausibility
 from bodyschema.calibration.rigid_chain import Calibration, Trusted
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning.solvers.tolerance_selection import WORKMANSHIP
+from bodyschema.learning.solvers.tolerance_selection import ToleranceSettings
 from bodyschema.recordings.recording import Recording
 from bodyschema.robot.calibrated_files import CAMERA_LINK
 from bodyschema.robot.description import RobotDescription
@@ -36,6 +36,12 @@ class _Settings:
     # No real arm is as good as its URDF to this [m]: the best of 18 measured ones is 0.08 mm off, and positions that a
     # robot publishes about itself are exact to the rounding of its joints.
     computed_m: float = 3e-5
+    still_rad, still_m = math.radians(10.0), 0.02  # a joint that moved less is named [rad, m]
+    # Multiples of its tolerance beyond which a joint offset is reported, and beyond which it is not written. One in 370
+    # exceeds the first if the tolerance is right; the second allows for a tolerance guessed at half its true value.
+    far_off, too_far_off = 3.0, 5.0
+    # Share of outliers above which they are mentioned: trackers and tags get less wrong.
+    most_outliers: float = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,12 +100,6 @@ def _after(values: FloatArray) -> FloatArray:
     return np.cumsum(values[::-1], axis=0)[::-1][1:]
 
 
-STILL_RAD, STILL_M = math.radians(10.0), 0.02  # a joint that moved less is named [rad, m]
-# Multiples of its tolerance beyond which a joint offset is reported, and beyond which it is not written. One in 370
-# exceeds the first if the tolerance is right; the second allows for a tolerance guessed at half its true value.
-FAR_OFF, TOO_FAR_OFF = 3.0, 5.0
-# Share of outliers above which they are mentioned: trackers and tags get less wrong.
-MOST_OUTLIERS = 0.1
 _DEG = math.degrees(1.0)
 _UNITS = (1e3, 1e3, 1e3, _DEG, _DEG, _DEG, 1e3, 1e3, 1e3)
 
@@ -199,12 +199,12 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
         named, expected = calibration.figures, calibration.expected
         zeros = _zeros(calibration, named.values[9:], named.half_widths[9:])
         made_badly = _badly_made(calibration)
-        beyond = [*_far_off(calibration, zeros, TOO_FAR_OFF), *made_badly]
+        beyond = [*_far_off(calibration, zeros, _Settings.too_far_off), *made_badly]
         drawn_error_m = _mean_error(calibration.placed.chain.positions(recording.q), recording)
         doubts = [*seen.sentences, *_computed(drawn_error_m), *_stamped_late(calibration)]
         doubts += _many_left_out(calibration, first)
         if jump is None:  # the figures of two tools are of neither
-            doubts += [*_far_off(calibration, zeros, FAR_OFF), *made_badly]
+            doubts += [*_far_off(calibration, zeros, _Settings.far_off), *made_badly]
         values, halves = named.values, named.half_widths
         figures = [
             Figure(*(float(unit * number) for number in numbers))
@@ -309,7 +309,7 @@ def _stamped_late(calibration: Calibration) -> list[str]:
 def _many_left_out(calibration: Calibration, first: int) -> list[str]:
     """Return a message, if any, on more outliers than an instrument has, or on outliers in a run of rows."""
     off = np.flatnonzero(~calibration.learner.inliers)
-    if len(off) <= MOST_OUTLIERS * len(calibration.recording):
+    if len(off) <= _Settings.most_outliers * len(calibration.recording):
         return []
     runs = np.split(off, np.flatnonzero(np.diff(off) > 1) + 1)
     longest = max(runs, key=len) + first
@@ -324,7 +324,7 @@ def _many_left_out(calibration: Calibration, first: int) -> list[str]:
 
 def _badly_made(calibration: Calibration) -> list[str]:
     """Return a message if the geometric errors reach the largest that are considered; else an empty list."""
-    made, (axes, points) = calibration.workmanship, WORKMANSHIP[-1]
+    made, (axes, points) = calibration.workmanship, ToleranceSettings.workmanship[-1]
     if made is None or made.axes < axes:
         return []
     return [
@@ -336,7 +336,7 @@ def _badly_made(calibration: Calibration) -> list[str]:
 
 def _still(robot: RobotDescription, recording: Recording) -> list[str]:
     """Return the joints that hardly moved."""
-    least = np.where(robot.chain.prismatic, STILL_M, STILL_RAD)
+    least = np.where(robot.chain.prismatic, _Settings.still_m, _Settings.still_rad)
     moved = np.ptp(recording.q, axis=0)
     return [name for name, still in zip(robot.joints, moved < least, strict=True) if still]
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning.solvers.tolerance_selection import WORKMANSHIP, probable
+from bodyschema.learning.solvers.tolerance_selection import ToleranceSettings, probable
 from bodyschema.recordings.recording import Recording
 from bodyschema.robot.description import RobotDescription
 from kbmaps import (
@@ -28,7 +28,7 @@ from kbmaps import (
     rotation_matrices,
     unexplained_variance,
 )
-from kbmaps.robust import ROUNDING_M
+from kbmaps.robust import RobustSettings
 
 from .chain_figures import ChainFigures, is_told
 
@@ -179,7 +179,7 @@ class Calibration:
 
         The prior allows an arm of the worst workmanship.
         """
-        report, (axes, points) = self.learner.report(), WORKMANSHIP[-1]
+        report, (axes, points) = self.learner.report(), ToleranceSettings.workmanship[-1]
         parameters = ChainParameters(self.placed.chain)
         before = ChainBelief.from_tolerances(parameters, replace(self.learner.tolerances, axes=axes, points=points))
         _, jacobian = parameters.linearised(self.learner.change, self.recording.q)
@@ -202,7 +202,7 @@ def _learners(
     common: FloatArray | None,
 ) -> tuple[tuple[RigidLearner, ...], FloatArray]:
     """Return learners of all pairs with the tolerances that a sample of the pairs makes probable, and their shares."""
-    told = None if recording.cov is None else recording.cov + ROUNDING_M**2 * np.eye(3)
+    told = None if recording.cov is None else recording.cov + RobustSettings.rounding_m**2 * np.eye(3)
     some = np.unique(np.linspace(0, len(recording) - 1, _Settings.judged_pairs).astype(np.intp))
 
     def learner(tolerances: ChainTolerances, rows: IntArray) -> RigidLearner:
@@ -239,7 +239,7 @@ def _told(recording: Recording, learner: RigidLearner, rows: IntArray, common: F
     """Return the stated covariances (n, 3, 3) [m²], the arm's share added in some rows; None if none are stated."""
     if recording.cov is None:
         return None
-    return recording.cov + (ROUNDING_M**2 + _of_the_arm(learner, recording, rows, common)) * np.eye(3)
+    return recording.cov + (RobustSettings.rounding_m**2 + _of_the_arm(learner, recording, rows, common)) * np.eye(3)
 
 
 def _of_the_arm(learner: RigidLearner, recording: Recording, rows: IntArray, common: FloatArray | None) -> float:
@@ -248,7 +248,7 @@ def _of_the_arm(learner: RigidLearner, recording: Recording, rows: IntArray, com
     good = rows[learner.inliers]
     residuals = _residuals(learner, recording, rows, common)[learner.inliers]
     freedom = max(learner.scatter.freedom, 1.0)
-    return unexplained_variance(residuals, recording.cov[good] + ROUNDING_M**2 * np.eye(3), freedom)
+    return unexplained_variance(residuals, recording.cov[good] + RobustSettings.rounding_m**2 * np.eye(3), freedom)
 
 
 def fewest_pairs(joints: int, trusted: Trusted) -> int:
@@ -264,7 +264,7 @@ def _tolerances(
 
     The frame's pose is a turn about this origin and a shift: from afar, a small turn of the arm is a long shift.
     """
-    links = WORKMANSHIP if trusted == "nothing" else ((0.0, 0.0),)
+    links = ToleranceSettings.workmanship if trusted == "nothing" else ((0.0, 0.0),)
     free_zeros = trusted != "urdf"
     pose_known, marker_known = robot.camera.pose_known, robot.robot.marker_known
     fitted_place_m = max(_Settings.fitted_place_m, _Settings.fitted_turn_rad * distance_m)

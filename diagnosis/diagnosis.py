@@ -28,7 +28,7 @@ from bodyschema.diagnosis.fit.fit import Fit, fitted
 from bodyschema.diagnosis.fit.instrument import instrument_factor, reshaped
 from bodyschema.diagnosis.fit.noise import correlation, wanders
 from bodyschema.diagnosis.fit.observations import IntArray, Observations
-from bodyschema.diagnosis.fit.worth import NAMED
+from bodyschema.diagnosis.fit.worth import WorthSettings
 from bodyschema.diagnosis.search.drives import with_small_ripples
 from bodyschema.diagnosis.search.held_out import Added, Blocks, added, gain_percent, held_out_errors, is_marker
 from bodyschema.diagnosis.search.hypotheses import Hypotheses
@@ -46,7 +46,7 @@ from .stages import RIVALS, SEARCH, SETS, UNNAMED, Stages
 Told = Callable[[str], None]
 
 
-class _Settings:
+class DiagnosisSettings:
     """Settings of the diagnosis.
 
     Sensitivity, each at 0.3 and 3 times over seven recordings with hidden errors: `same_scale` and `rescaled`, with
@@ -67,10 +67,8 @@ class _Settings:
     same_noise = 0.1  # smallest change of the instrument's noise (in logarithms) that triggers a refit
     # In more than twice as many rows, causes are sought in runs of neighbouring rows, and fitted to all of them.
     most_rows, run = 1000, 50
-
-
-# Rows before which the state is unknown are left out while most rows remain: a false jump may stand in for them.
-MOST_DOUBTFUL = 0.5
+    # Rows before which the state is unknown are left out while most rows remain: a false jump may stand in for them.
+    most_doubtful = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +131,7 @@ class Diagnosis:
     def leaves_out(self) -> bool:
         """True if extended.toml leaves out what reduces the error by more than a little here."""
         squares = [np.square(errors[self.markers]).sum() for errors in (self.complete_errors, self.errors["extended"])]
-        return bool(squares[0] < _Settings.little * squares[1])
+        return bool(squares[0] < DiagnosisSettings.little * squares[1])
 
     @cached_property
     def held_out(self) -> dict[str, FloatArray]:
@@ -157,7 +155,7 @@ class Diagnosis:
     def outliers_are_found(self) -> bool:
         """Return True if outliers are numerous and large enough to be a finding."""
         worth = self.extended.noise.log_likelihood - self.extended.without_outliers
-        named = self.outliers >= _Settings.fewest_outliers and worth > _Settings.outliers_named
+        named = self.outliers >= DiagnosisSettings.fewest_outliers and worth > DiagnosisSettings.outliers_named
         return named and not self._off_where_fast() and not self._off_by_what_is_inexact()
 
     def _off_by_what_is_inexact(self) -> bool:
@@ -171,7 +169,7 @@ class Diagnosis:
             changes.append(self.left.model.explained)
         squares = np.square(fit.observations.whitened(np.stack(changes, axis=2))).sum(axis=1).mean(axis=0)
         off = np.square(fit.residuals[self._off]).sum(axis=1)
-        return bool(np.median(off) < _Settings.by_so_much**2 * squares.sum())
+        return bool(np.median(off) < DiagnosisSettings.by_so_much**2 * squares.sum())
 
     def _off_where_fast(self) -> bool:
         """Return True if the outliers are mostly at the fastest rows; the motion is then poorly modelled."""
@@ -180,7 +178,7 @@ class Diagnosis:
         duration = np.ones(len(motion)) if motion.t is None else np.append(np.inf, np.diff(motion.t))
         speed = steps / np.maximum(duration, 1e-9)
         on, off = self.markers, self._off
-        return max(_exceeds(v[off], v[on]) for v in (steps, speed)) > _Settings.mostly
+        return max(_exceeds(v[off], v[on]) for v in (steps, speed)) > DiagnosisSettings.mostly
 
     def gain(self) -> tuple[float, tuple[float, float]]:
         """Return the reduction of the RMS from aligned to extended [%], with its 95 % interval on new poses."""
@@ -235,7 +233,7 @@ class Diagnosis:
         roots = np.linalg.inv(fit.observations.whitening)
         stated = roots @ np.swapaxes(roots, 1, 2)
         # Scale the stated noise to the size of the residuals, corrected for what the fit absorbed.
-        spent = min(fit.background.spent(fit.noise.sigma) / max(left.size, 1), _Settings.most_spent)
+        spent = min(fit.background.spent(fit.noise.sigma) / max(left.size, 1), DiagnosisSettings.most_spent)
         size = np.square(left).sum() / np.trace(stated[kept], axis1=1, axis2=2).sum() / (1.0 - spent) * (1.0 - shared)
         # The play of a loose marker is no noise.
         return float(size) * fit.observations.own
@@ -388,13 +386,14 @@ def _part_of(begins: NDArray[np.bool_]) -> IntArray:
         begins: (n,), True in the first row after each break.
     """
     rows = len(begins)
-    if rows <= 2 * _Settings.most_rows:
+    if rows <= 2 * DiagnosisSettings.most_rows:
         return np.arange(rows)
-    breaks = np.convolve(begins[1:], np.ones(_Settings.run - 1), "valid")
-    firsts = np.linspace(0, rows - _Settings.run, _Settings.most_rows // _Settings.run).astype(np.intp)
+    breaks = np.convolve(begins[1:], np.ones(DiagnosisSettings.run - 1), "valid")
+    runs = DiagnosisSettings.most_rows // DiagnosisSettings.run
+    firsts = np.linspace(0, rows - DiagnosisSettings.run, runs).astype(np.intp)
     for k, (first, after) in enumerate(pairwise(firsts.tolist())):
-        firsts[k] += np.argmin(breaks[first : after - _Settings.run + 1])
-    return (firsts[:, None] + np.arange(_Settings.run)).ravel()
+        firsts[k] += np.argmin(breaks[first : after - DiagnosisSettings.run + 1])
+    return (firsts[:, None] + np.arange(DiagnosisSettings.run)).ravel()
 
 
 def _moment_anew(fit: Fit, cause: Effect, searched: FloatArray) -> Candidate | None:
@@ -410,7 +409,7 @@ def _left_out(fit: Fit) -> NDArray[np.bool_]:
     If they are too many, these are only the first ones, and the arm is taken to go straight from each run to the next.
     """
     rows = fit.doubtful()
-    return rows if rows.mean() <= MOST_DOUBTFUL else fit.doubtful_at_first
+    return rows if rows.mean() <= DiagnosisSettings.most_doubtful else fit.doubtful_at_first
 
 
 def _found(
@@ -448,7 +447,7 @@ def _found(
     bare = begun.with_causes([]).to(start.observations)
     fits = [start, bare, *([extended.with_causes(steady)] if steady else [])]
     loose = None if start.is_exact else _loose(explanation, fits, search)
-    for _ in range(_Settings.rattled if loose is not None else 0):
+    for _ in range(DiagnosisSettings.rattled if loose is not None else 0):
         assert loose is not None
         told(loose.what)
         # Begin again: causes may have been named for it, and the noise is smaller without it.
@@ -487,7 +486,7 @@ def _loose(explanation: Explanation, fits: Sequence[Fit], search: Search) -> Rat
     other = explanation.worth - explanation.counted * beside.log_likelihood + likelihood(beside)
     worths = [(play.likelihood - names - other, play) for play, names in found if play is not None]
     worth, play = max(worths, key=lambda one: one[0], default=(-np.inf, None))
-    return play if worth > NAMED else None
+    return play if worth > WorthSettings.named_nats else None
 
 
 def _refitted(fit: Fit, start: Fit, simulation: Simulation, shape: Observations | None = None) -> tuple[Fit, Fit]:
@@ -502,7 +501,7 @@ def _refitted(fit: Fit, start: Fit, simulation: Simulation, shape: Observations 
     before = np.zeros_like(left_out) if observations.doubtful is None else observations.doubtful
     # Other sizes of the same causes change few rows.
     other_rows = (left_out ^ before).sum() > (left_out & before).sum()
-    other_noise = abs(np.log(factor / observations.stated_factor)) > _Settings.same_noise
+    other_noise = abs(np.log(factor / observations.stated_factor)) > DiagnosisSettings.same_noise
     if fit.is_exact or not (other_rows or other_noise or shape is not None):
         return fit, start
     observations = (shape or observations).with_factor(factor).without(left_out)
@@ -531,7 +530,7 @@ def _stored(start: Fit, alone: Fit, complete: Fit, left: ResidualStructure, bloc
 def _searched(begun: Fit, search: Search) -> Fit:
     """Run the search for causes from a fit, and refit with tolerances updated to what it finds."""
     extended = begun
-    for _ in range(_Settings.rescaled):
+    for _ in range(DiagnosisSettings.rescaled):
         begun = _with_small_ones_tolerated(begun)
         extended = search.run(begun)
         before = extended.background.scales or Scales()
@@ -539,7 +538,8 @@ def _searched(begun: Fit, search: Search) -> Fit:
         bare = extended.with_causes([])
         search.path = [bare.tolerating(before.no_larger), bare, *search.path[1:]]
         scales = tolerated(extended).scales
-        is_same = not _small_ones(extended) and np.abs(np.log(scales) - np.log(before)).max() < _Settings.same_scale
+        moved = np.abs(np.log(scales) - np.log(before)).max()
+        is_same = not _small_ones(extended) and moved < DiagnosisSettings.same_scale
         if search.ended_early or is_same:
             break
         begun = extended.tolerating(scales, _small_ones(extended))

@@ -18,7 +18,6 @@ SETS = Stage("comparing sets of causes", 45.0)
 SEARCH = Stage("searching for further causes", 65.0)
 UNNAMED = Stage("asking whether something without a name is at work", 80.0)
 RIVALS = Stage("asking what else it could be", 95.0)
-_OF_THE_REST = 0.25  # The number of steps of a stage is unknown: each takes this share of what is left of it
 
 
 class Stages:
@@ -40,7 +39,8 @@ class Stages:
 
     def __call__(self, said: str) -> None:
         """Tell a step of the current stage."""
-        self._done += max(self._stage.ends - self._done, 0.0) * _OF_THE_REST
+        # The number of steps of a stage is unknown: each takes a quarter of what is left of it.
+        self._done += max(self._stage.ends - self._done, 0.0) * 0.25
         self._say(f"{self._stage.what}: {said}")
 
     def _say(self, said: str) -> None:

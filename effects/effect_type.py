@@ -35,10 +35,13 @@ STAGES: tuple[Stage, ...] = get_args(Stage)
 # How the last parameter is searched: not at all, as a moment, a number of cycles, a width that is also the amount, one
 # of `trial_shapes`, or a load of those shares of the largest one.
 ShapeSearch = Literal["none", "moment", "cycles", "width", "shape", "load"]
-# Largest step of a period or a time constant, as a share of it; largest change in one step.
-_SHAPE_STEP, _SHAPE_CHANGE = 0.3, 2.0
-_MOST_MOMENTS = 2  # two moments at one place are told apart; further ones are a drift
-STEP = 1e-6  # step of numerical derivatives [rad, m, or a parameter's unit]
+
+
+class EffectSettings:
+    # Largest step of a period or a time constant, as a share of it; largest change in one step.
+    shape_step, shape_change = 0.3, 2.0
+    most_moments = 2  # two moments at one place are told apart; further ones are a drift
+    step = 1e-6  # step of numerical derivatives [rad, m, or a parameter's unit]
 
 
 class SimulatedArm(Protocol):
@@ -174,7 +177,7 @@ class EffectType(ABC):
     @property
     def most_at_one_place(self) -> int:
         """Maximum of effects of this type at one place."""
-        return _MOST_MOMENTS if self.begins else 1
+        return EffectSettings.most_moments if self.begins else 1
 
     def is_free(self, robot: RobotDescription) -> bool:
         """Return True if robot.toml does not know what it changes: it is fitted first, and never a finding."""
@@ -190,11 +193,12 @@ class EffectType(ABC):
 
     def shape_step(self, run: SimulationRun, effect: Effect, k: int) -> float:
         """Return the largest step of value k, a smooth shape, for which its derivative is still valid."""
-        return _SHAPE_STEP * float(effect.values[k])
+        return EffectSettings.shape_step * float(effect.values[k])
 
     def bounded(self, effect: Effect, k: int, value: float, motion: Motion) -> float:
         """Limit value k, a smooth shape, to its valid range and to one step from the present one."""
-        return float(np.clip(value, effect.values[k] / _SHAPE_CHANGE, _SHAPE_CHANGE * effect.values[k]))
+        factor = EffectSettings.shape_change
+        return float(np.clip(value, effect.values[k] / factor, factor * effect.values[k]))
 
     def unknown_state(self, run: SimulationRun, effect: Effect) -> NDArray[np.bool_]:
         """Return rows (n,) at which its state is not known well enough, as before the first contact of a backlash."""

@@ -14,9 +14,11 @@ from .effect_type import Effect, EffectType, SimulationRun
 from .motion import Motion
 from .parameter import Place
 
-# Number of runs whose strains are kept: the diagnosis asks again for those of its candidates.
-STRAINS_KEPT = 256
-_FORGOTTEN = 1e-17  # share of a past move below which it is ignored
+
+class EncoderSettings:
+    # Number of runs whose strains are kept: the diagnosis asks again for those of its candidates.
+    strains_kept = 256
+    forgotten = 1e-17  # share of a past move below which it is ignored
 
 
 class LiveError(Protocol):
@@ -101,7 +103,7 @@ def carried_on(added: FloatArray, kept: FloatArray) -> FloatArray:
     """Solve e_i = added_i + kept_i e_{i-1} for all rows (n,); nothing is kept from before the first."""
     total, kept, back = added.copy(), kept.copy(), 1
     # Doubling: `kept` is the share of a row that remains after `back` rows.
-    while back < len(total) and np.abs(kept).max() > _FORGOTTEN:
+    while back < len(total) and np.abs(kept).max() > EncoderSettings.forgotten:
         total[back:] += kept[back:] * total[:-back]
         kept[back:] *= kept[:-back]
         back *= 2

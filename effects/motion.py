@@ -12,8 +12,6 @@ from bodyschema.interfaces.records import FloatArray, frozen_array
 from bodyschema.recordings.recording import Recording
 from kbmaps.rotations import exponentials
 
-_EARLIER_KEPT = 16
-
 
 @dataclass(frozen=True, eq=False)
 class Motion:
@@ -133,7 +131,7 @@ class Motion:
         return self if lag_s == 0.0 else _earlier(self, lag_s)
 
 
-@lru_cache(maxsize=_EARLIER_KEPT)
+@lru_cache(maxsize=16)
 def _earlier(motion: Motion, lag_s: float) -> Motion:
     """Return the earlier readings; cached, since a search repeats the same lags."""
     assert motion.t is not None

@@ -21,9 +21,9 @@ from kbmaps import RigidChain
 
 from .effect_type import (
     STAGES,
-    STEP,
     CameraEffect,
     Effect,
+    EffectSettings,
     EffectType,
     Identity,
     Stage,
@@ -38,8 +38,12 @@ from .motion import Motion
 from .optics import Optics
 from .parameter import Place
 
-_SHAPE_STEP = 1e-3  # relative step by a period or a time constant
-SPRING_ROUNDS = 3  # a spring's deflection changes its own load; each round adds the next order
+
+class SimulationSettings:
+    shape_step = 1e-3  # relative step by a period or a time constant
+    spring_rounds = 3  # a spring's deflection changes its own load; each round adds the next order
+
+
 # Corrections (n,) of readings by the encoder effects that were evaluated there, as long as both live.
 _CORRECTIONS: WeakKeyDictionary[Motion, WeakKeyDictionary[Effect, FloatArray]] = WeakKeyDictionary()
 # Predictions (n, 3) of residuals, which no effect changes, as long as both live.
@@ -265,7 +269,7 @@ class Simulation:
         if not self.bears_weight:
             return given
         if self.springs.any():
-            for _ in range(SPRING_ROUNDS):
+            for _ in range(SimulationSettings.spring_rounds):
                 given = self.springs * self.torques(q + given)
         loose = [(effect, kind) for effect, kind in self._of(StructureEffect) if kind.has_slack]
         torques, sides = self.torques(q + given) if loose else given, {} if hung is None else hung
@@ -434,7 +438,7 @@ class Simulated:
         derivatives = []
         for k in effect.shapes:
             step = np.zeros(len(effect.values))
-            step[k] = _SHAPE_STEP * (abs(effect.values[k]) or 1.0)
+            step[k] = SimulationSettings.shape_step * (abs(effect.values[k]) or 1.0)
             above, below = (self.columns(effect.with_values(effect.values + sign * step)) for sign in (1.0, -1.0))
             change = (above - below)[:, :, effect.amounts] @ effect.values[effect.amounts]
             derivatives.append(change / (2.0 * step[k]))
@@ -451,10 +455,11 @@ class Simulated:
         columns = []
         for parameter in effect.parameters:
             number = getattr(optics, parameter.name)
-            more, less = (replace(optics, **{parameter.name: number + step}) for step in (STEP, -STEP))
+            both = EffectSettings.step, -EffectSettings.step
+            more, less = (replace(optics, **{parameter.name: number + step}) for step in both)
             change = simulation.reported(self.x_camera, self.motion, more)
             change = change - simulation.reported(self.x_camera, self.motion, less)
-            columns.append(change / (2.0 * STEP))
+            columns.append(change / (2.0 * EffectSettings.step))
         return np.stack(columns, axis=2)
 
     def by_report(self, effect: Effect) -> FloatArray:
@@ -462,10 +467,10 @@ class Simulated:
         columns = np.zeros((len(self.motion), 3, len(effect.values)))
         for k in effect.all_amounts:
             step = np.zeros(len(effect.values))
-            step[k] = STEP
+            step[k] = EffectSettings.step
             ends = (self.simulation.having(effect.with_values(effect.values + s * step)) for s in (1.0, -1.0))
             more, less = (simulation.reported(self.x_camera, self.motion) for simulation in ends)
-            columns[:, :, k] = (more - less) / (2.0 * STEP)
+            columns[:, :, k] = (more - less) / (2.0 * EffectSettings.step)
         return columns
 
     def seen(self, moved: FloatArray) -> FloatArray:
@@ -495,6 +500,6 @@ class Simulated:
         reported = self.simulation.reported
         changes = [
             reported(self.x_camera + step, self.motion) - reported(self.x_camera - step, self.motion)
-            for step in STEP * np.eye(3)
+            for step in EffectSettings.step * np.eye(3)
         ]
-        return np.stack(changes, axis=2) / (2.0 * STEP)
+        return np.stack(changes, axis=2) / (2.0 * EffectSettings.step)

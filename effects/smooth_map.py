@@ -19,10 +19,13 @@ from kbmaps import JointBasis, KBMap
 from .unexplained import PLACE, Unexplained
 
 Shift = Callable[[FloatArray], FloatArray]
-_MOST_HARMONICS, _LARGEST_NET = 15, 3**12  # maximum of harmonics, and of control points of a net
-# Points along an axis and lines on which harmonics are sought; rows per batch.
-_POINTS, _LINES, _ROWS = 64, 12, 4096
-_LARGEST_GRID = 400_000  # maximum of grid points
+
+
+class _Settings:
+    most_harmonics, largest_net = 15, 3**12  # maximum of harmonics, and of control points of a net
+    # Points along an axis and lines on which harmonics are sought; rows per batch.
+    points, lines, rows = 64, 12, 4096
+    largest_grid = 400_000  # maximum of grid points
 
 
 @dataclass(frozen=True)
@@ -80,7 +83,7 @@ class _Axis:
     @property
     def in_columns(self) -> FloatArray:
         """Functions in terms of the column bases (functions, m, ..., m)."""
-        q = self.spread(4 * _POINTS)
+        q = self.spread(4 * _Settings.points)
         columns = [basis.weights(factor * q) for basis, factor in zip(self.bases, self.factors, strict=True)]
         products = reduce(
             lambda a, b: (a[:, :, None] * b[:, None, :]).reshape(len(q), -1), columns, np.ones((len(q), 1))
@@ -114,7 +117,7 @@ def _learnt(
     tolerance_m: float,
 ) -> Unexplained:
     axes = [_axis(slides[k], shift, q, k, tolerance_m) for k in range(q.shape[1])]
-    while np.prod([float(len(axis.grid)) for axis in axes]) > _LARGEST_GRID:
+    while np.prod([float(len(axis.grid)) for axis in axes]) > _Settings.largest_grid:
         most = max(range(len(axes)), key=lambda k: axes[k].harmonics)
         axes[most] = replace(axes[most], harmonics=axes[most].harmonics - 1)
     axes, amounts = _pruned(axes, _amounts(axes, shift), tolerance_m)
@@ -129,11 +132,11 @@ def _axis(slides: bool, shift: Shift, q: FloatArray, joint: int, tolerance_m: fl
     if slides and high - low < 1e-6:
         low, high = low - 0.5, low + 0.5
     axis = _Axis(slides, low, high, 0)
-    points = axis.spread(_POINTS)
-    lines = np.repeat(q[np.linspace(0, len(q) - 1, _LINES).round().astype(int)], _POINTS, axis=0)
-    lines[:, joint] = np.tile(points, _LINES)
-    values = np.swapaxes(shift(lines).reshape(_LINES, _POINTS, 3), 0, 1).reshape(_POINTS, -1)
-    for harmonics in range(_MOST_HARMONICS + 1):
+    points = axis.spread(_Settings.points)
+    lines = np.repeat(q[np.linspace(0, len(q) - 1, _Settings.lines).round().astype(int)], _Settings.points, axis=0)
+    lines[:, joint] = np.tile(points, _Settings.lines)
+    values = np.swapaxes(shift(lines).reshape(_Settings.lines, _Settings.points, 3), 0, 1).reshape(_Settings.points, -1)
+    for harmonics in range(_Settings.most_harmonics + 1):
         axis = replace(axis, harmonics=harmonics)
         functions = axis.functions(points)
         left = values - functions @ np.linalg.lstsq(functions, values, rcond=1e-10)[0]
@@ -147,7 +150,7 @@ def _amounts(axes: Sequence[_Axis], shift: Shift) -> FloatArray:
     """Return amounts of all products of the axes' functions (functions, ..., functions, 3)."""
     grids = [axis.grid for axis in axes]
     q = np.stack(np.meshgrid(*grids, indexing="ij"), axis=-1).reshape(-1, len(axes))
-    values = np.concatenate([shift(q[first : first + _ROWS]) for first in range(0, len(q), _ROWS)])
+    values = np.concatenate([shift(q[first : first + _Settings.rows]) for first in range(0, len(q), _Settings.rows)])
     amounts = values.reshape(*(len(grid) for grid in grids), 3)
     for k, axis in enumerate(axes):
         solve = np.linalg.pinv(axis.functions(grids[k]), rcond=1e-10)
@@ -169,7 +172,7 @@ def _pruned(axes: list[_Axis], amounts: FloatArray, tolerance_m: float) -> tuple
             return axes, amounts
         least = min(parts, key=lambda k: parts[k])
         net = np.prod([float(basis.size) for axis in axes for basis in axis.bases])
-        if squared + parts[least] > tolerance_m**2 and net <= _LARGEST_NET:
+        if squared + parts[least] > tolerance_m**2 and net <= _Settings.largest_net:
             return axes, amounts
         squared += parts[least]
         amounts = np.take(amounts, range(amounts.shape[least] - axes[least].last), axis=least)

@@ -78,12 +78,9 @@ def require_positive(name: str, value: float, unit: str = "") -> None:
         raise SettingError(f"{name} must be finite and greater than 0{unit}, got {value!r}")
 
 
-_BATCH_ROWS = 1024  # small enough to stay in the cache
-
-
-def batches(count: int) -> Iterator[slice]:
-    """Yield slices of at most `_BATCH_ROWS` rows that together cover `count` rows."""
-    return (slice(start, start + _BATCH_ROWS) for start in range(0, count, _BATCH_ROWS))
+def batches(count: int, rows: int = 1024) -> Iterator[slice]:
+    """Yield slices of at most `rows` rows, few enough to stay in the cache, that together cover `count` rows."""
+    return (slice(start, start + rows) for start in range(0, count, rows))
 
 
 def limits(name: str, values: ArrayLike, width: int) -> FloatArray:

@@ -13,7 +13,7 @@ from kbmaps.arrays import FloatArray
 from kbmaps.errors import ShapeError
 
 
-class _Settings:
+class ContestSettings:
     # Over longer lags than this share of the series, the sum would be dominated by noise.
     longest_lag_share: float = 0.25
     fewest: int = 3  # minimum number of pairs predicted by both models for a comparison
@@ -28,6 +28,11 @@ class _Settings:
     # A squared error is capped at this multiple of the better model's median: an outlier says nothing about either.
     cap: float = 9.0
     least: float = 1e-30  # Lower bound of the median [m²]: where a model is exact, another one that errs still loses
+    # Number of the last pairs that are compared: at least this many, or this share of all so far, up to a bound.
+    shortest, share, longest = 100, 0.5, 1000
+    # A model is worse than another when the difference of their squared errors is this many standard errors.
+    clearly: float = 2.0
+    listed: int = 10  # a model is listed next to the answering one if it has predicted this many of the last pairs
 
 
 def shared_by(residuals: FloatArray) -> float:
@@ -38,7 +43,7 @@ def shared_by(residuals: FloatArray) -> float:
     centred: a mean is an error too.
     """
     n = len(residuals)
-    longest = int(n * _Settings.longest_lag_share)
+    longest = int(n * ContestSettings.longest_lag_share)
     square = float(np.vdot(residuals, residuals)) / max(n, 1)
     if longest < 2 or square == 0.0:
         return 1.0
@@ -50,13 +55,6 @@ def shared_by(residuals: FloatArray) -> float:
     ends = np.flatnonzero(pairs <= 0.0)
     count = int(ends[0]) if len(ends) else len(pairs)
     return max(2.0 * float(pairs[:count].sum()) - 1.0, 1.0)
-
-
-# Number of the last pairs that are compared: at least this many, or this share of all so far, up to a bound.
-SHORTEST, SHARE, LONGEST = 100, 0.5, 1000
-# A model is worse than another when the difference of their squared errors is this many standard errors.
-CLEARLY = 2.0
-LISTED = 10  # a model is listed next to the answering one if it has predicted this many of the last pairs
 
 
 @dataclass(frozen=True)
@@ -121,7 +119,11 @@ class PrequentialComparison:
         for name in added:
             self._errors.setdefault(name, np.full(self._length, math.nan))
         self._pairs += count
-        self._length = min(self._length + count, LONGEST, int(max(SHORTEST, SHARE * self._pairs)))
+        self._length = min(
+            self._length + count,
+            ContestSettings.longest,
+            int(max(ContestSettings.shortest, ContestSettings.share * self._pairs)),
+        )
         none = np.full(count, math.nan)
         for name, values in self._errors.items():
             more = added.get(name, none)
@@ -143,21 +145,21 @@ class PrequentialComparison:
 
     def compares(self, name: str) -> bool:
         """Return True if a model has predicted enough of the last pairs to be compared."""
-        return name in self._errors and _count(self._errors[name]) >= _Settings.fewest
+        return name in self._errors and _count(self._errors[name]) >= ContestSettings.fewest
 
     def recent(self, answering: str) -> Recent:
         """Return the models' errors on the last pairs, the same pairs for all of them.
 
         A model that has predicted few of the pairs of `answering` is left out.
         """
-        last = {name: values[-_Settings.lately :] for name, values in self._errors.items()}
+        last = {name: values[-ContestSettings.lately :] for name, values in self._errors.items()}
         seen = {name: np.isfinite(values) for name, values in last.items()}
         if answering not in seen or not seen[answering].any():
             answering = max(seen, key=lambda name: int(seen[name].sum()), default="")
         if not answering:
             return Recent(0, {})
         common = seen[answering]
-        fewest = min(LISTED, int(common.sum()))
+        fewest = min(ContestSettings.listed, int(common.sum()))
         listed = [name for name in seen if (seen[name] & seen[answering]).sum() >= fewest]
         for name in listed:
             common = common & seen[name]
@@ -175,7 +177,9 @@ class PrequentialComparison:
             present: the model that answers while too few pairs were predicted.
         """
         errors = ((name, self._errors.get(name)) for name in trusted)
-        tried = {name: values for name, values in errors if values is not None and _count(values) >= _Settings.fewest}
+        tried = {
+            name: values for name, values in errors if values is not None and _count(values) >= ContestSettings.fewest
+        }
         rivals = {name: [other for rival, other in tried.items() if rival != name] for name in tried}
         lately = [name for name in tried if not any(_worse_lately(tried[name], other) for other in rivals[name])]
         for name in lately:
@@ -189,26 +193,27 @@ def _count(errors: FloatArray) -> int:
 
 
 def _worse_lately(errors: FloatArray, others: FloatArray) -> bool:
-    errors, others = errors[-_Settings.lately :], others[-_Settings.lately :]
+    errors, others = errors[-ContestSettings.lately :], others[-ContestSettings.lately :]
     both = np.isfinite(errors) & np.isfinite(others)
-    if both.sum() < _Settings.fewest:
+    if both.sum() < ContestSettings.fewest:
         return False
     return (
-        float(np.sqrt(errors[both]).mean()) > _Settings.worse * float(np.sqrt(others[both]).mean()) + _Settings.least_m
+        float(np.sqrt(errors[both]).mean())
+        > ContestSettings.worse * float(np.sqrt(others[both]).mean()) + ContestSettings.least_m
     )
 
 
 def _clearly_worse(errors: FloatArray, others: FloatArray) -> bool:
     both = np.isfinite(errors) & np.isfinite(others)
     errors, others, count = errors[both], others[both], int(both.sum())
-    if count < _Settings.fewest:
+    if count < ContestSettings.fewest:
         return False
-    cap = _Settings.cap * max(min(float(np.median(errors)), float(np.median(others))), _Settings.least)
+    cap = ContestSettings.cap * max(min(float(np.median(errors)), float(np.median(others))), ContestSettings.least)
     losses = np.minimum(errors, cap) - np.minimum(others, cap)
     mean = float(losses.mean())
     # Few losses may be alike by chance: their spread is widened accordingly.
     error = float(losses.std(ddof=1)) / math.sqrt(count) * (1.0 + 3.0 / count)
-    if mean <= CLEARLY * error:
+    if mean <= ContestSettings.clearly * error:
         return False
     # Neighbours on a path have correlated losses, and count as one.
-    return mean > CLEARLY * error * math.sqrt(shared_by((losses - mean)[:, None]))
+    return mean > ContestSettings.clearly * error * math.sqrt(shared_by((losses - mean)[:, None]))

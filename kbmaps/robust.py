@@ -11,14 +11,20 @@ from kbmaps.pairs import Pairs
 
 # The norm of a residual with noise σ per axis has the median 1.538 σ in three dimensions (√ of χ²₃'s median).
 MEDIAN_NORM = 1.538
-ROUNDING_M = 1e-9  # residuals below a nanometre are rounding, even on noise-free data
-VARIANCE_FLOOR = 1e-24  # variances [m² or rad²] below that of (1 pm)² are rounding
-# A pair this many sigma from its prediction by the others is an outlier: 3 in 100,000 good ones are farther out (chi,
-# three dimensions).
-OUTLIER_SIGMAS = 4.8
-UNCALIBRATED_SIGMAS = 15.0  # an arm that is not calibrated has errors with long tails, which must not be rejected
-# Where single pairs are weighed, none counts for more than one this many sigmas away: it may be an outlier.
-CLIPPED_SIGMAS = 4.0
+
+
+class RobustSettings:
+    rounding_m = 1e-9  # residuals below a nanometre are rounding, even on noise-free data
+    variance_floor = 1e-24  # variances [m² or rad²] below that of (1 pm)² are rounding
+    # A pair this many sigma from its prediction by the others is an outlier: 3 in 100,000 good ones are farther out
+    # (chi, three dimensions).
+    outlier_sigmas = 4.8
+    uncalibrated_sigmas = 15.0  # an arm that is not calibrated has errors with long tails, which must not be rejected
+    # Where single pairs are weighed, none counts for more than one this many sigmas away: it may be an outlier.
+    clipped_sigmas = 4.0
+
+
+HALF_WIDTH_95 = 1.959964  # of a 95 % interval, in standard deviations of a Gaussian
 _ONE_SIGMA = 0.841344746
 
 
@@ -79,4 +85,4 @@ def unexplained_variance(residuals: FloatArray, covariances: FloatArray, freedom
         return 0.0
     # At the largest square each term is negative. The import takes 0.2 s of CPU.
     brentq = import_module("scipy.optimize").brentq
-    return float(brentq(slope, 0.0, float(squares.max()), xtol=VARIANCE_FLOOR))
+    return float(brentq(slope, 0.0, float(squares.max()), xtol=RobustSettings.variance_floor))

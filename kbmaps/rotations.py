@@ -13,10 +13,14 @@ from kbmaps.errors import NonFiniteError, RotationError, ShapeError
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation  # pyright: ignore[reportMissingTypeStubs]
 
-# Accepted deviation of a measured rotation: quaternions and matrices are often written with six digits.
-_TOLERANCE = 1e-4
-# Below this angle [rad] the quotients of the exponential map are taken from their series.
-SMALL_ANGLE = 1e-3
+
+class RotationSettings:
+    # Accepted deviation of a measured rotation: quaternions and matrices are often written with six digits.
+    tolerance = 1e-4
+    # Below this angle [rad] the quotients of the exponential map are taken from their series.
+    small_rad = 1e-3
+
+
 _EYE = np.eye(3)
 # (3, 9): row i is the matrix K of `cross_matrix` of the unit vector e_i.
 _CROSS = np.stack([np.cross(unit, _EYE).T.ravel() for unit in _EYE])
@@ -99,8 +103,8 @@ def exponentials(turns: FloatArray) -> tuple[FloatArray, FloatArray]:
     (Chirikjian 2012, section 10.8).
     """
     angles: FloatArray = np.sqrt(np.einsum("ki,ki->k", turns, turns))[:, None, None]
-    safe: FloatArray = np.maximum(angles, SMALL_ANGLE)
-    small: BoolArray = angles < SMALL_ANGLE
+    safe: FloatArray = np.maximum(angles, RotationSettings.small_rad)
+    small: BoolArray = angles < RotationSettings.small_rad
     squares = angles * angles
     sine: FloatArray = np.where(small, 1.0 - squares / 6.0, np.sin(safe) / safe)
     cosine: FloatArray = np.where(small, 0.5 - squares / 24.0, (1.0 - np.cos(safe)) / (safe * safe))
@@ -135,7 +139,7 @@ def rotation_matrices(name: str, values: ArrayLike) -> FloatArray:
         raise NonFiniteError(name)
     if is_quaternion:
         off = np.abs(np.linalg.norm(given, axis=-1) - 1.0)
-        if given.size and off.max() > _TOLERANCE:
+        if given.size and off.max() > RotationSettings.tolerance:
             raise RotationError(name, "a quaternion is not of length 1")
         # scipy refuses an empty batch.
         return (
@@ -144,6 +148,6 @@ def rotation_matrices(name: str, values: ArrayLike) -> FloatArray:
             else np.empty((0, 3, 3))
         )
     fixed = nearest_rotation(given)
-    if given.size and np.abs(fixed - given).max() > _TOLERANCE:
+    if given.size and np.abs(fixed - given).max() > RotationSettings.tolerance:
         raise RotationError(name, "a matrix is no proper rotation (orthonormal, determinant 1)")
     return fixed

@@ -5,22 +5,26 @@ from __future__ import annotations
 import numpy as np
 
 from kbmaps.arrays import FloatArray, evenly_spread
-from kbmaps.robust import CLIPPED_SIGMAS, ROUNDING_M
+from kbmaps.robust import RobustSettings
 
-_STEPS = 60  # number of steps towards the maximum likelihood; each increases it
-_LEAST = 1e-9  # Lower bound of a variance as a share of all: it would vanish in rounding
+
+class _Settings:
+    steps = 60  # number of steps towards the maximum likelihood; each increases it
+    least_share = 1e-9  # Lower bound of a variance as a share of all: it would vanish in rounding
+    # Errors that the shares are estimated from, evenly spread: they determine four numbers to a few percent, and
+    # weights that are wrong by so much cost a thousandth.
+    most_errors = 500
+    alike_share = 1e-6  # variances of a covariance that differ by less than this share are the same
+
+
 # Positions of the six numbers of a symmetric matrix: xx, yy, zz, yz, xz, xy.
 _ROWS, _COLUMNS = [0, 1, 2, 1, 0, 0], [0, 1, 2, 2, 2, 1]
-# Errors that the shares are estimated from, evenly spread: they determine four numbers to a few percent, and weights
-# that are wrong by so much cost a thousandth.
-_MOST_ERRORS = 500
-_ALIKE = 1e-6  # variances of a covariance that differ by less than this share are the same
 
 
 def tells_directions(stated: FloatArray) -> bool:
     """Return True if any of the stated covariances (n, 3, 3), NaN where there is none, is anisotropic."""
     values = np.linalg.eigvalsh(stated[~np.isnan(stated).any(axis=(1, 2))])
-    return bool((values[:, 2] - values[:, 0] > _ALIKE * values[:, 2]).any())
+    return bool((values[:, 2] - values[:, 0] > _Settings.alike_share * values[:, 2]).any())
 
 
 def error_covariances(errors: FloatArray, stated: FloatArray, readings: FloatArray) -> FloatArray:
@@ -50,10 +54,10 @@ def error_covariances(errors: FloatArray, stated: FloatArray, readings: FloatArr
         axis=1,
     )
     parts = parts[:, parts.any(axis=(0, 2, 3))]
-    some = evenly_spread(len(errors), _MOST_ERRORS)
+    some = evenly_spread(len(errors), _Settings.most_errors)
     spread, units = in_typical_units(parts[some], errors[some])
     shares, _ = most_probable_shares(spread, errors[some], leave_out=True)
-    return np.einsum("k,nkij->nij", shares * units, parts) + ROUNDING_M**2 * np.eye(3)
+    return np.einsum("k,nkij->nij", shares * units, parts) + RobustSettings.rounding_m**2 * np.eye(3)
 
 
 def in_typical_units(spread: FloatArray, off: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -72,18 +76,18 @@ def most_probable_shares(spread: FloatArray, off: FloatArray, *, leave_out: bool
     n, k = spread.shape[:2]
     parts = np.ascontiguousarray(spread[:, :, _ROWS, _COLUMNS].transpose(1, 2, 0)).reshape(k, 6 * n)
     shares, likelihood = np.full(k, 1.0 / k), -np.inf
-    for _ in range(_STEPS):
+    for _ in range(_Settings.steps):
         root = _inverse_root((shares @ parts).reshape(6, n))
         whitened = _turned(root, off.T)
         far = np.square(whitened).sum(axis=0)
-        near = far <= (max(CLIPPED_SIGMAS**2, float(np.median(far))) if leave_out else np.inf)
+        near = far <= (max(RobustSettings.clipped_sigmas**2, float(np.median(far))) if leave_out else np.inf)
         likelihood = float(np.log(root[0] * root[2] * root[5]).sum())
-        likelihood -= 0.5 * float(np.minimum(far, CLIPPED_SIGMAS**2).sum())
-        whitened *= np.minimum(1.0, CLIPPED_SIGMAS / np.sqrt(np.maximum(far, 1e-300)))
+        likelihood -= 0.5 * float(np.minimum(far, RobustSettings.clipped_sigmas**2).sum())
+        whitened *= np.minimum(1.0, RobustSettings.clipped_sigmas / np.sqrt(np.maximum(far, 1e-300)))
         x, y, z = _turned_back(root, whitened * near)
         seen = parts @ np.concatenate([x * x, y * y, z * z, 2.0 * y * z, 2.0 * x * z, 2.0 * x * y])
         expected = parts @ (_inverse_of(root) * near).ravel()
-        shares = np.maximum(shares * np.sqrt(seen / expected), _LEAST)
+        shares = np.maximum(shares * np.sqrt(seen / expected), _Settings.least_share)
     return shares, likelihood
 
 

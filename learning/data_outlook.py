@@ -14,9 +14,9 @@ from bodyschema.learning.snapshot import MEAN_OVER_RMS
 from bodyschema.learning.status import Outlook
 from bodyschema.learning.uncertainty import PredictiveUncertainty
 from kbmaps import ChainBelief, ChainPosterior, ChainTolerances, candidate_motions, expected_gain, shared_by
-from kbmaps.chains.rigid_filter import LEAST_NOISE_M
+from kbmaps.chains.rigid_filter import FilterSettings
 from kbmaps.planning.expected_gain import ALL, SAME
-from kbmaps.robust import OUTLIER_SIGMAS
+from kbmaps.robust import RobustSettings
 
 
 class _Settings:
@@ -60,8 +60,8 @@ class Scatter:
         distances = np.linalg.norm(missed, axis=1)
         # The part of the residuals that the fit absorbs equals its uncertainty at the same places.
         noise = math.hypot(MEDIAN_TO_SIGMA * float(np.median(distances)), math.sqrt(float(np.median(variance))))
-        noise = max(noise, LEAST_NOISE_M)
-        inliers = distances <= OUTLIER_SIGMAS * noise
+        noise = max(noise, FilterSettings.least_noise_m)
+        inliers = distances <= RobustSettings.outlier_sigmas * noise
         return cls(noise, int((~inliers).sum()), shared_by(missed[inliers]))
 
 
@@ -76,7 +76,7 @@ def forecast(known: LearnerEvidence, scatter: Scatter, joints: tuple[str, ...]) 
     """
     rng = np.random.default_rng(0)  # the same pairs have the same outlook
     nominal, claim = known.nominal, known.claim
-    lower, upper = nominal.lower, np.maximum(nominal.upper, nominal.lower + LEAST_NOISE_M)
+    lower, upper = nominal.lower, np.maximum(nominal.upper, nominal.lower + FilterSettings.least_noise_m)
     floor = float(np.sqrt(np.square(claim.inside).mean()))
     noise = scatter.noise_m * math.sqrt(scatter.shared)
     posterior = ChainPosterior.of_belief(known.belief, noise=max(noise, floor), floor=floor)

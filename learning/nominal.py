@@ -11,9 +11,9 @@ import numpy as np
 
 from bodyschema.effects import Motion, Simulation
 from bodyschema.interfaces.records import FloatArray, frozen_array
-from bodyschema.learning.changes.known_arm import OTHER_TOOL_M
+from bodyschema.learning.changes.known_arm import ArmSettings
 from bodyschema.learning.config import LearnerConfig
-from bodyschema.learning.solvers.orientation import FITTED
+from bodyschema.learning.solvers.orientation import BatchSettings
 from bodyschema.robot.description import RobotDescription
 from kbmaps import (
     ChainBelief,
@@ -28,10 +28,12 @@ from kbmaps import (
 )
 from kbmaps.arrays import evenly_spread
 
-# Number of pairs after a tool change at which the tool is first fitted; later fits follow at doubled numbers.
-PAIRS_TO_REFIT = 5
-NARROWEST_STROKE_M = 0.1  # a narrower stroke would make the basis needlessly stiff, and equal limits impossible
-LARGEST_GRID = 20_000  # maximum number of postures at which an extended simulation is evaluated for a prior
+
+class NominalSettings:
+    # Number of pairs after a tool change at which the tool is first fitted; later fits follow at doubled numbers.
+    pairs_to_refit = 5
+    narrowest_stroke_m = 0.1  # a narrower stroke would make the basis needlessly stiff, and equal limits impossible
+    largest_grid = 20_000  # maximum number of postures at which an extended simulation is evaluated for a prior
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class NominalModel:
     def __post_init__(self) -> None:
         slides = self.chain.prismatic
         low, high = np.where(slides, self.lower, -np.pi), np.where(slides, self.upper, np.pi)
-        missing = np.maximum(NARROWEST_STROKE_M - (high - low), 0.0) / 2.0
+        missing = np.maximum(NominalSettings.narrowest_stroke_m - (high - low), 0.0) / 2.0
         object.__setattr__(self, "lower", frozen_array(self.lower))
         object.__setattr__(self, "upper", frozen_array(self.upper))
         object.__setattr__(self, "bases", learning_bases(low - missing, high + missing, self.chain.prismatic.tolist()))
@@ -126,7 +128,7 @@ class NominalModel:
 
     def _nodes(self) -> list[FloatArray] | None:
         """Return the grid values of each joint over its range that determine a map; None for too large a grid."""
-        count = next((n for n in (5, 4, 3) if n**self.joints <= LARGEST_GRID), None)
+        count = next((n for n in (5, 4, 3) if n**self.joints <= NominalSettings.largest_grid), None)
         if count is None:
             return None
         low = np.where(self.chain.prismatic, self.lower, np.maximum(self.lower, -np.pi))
@@ -149,7 +151,7 @@ class NominalModel:
             known = replace(known, base_rotation=math.inf, base_translation=math.inf)
         if not self.marker_known:
             # A marker is on the hand. First pairs along a short path would fit one metres away just as well.
-            known = replace(known, tool=OTHER_TOOL_M)
+            known = replace(known, tool=ArmSettings.other_tool_m)
         return known
 
     def placed(self, q: FloatArray, x: FloatArray) -> RigidChain:
@@ -160,7 +162,7 @@ class NominalModel:
         Raises:
             DegenerateDataError: the pairs do not determine it.
         """
-        chosen = evenly_spread(len(q), FITTED)
+        chosen = evenly_spread(len(q), BatchSettings.fitted)
         return align(self.chain, q[chosen], x[chosen], pose_known=self.pose_known, marker_known=True).chain
 
     def with_other_tool(self, kbmap: KBMap, chain: RigidChain, q: FloatArray, x: FloatArray) -> KBMap:
@@ -172,7 +174,7 @@ class NominalModel:
         Raises:
             DegenerateDataError: there are no pairs.
         """
-        chosen = evenly_spread(len(q), FITTED)
+        chosen = evenly_spread(len(q), BatchSettings.fitted)
         return with_refitted_tool(kbmap, chain, q[chosen], x[chosen])
 
 

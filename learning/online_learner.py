@@ -19,22 +19,24 @@ from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.data_outlook import LearnerEvidence
 from bodyschema.learning.model_bank import PRIOR, SOLVED
 from bodyschema.learning.nominal import NominalModel, chain_tolerances
-from bodyschema.learning.regime import LOOKED_BACK, BoolArray, Regime
+from bodyschema.learning.regime import BoolArray, Regime, RegimeSettings
 from bodyschema.learning.regime_history import Regimes
 from bodyschema.learning.snapshot import Snapshot
 from bodyschema.learning.solvers.solver import Solver, SolverClient
 from bodyschema.learning.state import Counters, Curve, LearningState
 from bodyschema.learning.status import ChangeRecord, CurvePoint, OrientationStatus
-from bodyschema.learning.uncertainty import WARM
+from bodyschema.learning.uncertainty import UncertaintySettings
 from kbmaps import ChainBelief, Recent
 
-# Maximum number of pairs judged together, absolute and as a share of the known ones: early pairs matter more.
-MOST_TOGETHER, TOGETHER = 25, 0.1
-# As a share of a covariance's largest eigenvalue: rounding may push the smallest this far below zero.
-ROUNDING = 1e-6
-FEED_PAIRS = 256
-REGION_RAD = np.radians(3.0)
-REGION_SAMPLES = 256
+
+class OnlineSettings:
+    # Maximum number of pairs judged together, absolute and as a share of the known ones: early pairs matter more.
+    most_together, together_share = 25, 0.1
+    # As a share of a covariance's largest eigenvalue: rounding may push the smallest this far below zero.
+    rounding_share = 1e-6
+    feed_pairs = 256
+    region_rad = np.radians(3.0)
+    region_samples = 256
 
 
 class OnlineLearner:
@@ -126,13 +128,13 @@ class OnlineLearner:
     def claimed_error_m(self) -> float | None:
         """Return the expected mean distance [m] in the data's region to what the cameras see without noise.
 
-        None while there are too few pairs. The region: within a few degrees (`REGION_RAD` per joint) of the kept pairs.
+        None while there are too few pairs. The region: within a few degrees (`region_rad` per joint) of the kept pairs.
         """
         with self._lock:
             regime, snapshot = self._regimes.present, self._snapshot
             answering = None if regime is None else self._regimes.claims.errors.get(regime.answering)
             if (
-                regime is None or answering is None or answering.weight < WARM / 2
+                regime is None or answering is None or answering.weight < UncertaintySettings.warm_pairs / 2
             ):  # the prior expectation counts more than the errors
                 return None
             region = self._region(regime)
@@ -150,8 +152,8 @@ class OnlineLearner:
     def _region(self, regime: Regime) -> FloatArray:
         """Return poses (n, d) [rad, m] that represent the data's region; the same for the same pairs."""
         rng = np.random.default_rng(0)
-        q, _ = regime.memory.at(rng.integers(len(regime.memory), size=REGION_SAMPLES))
-        return q + rng.normal(0.0, 1.0, q.shape) * self.nominal.reach(REGION_RAD)
+        q, _ = regime.memory.at(rng.integers(len(regime.memory), size=OnlineSettings.region_samples))
+        return q + rng.normal(0.0, 1.0, q.shape) * self.nominal.reach(OnlineSettings.region_rad)
 
     def orientation_status(self) -> OrientationStatus | None:
         """Return the accuracy of the marker's orientation; None if no pair with the current tool has one."""
@@ -161,7 +163,7 @@ class OnlineLearner:
                 return None
             known, region = regime.orientations, self._region(regime)
             pairs, errors = known.pairs, known.prequential_rad()
-        claimed = model.expected_error(region) if pairs >= WARM / 2 else None
+        claimed = model.expected_error(region) if pairs >= UncertaintySettings.warm_pairs / 2 else None
         return OrientationStatus(pairs, model.name, errors, claimed)
 
     def known(self) -> LearnerEvidence | None:
@@ -173,8 +175,9 @@ class OnlineLearner:
             regime, claims = self._regimes.present, self._regimes.claims
             if regime is None or claims.belief is None or not self._solving.works_on(regime.task_number):
                 return None
-            seen, *_ = regime.memory.some(regime.memory.count, LOOKED_BACK)
-            q, x, _ = regime.memory.since(self._solving.fed - LOOKED_BACK, LOOKED_BACK)  # pairs that the solver knows
+            seen, *_ = regime.memory.some(regime.memory.count, RegimeSettings.looked_back)
+            known = self._solving.fed  # number of pairs that the solver knows
+            q, x, _ = regime.memory.since(known - RegimeSettings.looked_back, RegimeSettings.looked_back)
             return LearnerEvidence(
                 nominal=self.nominal,
                 belief=claims.belief,
@@ -221,7 +224,8 @@ class OnlineLearner:
                 if not regime.met:
                     self._met_at = now
                 regime.meet(pair)
-                enough = min(MOST_TOGETHER, max(int(TOGETHER * regime.memory.count), 1))
+                enough = max(int(OnlineSettings.together_share * regime.memory.count), 1)
+                enough = min(OnlineSettings.most_together, enough)
                 if len(regime.met) >= enough or self._judge_due(now):
                     self._judge()
             self._publish()
@@ -416,10 +420,9 @@ class OnlineLearner:
                 if self._regimes.present is not regime:
                     return True
                 regime.ask()
-            q, x, fed = regime.memory.since(solving.fed, FEED_PAIRS)
-            cov, turns = (
-                each(solving.fed, FEED_PAIRS) for each in (regime.memory.cov_since, regime.memory.turns_since)
-            )
+            q, x, fed = regime.memory.since(solving.fed, OnlineSettings.feed_pairs)
+            both = regime.memory.cov_since, regime.memory.turns_since
+            cov, turns = (each(solving.fed, OnlineSettings.feed_pairs) for each in both)
         if len(q):
             solving.feed(q, x, fed, cov, turns if np.isfinite(turns).any() else None)
         if asking:
@@ -498,5 +501,5 @@ def _check_pair(pair: Pair, counters: Counters, joints: int) -> None:
     if np.abs(pair.cov).max() > FARTHEST_M**2:
         raise RequestError(f"pair {pair.seq} says that it may be {np.sqrt(np.abs(pair.cov).max()):.3g} m wrong")
     spread = np.linalg.eigvalsh(pair.cov)
-    if spread[0] < -ROUNDING * max(spread[-1], 0.0):
+    if spread[0] < -OnlineSettings.rounding_share * max(spread[-1], 0.0):
         raise RequestError(f"pair {pair.seq} has a cov that is no covariance: a variance of {spread[0]:.3g} m²")

@@ -13,7 +13,7 @@ import numpy as np
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.model_bank import EXACT, PRIOR, RIGID
 from bodyschema.learning.solvers.orientation import OrientationSolution
-from bodyschema.learning.uncertainty import DISCOUNT, WARM
+from bodyschema.learning.uncertainty import UncertaintySettings
 from bodyschema.learning.variance_terms import unexplained
 from kbmaps import (
     ChainBelief,
@@ -30,10 +30,16 @@ from kbmaps import (
 
 # Order of trust while errors do not decide.
 TRUSTED = (RIGID, EXACT, PRIOR)
-# The marker's rotation on the nominal chain's hand is fitted whenever the pairs have doubled, up to this many pairs.
-FIRST = 64
-# Minimum number of pairs to trust the solved chain before it has predicted any.
-FEWEST_TO_BELIEVE = 3
+
+
+class OrientationSettings:
+    # The marker's rotation on the nominal chain's hand is fitted whenever the pairs have doubled, up to this many
+    # pairs.
+    first_pairs = 64
+    # Minimum number of pairs to trust the solved chain before it has predicted any.
+    fewest_to_trust = 3
+
+
 # Mean divided by RMS length of a Gaussian rotation vector with the same variance about each axis.
 MEAN_OVER_RMS = 0.9213
 
@@ -55,17 +61,17 @@ class AngleMemory(msgspec.Struct):
             noise: expected square of the measurement's noise [rad²].
             claimed: expected square of noise and model error together [rad²].
         """
-        self.weight = DISCOUNT * self.weight + 1.0
-        self.angle = DISCOUNT * self.angle + angle
-        self.square = DISCOUNT * self.square + angle**2
-        self.noise = DISCOUNT * self.noise + noise
-        self.ratio = DISCOUNT * self.ratio + angle**2 / max(claimed, 1e-18)
+        self.weight = UncertaintySettings.discount * self.weight + 1.0
+        self.angle = UncertaintySettings.discount * self.angle + angle
+        self.square = UncertaintySettings.discount * self.square + angle**2
+        self.noise = UncertaintySettings.discount * self.noise + noise
+        self.ratio = UncertaintySettings.discount * self.ratio + angle**2 / max(claimed, 1e-18)
 
     @property
     def surprise(self) -> float:
         """Ratio of the errors to the predicted ones, at least 1."""
-        few = max(WARM - self.weight, 0.0)
-        return math.sqrt(max((self.ratio + few) / max(self.weight, WARM), 1.0))
+        few = max(UncertaintySettings.warm_pairs - self.weight, 0.0)
+        return math.sqrt(max((self.ratio + few) / max(self.weight, UncertaintySettings.warm_pairs), 1.0))
 
 
 class OrientationState(msgspec.Struct, kw_only=True):
@@ -163,7 +169,7 @@ class Orientations:
             squares[name] = angle**2
         self._contest.add(squares)
         self.pairs += 1
-        self._noise += (noise / 3.0 - self._noise) / min(self.pairs, 1.0 / (1.0 - DISCOUNT))
+        self._noise += (noise / 3.0 - self._noise) / min(self.pairs, 1.0 / (1.0 - UncertaintySettings.discount))
         self._fit_drawn(q, measured)
         self._choose()
 
@@ -216,7 +222,7 @@ class Orientations:
         return math.sqrt(max(around**2 - self._noise, around**2 * resolution if self._noise else around**2))
 
     def _fit_drawn(self, q: FloatArray, measured: FloatArray) -> None:
-        if len(self._first) == FIRST or self.pairs > FIRST:
+        if len(self._first) == OrientationSettings.first_pairs or self.pairs > OrientationSettings.first_pairs:
             return
         self._first.append((q, measured))
         count = len(self._first)
@@ -227,5 +233,5 @@ class Orientations:
     def _choose(self) -> None:
         self.answering = self._contest.best(TRUSTED, self.answering)
         untried = RIGID in self._chains and not self._contest.compares(RIGID)
-        if self.answering == PRIOR and self.pairs >= FEWEST_TO_BELIEVE and untried:
+        if self.answering == PRIOR and self.pairs >= OrientationSettings.fewest_to_trust and untried:
             self.answering = RIGID

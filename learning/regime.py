@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray, Pair
 from bodyschema.learning.changes.known_arm import KnownArm
-from bodyschema.learning.changes.monitor import LOOKED_BACK as KNOWN_PAIRS
-from bodyschema.learning.changes.monitor import ChangeMonitor, Reference
-from bodyschema.learning.changes.outlier_gate import DOUBT, OutlierGate, limits_m, sound
+from bodyschema.learning.changes.monitor import ChangeMonitor, MonitorSettings, Reference
+from bodyschema.learning.changes.outlier_gate import OutlierGate, OutlierSettings, limits_m, sound
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.model_bank import EXACT, INSTANT, PRIOR, RESIDUAL, RIGID, LearntModel, ModelBank
-from bodyschema.learning.orientation import FEWEST_TO_BELIEVE, OrientationModel, Orientations
+from bodyschema.learning.orientation import OrientationModel, Orientations, OrientationSettings
 from bodyschema.learning.replay_memory import PairMemory, Permutations
 from bodyschema.learning.solvers.solver import Solved, Task
 from bodyschema.learning.state import NET, LearningHeader
@@ -23,10 +22,8 @@ from bodyschema.learning.uncertainty import UncertaintyTracker
 from bodyschema.learning.variance_terms import QueryPoints
 from kbmaps import ChainBelief, KBMap, Recent, follow_a_path
 
-LOOKED_BACK = 500  # number of learnt pairs on which a model's fit is assessed
 
-
-class _Settings:
+class RegimeSettings:
     # Number of pairs that determine the errors of a refitted prior, and that are replayed on top of it.
     recent: int = 200
     replay_steps: int = 64
@@ -34,6 +31,7 @@ class _Settings:
     # With this share of new pairs, the last solution no longer applies: the new one is judged by these pairs alone.
     judged_anew: float = 0.25
     looked_back_in_replay: int = 4
+    looked_back: int = 500  # number of learnt pairs on which a model's fit is assessed
 
 
 NO_TURN = (math.nan,) * 4
@@ -115,7 +113,9 @@ class Regime:
         predicted = self.models.predict(INSTANT, pair.q)
         doubted = self._judged([pair], predicted[None])[0]
         # An outlier gets a step no longer than any other pair.
-        self.models.learn(pair.q, pair.x - predicted, self._limit_m / DOUBT if doubted else np.inf)
+        self.models.learn(
+            pair.q, pair.x - predicted, self._limit_m / OutlierSettings.times_farther if doubted else np.inf
+        )
         return not doubted
 
     def meet(self, pair: Pair) -> None:
@@ -128,7 +128,7 @@ class Regime:
         if not math.isfinite(self._limit_m):
             self._limit_m = self.limit_m(pair)
         far = float(np.linalg.norm(pair.x - self.map.predict(pair.q))) > self._limit_m
-        self.models.learn(pair.q, pair.x - predicted, self._limit_m / DOUBT if far else np.inf)
+        self.models.learn(pair.q, pair.x - predicted, self._limit_m / OutlierSettings.times_farther if far else np.inf)
         self._met.append((pair, predicted))
 
     def judge(self) -> tuple[Sequence[Pair], BoolArray]:
@@ -220,9 +220,9 @@ class Regime:
         """Take some of the replay steps that are due; return their number."""
         if not self.owes_replays:
             return 0
-        places = self._order.take(min(_Settings.replay_steps, int(self._replays_due)), len(self.memory))
+        places = self._order.take(min(RegimeSettings.replay_steps, int(self._replays_due)), len(self.memory))
         q, x = self.memory.at(places)
-        seen = slice(_Settings.looked_back_in_replay)
+        seen = slice(RegimeSettings.looked_back_in_replay)
         self._claims.replayed(x[seen] - self.models.predict(INSTANT, q[seen]))
         self.models.replay(q, x)
         self._replays_due -= len(places)
@@ -248,9 +248,9 @@ class Regime:
         """Replace the prior by another one fitted to the same pairs."""
         q, x = self.memory.all()
         self.models.start_again(prior, q, x)
-        self._claims.prior_changed(x[-_Settings.recent :] - prior.predict(q[-_Settings.recent :]))
+        self._claims.prior_changed(x[-RegimeSettings.recent :] - prior.predict(q[-RegimeSettings.recent :]))
         self._choose_map()
-        self._replays_due += self._replays_per_pair * min(len(q), _Settings.recent)
+        self._replays_due += self._replays_per_pair * min(len(q), RegimeSettings.recent)
 
     def ask(self) -> None:
         self._claims.solution_asked()
@@ -260,7 +260,7 @@ class Regime:
     def take(self, solved: Solved, model: LearntModel, fed: int) -> None:
         """Store a solution of this regime's task, for one of the models; the solver has `fed` pairs."""
         self.models.take(solved.name, model)
-        q, x, cov = self.memory.some(fed, LOOKED_BACK)
+        q, x, cov = self.memory.some(fed, RegimeSettings.looked_back)
         neighbours = follow_a_path(self.models.prior, q)
         errors, variances = x - model.predict(q), cov.diagonal(axis1=1, axis2=2)
         self._claims.solution_taken(
@@ -276,7 +276,7 @@ class Regime:
         belief, wide = self._claims.belief, self._claims.wide
         if belief is None or wide is None:
             return
-        q, x, _ = self.memory.since(known - KNOWN_PAIRS, KNOWN_PAIRS)
+        q, x, _ = self.memory.since(known - MonitorSettings.looked_back, MonitorSettings.looked_back)
         claim = self._claims.of(self.answering, self.model.predict)
         variance = self._claims.errors[PRIOR].noise_variance
         residual = self._claims.residual
@@ -319,14 +319,14 @@ class Regime:
 
     def _judge_late(self, name: str, model: LearntModel, pairs: int, fed: int) -> None:
         """Compare a solution on the pairs received while the solver worked: it has not learnt them."""
-        q, x, _ = self.memory.since(max(pairs, self.memory.count - _Settings.judged_late))
+        q, x, _ = self.memory.since(max(pairs, self.memory.count - RegimeSettings.judged_late))
         if len(q) == 0:
             return
         instant = np.full(x.shape, math.nan)
         new = min(max(self.memory.count - fed, 0), len(q))
         if new and self.models.delayed is not None:
             instant[-new:] = x[-new:] - self.models.delayed.predict(q[-new:])
-        anew = len(q) >= _Settings.judged_anew * pairs
+        anew = len(q) >= RegimeSettings.judged_anew * pairs
         self._claims.predicted_late(name, model.predict, q, x - model.predict(q), instant, anew=anew)
 
     def _learn_turn(self, q: FloatArray, turn: FloatArray | None, cov: FloatArray | None = None) -> None:
@@ -346,7 +346,11 @@ class Regime:
 
     def _choose(self) -> None:
         self.answering = self._claims.best(self.answering)
-        if self.answering == PRIOR and self.memory.count >= FEWEST_TO_BELIEVE and self._claims.untried(RIGID):
+        if (
+            self.answering == PRIOR
+            and self.memory.count >= OrientationSettings.fewest_to_trust
+            and self._claims.untried(RIGID)
+        ):
             self.answering = RIGID  # the same, after some pairs
         self._choose_map()
 

@@ -12,16 +12,16 @@ import numpy as np
 
 from bodyschema.interfaces.records import FloatArray, Pair
 from bodyschema.learning.changes.known_arm import Adapted, KnownArm, Origin
-from bodyschema.learning.changes.monitor import LOOK_AGAIN, DetectedChange
-from bodyschema.learning.changes.outlier_gate import DOUBT, FEWEST_FOR_CHANGE, explained, sound
+from bodyschema.learning.changes.monitor import DetectedChange, MonitorSettings
+from bodyschema.learning.changes.outlier_gate import OutlierSettings, explained, sound
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.model_bank import PRIOR
-from bodyschema.learning.nominal import PAIRS_TO_REFIT, NominalModel, chain_tolerances
+from bodyschema.learning.nominal import NominalModel, NominalSettings, chain_tolerances
 from bodyschema.learning.regime import Regime
 from bodyschema.learning.replay_memory import PairMemory
 from bodyschema.learning.solvers.solver import fitted_belief
 from bodyschema.learning.state import NET, PAIRS, Counters, Curve, LearningHeader, LearningState, StateError
-from bodyschema.learning.status import NAMED_WITHIN, ChangeRecord, KindOfChange
+from bodyschema.learning.status import ChangeRecord, KindOfChange, NamingSettings
 from bodyschema.learning.uncertainty import UncertaintyTracker
 from kbmaps import ChainBelief, ChainTolerances, DegenerateDataError, Explanation, KBMap, RigidChain
 
@@ -52,7 +52,7 @@ class Fitting:
         """Return True if it is time to fit."""
         return self.due_at is not None and pairs >= self.due_at
 
-    def change_tool(self, before: KBMap, hand: RigidChain, first_at: int = PAIRS_TO_REFIT) -> None:
+    def change_tool(self, before: KBMap, hand: RigidChain, first_at: int = NominalSettings.pairs_to_refit) -> None:
         """Fit another tool on top of the map `before` from now on, at first to `first_at` pairs.
 
         Args:
@@ -83,7 +83,7 @@ class Fitting:
 
     def done(self, pairs: int, fit: Fit | None) -> None:
         if fit is None:
-            self.due_at = pairs + max(self._nominal.pairs_to_align, PAIRS_TO_REFIT)
+            self.due_at = pairs + max(self._nominal.pairs_to_align, NominalSettings.pairs_to_refit)
         else:
             self.due_at, self.chain, self.is_first = 2 * pairs, fit.chain, False
 
@@ -204,7 +204,13 @@ class Regimes:
     def follow_change(self, regime: Regime, pair: Pair) -> bool:
         """Begin the regime of another tool if the outliers of `regime` in a row, up to `pair`, are its first pairs."""
         gate = regime.gate
-        if not (gate.changed or (gate.perhaps_changed and self._moved_together(regime, regime.limit_m(pair) / DOUBT))):
+        if not (
+            gate.changed
+            or (
+                gate.perhaps_changed
+                and self._moved_together(regime, regime.limit_m(pair) / OutlierSettings.times_farther)
+            )
+        ):
             return False
         q, x = gate.run()
         distances = np.linalg.norm(regime.model.predict(q) - x, axis=1)
@@ -219,9 +225,12 @@ class Regimes:
         if not regime.monitor.ready:
             return None
         gate = regime.gate
-        together = gate.perhaps_changed and self._moved_together(regime, regime.limit_m(pair) / DOUBT)
+        together = gate.perhaps_changed and self._moved_together(
+            regime, regime.limit_m(pair) / OutlierSettings.times_farther
+        )
         noticed = regime.monitor.noticed(run=gate.in_a_row if gate.changed or together else 0)
-        return None if noticed is None or len(noticed.q) - noticed.first < FEWEST_FOR_CHANGE else noticed
+        fewest = OutlierSettings.explained_change_pairs
+        return None if noticed is None or len(noticed.q) - noticed.first < fewest else noticed
 
     def adapt(self, regime: Regime, noticed: DetectedChange) -> bool:
         """Begin the regime after a change, if that improves the held-out predictions of the pairs since."""
@@ -232,7 +241,7 @@ class Regimes:
         if not origin.is_better(found, q, x, cov):
             regime.monitor.refute()
             return False
-        self._look_at = int(LOOK_AGAIN * len(q)) + 1
+        self._look_at = int(MonitorSettings.look_again * len(q)) + 1
         seqs = (*noticed.seqs, noticed.seqs[-1] + 1)
         self.change = ChangeRecord(
             first_seq=noticed.seqs[noticed.first],
@@ -265,8 +274,8 @@ class Regimes:
         if other and self.memory.complete:
             cov, turns = self.memory.cov_since(0), self.memory.turns_since(0)
             self._begin_adapted(self.present, origin.adapt(found, q, x, cov), q, x, cov, turns)
-        self._look_at = int(LOOK_AGAIN * len(q)) + 1
-        if len(q) > NAMED_WITHIN:
+        self._look_at = int(MonitorSettings.look_again * len(q)) + 1
+        if len(q) > NamingSettings.named_within_pairs:
             self._origin = None
         return other
 
@@ -301,7 +310,7 @@ class Regimes:
         self.present.learn_waiting(q[belongs], x[belongs], cov[belongs], turns[belongs], belief)
         return int((~belongs).sum())
 
-    def _next(self, regime: Regime, expected_m: float, first_fit: int = PAIRS_TO_REFIT) -> Regime:
+    def _next(self, regime: Regime, expected_m: float, first_fit: int = NominalSettings.pairs_to_refit) -> Regime:
         """Return the regime of another tool, which begins where `regime` ends."""
         prior, arm = regime.map, regime.arm.updated(self.claims.wide, self.claims.residual)
         self.fitting.change_tool(prior, self._hand, first_fit)

@@ -13,7 +13,7 @@ from bodyschema.interfaces.errors import RequestError
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.model_bank import LearntModel
 from bodyschema.learning.orientation import MEAN_OVER_RMS, OrientationModel
-from bodyschema.learning.solvers.solver import LARGEST_NET
+from bodyschema.learning.solvers.solver import SolverSettings
 from bodyschema.learning.uncertainty import PredictiveUncertainty
 from bodyschema.learning.variance_terms import unexplained
 from kbmaps import KBMap, SupportSet, quaternions
@@ -70,7 +70,7 @@ class Snapshot:
         if self.map is None:
             raise NoFrameError(self.waiting_for)
         turned = self.orientation
-        return self.map if turned is None or self.map.size > LARGEST_NET else turned.planes(self.map)
+        return self.map if turned is None or self.map.size > SolverSettings.largest_net else turned.planes(self.map)
 
     def predict(self, q: FloatArray) -> Prediction:
         """Return predictions for joint angles q (n, d) [rad].

@@ -79,8 +79,11 @@ class OrientationStatus(msgspec.Struct, frozen=True):
 
 
 TOOL, CAMERA, JOINT = "tool", "camera", "joint"
-NAMED = 0.95  # a kind at least this probable is named
-NAMED_WITHIN = 500  # a change is named or renamed within this many pairs; after them it stays as it is
+
+
+class NamingSettings:
+    named_probability = 0.95  # a kind at least this probable is named
+    named_within_pairs = 500  # a change is named or renamed within this many pairs; after them it stays as it is
 
 
 class KindOfChange(msgspec.Struct, frozen=True):
@@ -108,7 +111,8 @@ class ChangeRecord(msgspec.Struct, frozen=True, kw_only=True):
         """Named kind; None while undecided. Kinds that no motion can separate count together."""
         best = self.kinds[0]
         same = [kind for kind in self.kinds[1:] if kind.name == self.alike(best) or self.alike(kind) == best.name]
-        return best if best.probability + sum(kind.probability for kind in same) >= NAMED else None
+        probability = best.probability + sum(kind.probability for kind in same)
+        return best if probability >= NamingSettings.named_probability else None
 
     def alike(self, kind: KindOfChange) -> str | None:
         """Return the kind that no motion can separate from this one.

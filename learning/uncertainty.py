@@ -21,17 +21,21 @@ from bodyschema.learning.variance_terms import (
     VarianceTerm,
 )
 from kbmaps import ChainBelief, JointBasis, PrequentialComparison, Recent, ResidualModel, SupportSet
-from kbmaps.contest import CLEARLY
-from kbmaps.robust import OUTLIER_SIGMAS
+from kbmaps.contest import ContestSettings
+from kbmaps.robust import RobustSettings
 
-DISCOUNT = 0.98  # Weight of the error one pair back: the memory is about 50 pairs long
+
+class UncertaintySettings:
+    discount = 0.98  # Weight of the error one pair back: the memory is about 50 pairs long
+    # Below this number of pairs the prior expectation, or the discrepancy with the last tool, counts too.
+    warm_pairs = 10.0
 
 
 class ErrorMemory(msgspec.Struct):
     """Discounted sums over one model's recent prediction errors."""
 
     expected_m: float  # RMS distance expected before there were errors [m]
-    discount: float = DISCOUNT  # weight of the error one pair back
+    discount: float = UncertaintySettings.discount  # weight of the error one pair back
     weight: float = 0.0  # effective number of errors
     square: tuple[float, float, float] = (0.0, 0.0, 0.0)  # sums of their squares per axis [m²]
     noise: tuple[float, float, float] = (0.0, 0.0, 0.0)  # sums of the measurements' variances per axis [m²]
@@ -56,14 +60,16 @@ class ErrorMemory(msgspec.Struct):
     @property
     def rms_m(self) -> float:
         """RMS distance between prediction and measurement [m], shrunk to the expected one while errors are few."""
-        missing = max(WARM - self.weight, 0.0)
-        return math.sqrt((sum(self.square) + missing * self.expected_m**2) / max(self.weight, WARM))
+        missing = max(UncertaintySettings.warm_pairs - self.weight, 0.0)
+        weight = max(self.weight, UncertaintySettings.warm_pairs)
+        return math.sqrt((sum(self.square) + missing * self.expected_m**2) / weight)
 
     @property
     def sigma(self) -> FloatArray:
         """Uncertainty of the prediction against the truth, 1-sigma per axis (3,) [m]; noise is subtracted."""
-        missing = max(WARM - self.weight, 0.0)
-        square = (np.array(self.square) + missing * self.expected_m**2 / 3.0) / max(self.weight, WARM)
+        missing = max(UncertaintySettings.warm_pairs - self.weight, 0.0)
+        weight = max(self.weight, UncertaintySettings.warm_pairs)
+        square = (np.array(self.square) + missing * self.expected_m**2 / 3.0) / weight
         noise = self.noise_variance
         return np.sqrt(np.maximum(square - noise, noise * math.sqrt(2.0 / max(self.weight, 2.0))))
 
@@ -75,12 +81,10 @@ class ErrorMemory(msgspec.Struct):
     @property
     def surprise(self) -> float:
         """Ratio of the errors to the predicted ones, at least 1."""
-        missing = max(WARM - self.weight, 0.0)
-        return math.sqrt(max((self.ratio + missing) / max(self.weight, WARM), 1.0))
+        missing = max(UncertaintySettings.warm_pairs - self.weight, 0.0)
+        return math.sqrt(max((self.ratio + missing) / max(self.weight, UncertaintySettings.warm_pairs), 1.0))
 
 
-# Below this number of pairs the prior expectation, or the discrepancy with the last tool, counts too.
-WARM = 10.0
 _SUPPORT, _CONTEST = "support_q", "squares_"
 
 
@@ -404,12 +408,12 @@ def model_discrepancy(
         taken = max(scatter**2 / max(float(square.mean()), 1e-300), 1.0)
         variance = taken * square - noise.mean(axis=0)
         chance = np.sqrt(2.0 * taken * np.square(noise).mean(axis=0) / n)
-    seen = np.where(variance > CLEARLY * chance, variance, 0.0)
-    missing = max(WARM - n, 0.0)
-    return np.sqrt((n * seen + missing * np.square(before)) / max(n, WARM))
+    seen = np.where(variance > ContestSettings.clearly * chance, variance, 0.0)
+    missing = max(UncertaintySettings.warm_pairs - n, 0.0)
+    return np.sqrt((n * seen + missing * np.square(before)) / max(n, UncertaintySettings.warm_pairs))
 
 
 def _near(errors: FloatArray, scatter: float) -> NDArray[np.bool_]:
     """Return True for errors that the fit has not left out; for all if these are the minority: then the fit is off."""
-    near = np.linalg.norm(errors, axis=1) <= OUTLIER_SIGMAS * scatter
+    near = np.linalg.norm(errors, axis=1) <= RobustSettings.outlier_sigmas * scatter
     return near if near.mean() > 0.5 else np.ones_like(near)

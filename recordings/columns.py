@@ -36,14 +36,18 @@ OPTIONAL_GROUPS = (SIGMA, COVARIANCE, CENTRES, ORIENTATION)
 RESERVED = ("t", "segment", *POSITION, *SIGMA, *COVARIANCE, *CENTRES, *ORIENTATION)
 EXTRA_PREFIXES = ("current_", "temperature_")
 
-QUATERNION_TOLERANCE = 1e-3
-LARGEST_POSITION = 1e9  # of an arm in any unit of length; which one it is, is checked where the robot is known
-LARGEST_SEGMENT = 2.0**53
-SMALLEST_SIGMA_M, LARGEST_SIGMA_M = 1e-100, 1e100  # their squares are still numbers
+
+class ColumnLimits:
+    quaternion_tolerance = 1e-3
+    largest_position = 1e9  # of an arm in any unit of length; which one it is, is checked where the robot is known
+    largest_segment = 2.0**53
+    smallest_sigma_m, largest_sigma_m = 1e-100, 1e100  # their squares are still numbers
+    # More columns than any arm needs, and ten hours at 100 samples/s with 27 columns.
+    most_columns, most_numbers = 1000, 100_000_000
+    longest_name = 200
+
+
 _MEND_ROW = "Fix or delete the row"
-# More columns than any arm needs, and ten hours at 100 samples/s with 27 columns.
-MOST_COLUMNS, MOST_NUMBERS = 1000, 100_000_000
-LONGEST_NAME = 200
 
 
 class Fault(Exception):
@@ -96,12 +100,13 @@ def check_joints(joints: tuple[str, ...]) -> None:
 
 def check_width(names: Sequence[str]) -> None:
     """Raise Fault when there are more columns than a recording can have."""
-    if len(names) > MOST_COLUMNS:
-        what = f"there are {len(names):,} columns; a recording has at most {MOST_COLUMNS:,}"
+    if len(names) > ColumnLimits.most_columns:
+        what = f"there are {len(names):,} columns; a recording has at most {ColumnLimits.most_columns:,}"
         raise Fault(what, remedy="Delete those that are none of a recording's")
     for name in names:
-        if len(name) > LONGEST_NAME:
-            raise Fault(f"a column's name has {len(name):,} characters", remedy=f"Give it at most {LONGEST_NAME}")
+        if len(name) > ColumnLimits.longest_name:
+            remedy = f"Give it at most {ColumnLimits.longest_name}"
+            raise Fault(f"a column's name has {len(name):,} characters", remedy=remedy)
 
 
 def check_header(names: tuple[str, ...], joints: tuple[str, ...]) -> None:
@@ -145,14 +150,15 @@ def check_values(table: Table) -> None:
         _check_time(table)
     if table.has(POSITION):
         for name, x in zip(POSITION, table.columns(POSITION).T, strict=True):
-            _first(np.abs(x) > LARGEST_POSITION, lambda row, x=x: f"{float(x[row])!r} is no position in metres", name)
+            far = np.abs(x) > ColumnLimits.largest_position
+            _first(far, lambda row, x=x: f"{float(x[row])!r} is no position in metres", name)
     if table.has(("segment",)):
         segment = table.columns(("segment",))[:, 0]
-        bad = (segment != np.round(segment)) | (np.abs(segment) > LARGEST_SEGMENT)
+        bad = (segment != np.round(segment)) | (np.abs(segment) > ColumnLimits.largest_segment)
         _first(bad, lambda row: f"{segment[row]!r} is not a whole number", "segment")
     if table.has(SIGMA):
         for name, sigma in zip(SIGMA, table.columns(SIGMA).T, strict=True):
-            bad = ~((sigma >= SMALLEST_SIGMA_M) & (sigma <= LARGEST_SIGMA_M))
+            bad = ~((sigma >= ColumnLimits.smallest_sigma_m) & (sigma <= ColumnLimits.largest_sigma_m))
             _first(bad, lambda row, s=sigma: f"{float(s[row])!r} is no sigma: it has to be a positive length", name)
     if table.has(COVARIANCE):
         bad = ~positive_definite(from_upper(table.columns(COVARIANCE)))
@@ -160,7 +166,7 @@ def check_values(table: Table) -> None:
     if table.has(ORIENTATION):
         with np.errstate(over="ignore"):
             length = np.linalg.norm(table.columns(ORIENTATION), axis=1)
-        bad = ~(np.abs(length - 1.0) <= QUATERNION_TOLERANCE)
+        bad = ~(np.abs(length - 1.0) <= ColumnLimits.quaternion_tolerance)
         _first(bad, lambda row: f"the quaternion has the length {length[row]:.6g}, not 1", "qx", "Normalise it")
 
 

@@ -12,13 +12,16 @@ import numpy as np
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.limited import opened
 
-from .columns import MOST_NUMBERS, Fault, Table, check_finite, check_header, check_width, shortened
+from .columns import ColumnLimits, Fault, Table, check_finite, check_header, check_width, shortened
 
 FIRST_ROW_LINE = 2
-# Limits of a file and of a line: a thousand columns of 25 digits take 25 KiB.
-MOST_BYTES, MOST_LINE_BYTES = 2**30, 2**20
-# Size of a parsed block: large enough to hide Python's overhead, small compared with the numbers of a recording.
-BLOCK_BYTES = 2**22
+
+
+class _Settings:
+    # Limits of a file and of a line: a thousand columns of 25 digits take 25 KiB.
+    most_bytes, most_line_bytes = 2**30, 2**20
+    # Size of a parsed block: large enough to hide Python's overhead, small compared with the numbers of a recording.
+    block_bytes = 2**22
 
 
 def read_csv_table(file: Path, joints: tuple[str, ...]) -> Table:
@@ -30,7 +33,7 @@ def read_csv_table(file: Path, joints: tuple[str, ...]) -> Table:
     """
     blocks: list[FloatArray] = []
     rows, whole = 0, True
-    with opened(file, MOST_BYTES) as stream:
+    with opened(file, _Settings.most_bytes) as stream:
         names = _header(stream)
         _check_header_line(names, joints)
         while data := _block(stream, rows):
@@ -40,8 +43,8 @@ def read_csv_table(file: Path, joints: tuple[str, ...]) -> Table:
             except Fault as fault:
                 raise fault.moved(rows) from None
             rows += len(blocks[-1])
-            if rows * len(names) > MOST_NUMBERS:
-                most = MOST_NUMBERS // len(names)
+            if rows * len(names) > ColumnLimits.most_numbers:
+                most = ColumnLimits.most_numbers // len(names)
                 raise Fault(f"there are more than {most:,} rows of these columns", remedy="Cut the recording")
     if not rows:
         raise Fault("there are no rows below the header", remedy="Record at least one pair")
@@ -64,7 +67,7 @@ def csv_columns(file: Path) -> tuple[str, ...]:
         Fault: it is not text, or empty.
         OSError: it cannot be read.
     """
-    with opened(file, MOST_BYTES) as stream:
+    with opened(file, _Settings.most_bytes) as stream:
         names = _header(stream)
     check_width(names)
     return names
@@ -85,7 +88,7 @@ def _header(stream: BinaryIO) -> tuple[str, ...]:
         header = _lines(_decoded(line))[0] if line else ""
     except Fault as fault:
         raise fault.moved(-1) from None
-    if not header.strip() and not stream.read(MOST_LINE_BYTES).strip():
+    if not header.strip() and not stream.read(_Settings.most_line_bytes).strip():
         raise Fault("the file is empty", remedy="A recording has a header line and at least one row")
     for letter in header:
         if not letter.isprintable() and letter != "\t":
@@ -97,15 +100,15 @@ def _header(stream: BinaryIO) -> tuple[str, ...]:
 def _block(stream: BinaryIO, row: int) -> bytes:
     """Return the next lines, empty at the end of the file."""
     data = bytearray()
-    while len(data) < BLOCK_BYTES and (line := _line(stream, row)):
+    while len(data) < _Settings.block_bytes and (line := _line(stream, row)):
         data += line
         row += 1
     return bytes(data)
 
 
 def _line(stream: BinaryIO, row: int) -> bytes:
-    line = stream.readline(MOST_LINE_BYTES + 1)
-    if len(line) > MOST_LINE_BYTES:
+    line = stream.readline(_Settings.most_line_bytes + 1)
+    if len(line) > _Settings.most_line_bytes:
         raise Fault("the line is longer than 1 MiB", row=row, remedy="Name a CSV file")
     return line
 

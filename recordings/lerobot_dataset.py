@@ -16,9 +16,9 @@ import numpy as np
 
 from bodyschema.interfaces.errors import RecordingError
 from bodyschema.robot.lerobot import Calibrations, JointServo, Unit
-from bodyschema.robot.limited import MOST_MEMORY_BYTES, bounded_memory, opened, read_at_most
+from bodyschema.robot.limited import FileLimits, bounded_memory, opened, read_at_most
 
-from .columns import MOST_NUMBERS
+from .columns import ColumnLimits
 from .parquet_file import MOST_BYTES, arrow_modules
 from .recording import Recording
 from .tracks import JointTrack, MarkerTrack, joined
@@ -131,7 +131,7 @@ def _table(folder: Path, columns: Sequence[str]) -> list[tuple[float, ...]]:
     (pyarrow, _), rows = arrow_modules(folder, _WHAT), list[tuple[float, ...]]()
     for file in sorted(folder.rglob("*.parquet")):
         try:
-            with bounded_memory(MOST_MEMORY_BYTES), opened(file, MOST_BYTES) as stream:
+            with bounded_memory(FileLimits.memory_bytes), opened(file, MOST_BYTES) as stream:
                 table = pyarrow.parquet.ParquetFile(stream).read(columns=list(columns))
             numbers = np.column_stack([table.column(name).to_numpy().astype(np.float64) for name in columns])
             if not np.isfinite(numbers).all():
@@ -181,10 +181,10 @@ def _rows(source: Path, names: Sequence[str]) -> tuple[np.ndarray, np.ndarray, n
     if not files:
         raise RecordingError("the dataset has no data/**/*.parquet", file=source, remedy="Download it whole")
     states, times, episodes = list[np.ndarray](), list[np.ndarray](), list[np.ndarray]()
-    left = most = MOST_NUMBERS // (len(names) + len(_COLUMNS) - 1)
+    left = most = ColumnLimits.most_numbers // (len(names) + len(_COLUMNS) - 1)
     for file in files:
         try:
-            with bounded_memory(MOST_MEMORY_BYTES), opened(file, MOST_BYTES) as stream:
+            with bounded_memory(FileLimits.memory_bytes), opened(file, MOST_BYTES) as stream:
                 parquet = pyarrow.parquet.ParquetFile(stream)
                 left -= parquet.metadata.num_rows
                 if left < 0:

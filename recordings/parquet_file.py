@@ -12,9 +12,9 @@ import numpy as np
 
 from bodyschema.interfaces.errors import RecordingError
 from bodyschema.interfaces.extras import install_command
-from bodyschema.robot.limited import MOST_MEMORY_BYTES, bounded_memory, opened
+from bodyschema.robot.limited import FileLimits, bounded_memory, opened
 
-from .columns import MOST_NUMBERS, Fault, Table, check_finite, check_header, check_width
+from .columns import ColumnLimits, Fault, Table, check_finite, check_header, check_width
 
 MOST_BYTES = 2**30  # the largest number of values takes 0.8 GB
 INTEGER_COLUMNS = frozenset({"segment"})
@@ -58,7 +58,7 @@ def _read(arrow: Any, parquet: Any) -> Any:
 
     A file of some kilobytes can hold billions of equal numbers.
     """
-    most = MOST_NUMBERS // len(parquet.schema_arrow)
+    most = ColumnLimits.most_numbers // len(parquet.schema_arrow)
     _check_rows(parquet.metadata.num_rows, most)
     batches, rows = [], 0
     for batch in parquet.iter_batches():
@@ -77,7 +77,7 @@ def _check_rows(rows: int, most: int) -> None:
 def _opened(file: Path) -> Iterator[Any]:
     """Open the Parquet file. Raise Fault where the content read inside the with block is damaged."""
     arrow, parquet = arrow_modules(file, "Parquet, unlike CSV,")
-    with bounded_memory(MOST_MEMORY_BYTES), opened(file, MOST_BYTES) as stream:
+    with bounded_memory(FileLimits.memory_bytes), opened(file, MOST_BYTES) as stream:
         try:
             yield parquet.ParquetFile(stream)
         except (arrow.ArrowException, OSError, ValueError) as error:

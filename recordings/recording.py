@@ -37,8 +37,11 @@ from .csv_file import FIRST_ROW_LINE, csv_columns, read_csv_table, write_csv_row
 from .parquet_file import INTEGER_COLUMNS, parquet_columns, read_parquet_table, write_parquet_table
 
 CSV, PARQUET = ".csv", ".parquet"
-ROW_INTERVAL_S = 1 / 30  # between rows without times, the rate of the usual cameras
-RESET_GAP_S = 10.0  # between runs whose clocks have nothing to do with each other
+
+
+class RecordingSettings:
+    row_interval_s = 1 / 30  # between rows without times, the rate of the usual cameras
+    reset_gap_s = 10.0  # between runs whose clocks have nothing to do with each other
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,13 +95,13 @@ class Recording:
         segments, moved on.
         """
         if self.t is None:
-            return frozen_array(np.arange(len(self)) * ROW_INTERVAL_S)
+            return frozen_array(np.arange(len(self)) * RecordingSettings.row_interval_s)
         steps = np.diff(self.t)
         if (steps > 0).all():
             return self.t
-        moved = self.t[0] + np.cumsum(np.append(0.0, np.where(steps > 0, steps, RESET_GAP_S)))
+        moved = self.t[0] + np.cumsum(np.append(0.0, np.where(steps > 0, steps, RecordingSettings.reset_gap_s)))
         strictly = bool((np.diff(moved) > 0).all())  # steps far below the size of the times are lost in rounding
-        return frozen_array(moved if strictly else np.arange(len(self)) * ROW_INTERVAL_S)
+        return frozen_array(moved if strictly else np.arange(len(self)) * RecordingSettings.row_interval_s)
 
     @classmethod
     def read(cls, file: Path | str, joints: tuple[str, ...]) -> Self:

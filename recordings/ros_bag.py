@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from bodyschema.interfaces.errors import RecordingError
-from bodyschema.robot.limited import MOST_MEMORY_BYTES, bounded_memory, check_regular, read_at_most
+from bodyschema.robot.limited import FileLimits, bounded_memory, check_regular, read_at_most
 from bodyschema.robot.suggest import did_you_mean
 
 from .parquet_file import imported
@@ -40,10 +40,13 @@ _MARKERS: Mapping[str, Callable[[Any], Taken]] = {
     "geometry_msgs/msg/TransformStamped": lambda m: (m.transform.translation, m.transform.rotation, None),
 }
 _NANO = 1_000_000_000
-# Of metadata.yaml, which is parsed at some 100 kB/s; a topic or a part of the bag takes 1 kB.
-MOST_METADATA_BYTES = 2**20
-MOST_SAID = 200  # characters of another library's message, which may quote the file
-_FEW = 200  # messages that are looked at to learn which joints or frames a topic has
+
+
+class _Settings:
+    # Of metadata.yaml, which is parsed at some 100 kB/s; a topic or a part of the bag takes 1 kB.
+    most_metadata_bytes = 2**20
+    most_said = 200  # characters of another library's message, which may quote the file
+    first_messages = 200  # messages that are looked at to learn which joints or frames a topic has
 
 
 @dataclass(frozen=True)
@@ -114,7 +117,7 @@ class _Bag:
             yield received_ns / _NANO, self.reader.deserialize(data, connection.msgtype)
 
     def some(self, topic: str) -> Iterator[Any]:
-        for _, (_, message) in zip(range(_FEW), self.messages(topic), strict=False):
+        for _, (_, message) in zip(range(_Settings.first_messages), self.messages(topic), strict=False):
             yield message
 
     def wrong(self, what: str, remedy: str) -> RecordingError:
@@ -132,16 +135,16 @@ def _opened(source: Path) -> Iterator[_Bag]:
     try:
         _check_files(source)
         store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
-        with bounded_memory(MOST_MEMORY_BYTES), highlevel.AnyReader([source], default_typestore=store) as reader:
+        with bounded_memory(FileLimits.memory_bytes), highlevel.AnyReader([source], default_typestore=store) as reader:
             yield _Bag(source, reader)
     except RecordingError:
         raise
     except MemoryError as error:
-        what = f"reading it takes more than {MOST_MEMORY_BYTES // 2**30} GiB of memory"
+        what = f"reading it takes more than {FileLimits.memory_bytes // 2**30} GiB of memory"
         remedy = "Record the topics of joints and marker alone, or cut the bag: `ros2 bag convert`"
         raise RecordingError(what, file=source, remedy=remedy) from error
     except Exception as error:  # of damaged bytes rosbags raises whatever comes
-        said = (str(error).strip() or type(error).__name__).split("\n")[0][:MOST_SAID].rstrip(".")
+        said = (str(error).strip() or type(error).__name__).split("\n")[0][: _Settings.most_said].rstrip(".")
         remedy = "A bag whose recording was cut off: `ros2 bag reindex`; one of splits: name the folder"
         raise RecordingError(f"the bag cannot be read: {said}", file=source, remedy=remedy) from error
 
@@ -151,7 +154,7 @@ def _check_files(source: Path) -> None:
     if not source.is_dir():
         check_regular(source)
         return
-    read_at_most(source / METADATA, MOST_METADATA_BYTES)
+    read_at_most(source / METADATA, _Settings.most_metadata_bytes)
     for file in source.iterdir():
         if not file.is_dir():
             check_regular(file)

@@ -12,10 +12,14 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-# For text written by a person or a command: over ten times the size of any URDF, log or table of ours.
-MOST_TEXT_BYTES = 2**24
-# What reading one file may take: 20 million joint states of some 200 bytes. A file of 256 kB can unpack to 8 GiB.
-MOST_MEMORY_BYTES = 2**32
+
+class FileLimits:
+    # For text written by a person or a command: over ten times the size of any URDF, log or table of ours.
+    text_bytes = 2**24
+    # What reading one file may take: 20 million joint states of some 200 bytes. A file of 256 kB can unpack to 8 GiB.
+    memory_bytes = 2**32
+
+
 _KINDS = (
     (stat.S_ISCHR, "a device, not a file"),
     (stat.S_ISBLK, "a device, not a file"),
@@ -58,7 +62,7 @@ def opened(file: Path, most: int) -> Iterator[BinaryIO]:
         yield stream
 
 
-def read_at_most(file: Path, most: int = MOST_TEXT_BYTES) -> bytes:
+def read_at_most(file: Path, most: int = FileLimits.text_bytes) -> bytes:
     """Return the bytes of a regular file. Raise the errors of `opened`."""
     data = bytearray()
     with opened(file, most) as stream:

@@ -21,17 +21,22 @@ from kbmaps.rotations import exponentials
 from .limited import read_at_most
 
 MESHES = (".stl", ".obj", ".dae")
-LARGEST_MESH_BYTES = 64 * 2**20  # the meshes of public arms have 0.1 to 20 MB
-MOST_TRIANGLES = 1_000_000  # 50 MB of a binary STL
-_STL_HEAD_BYTES = 84
-_STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+
+
+class MeshLimits:
+    mesh_bytes = 64 * 2**20  # the meshes of public arms have 0.1 to 20 MB
+    triangles = 1_000_000  # 50 MB of a binary STL
+    obj_line = 2**16
+    nodes = 10_000  # COLLADA may place a node within itself
+    # No link of an arm is larger; one of 10 mm is, if its mesh is in millimetres. No part that is drawn is as small.
+    largest_m, smallest_m = 10.0, 1e-6
+    all_bytes = 4 * mesh_bytes
+    first_cell_m, cell_growth = 0.001, 1.4
+
+
+STL_HEAD_BYTES = 84
+STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _STL_VERTEX = re.compile(rb"vertex\s+(\S+)\s+(\S+)\s+(\S+)")
-_LONGEST_OBJ_LINE = 2**16
-_MOST_NODES = 10_000  # COLLADA may place a node within itself
-# No link of an arm is larger; one of 10 mm is, if its mesh is in millimetres. No part that is drawn is as small.
-LARGEST_M, SMALLEST_M = 10.0, 1e-6
-_MOST_BYTES = 4 * LARGEST_MESH_BYTES
-_FIRST_CELL_M, _GROWTH = 0.001, 1.4
 
 
 def find_mesh(name: str, urdf: Path) -> Path | None:
@@ -72,7 +77,8 @@ class MeshSet:
                 scaled = triangles * np.array(scale)
             low, high = scaled.min(axis=(0, 1)), scaled.max(axis=(0, 1))
             size = float((high - low).max())
-            if not SMALLEST_M <= size <= LARGEST_M or max(np.abs(low).max(), np.abs(high).max()) > LARGEST_M:
+            largest_m, farthest_m = MeshLimits.largest_m, max(np.abs(low).max(), np.abs(high).max())
+            if not MeshLimits.smallest_m <= size <= largest_m or farthest_m > largest_m:
                 self.unusable[name] = (
                     f"it is {size:.3g} m large, or lies too far from its link. A mesh in millimetres needs "
                     'scale="0.001 0.001 0.001"'
@@ -91,7 +97,7 @@ class MeshSet:
         """
         drawn, cell = {number: self.shapes[number] for number in numbers}, 0.0
         while sum(len(drawn[number]) for number in numbers) > self._most:
-            cell = max(_FIRST_CELL_M, _GROWTH * cell)
+            cell = max(MeshLimits.first_cell_m, MeshLimits.cell_growth * cell)
             drawn = {number: merged(triangles, cell) for number, triangles in drawn.items()}
         return drawn, sum(self._sizes[self._names[number]] for number in numbers)
 
@@ -112,13 +118,13 @@ class MeshSet:
         if file.resolve().suffix.lower() not in MESHES or file.suffix.lower() not in MESHES:
             raise MeshError(f"meshes end in {', '.join(MESHES)}")
         self._bytes += file.stat().st_size
-        if self._bytes > _MOST_BYTES:
-            raise MeshError(f"the meshes are larger than {_MOST_BYTES >> 20} MiB together")
+        if self._bytes > MeshLimits.all_bytes:
+            raise MeshError(f"the meshes are larger than {MeshLimits.all_bytes >> 20} MiB together")
         triangles, cell = read_mesh(file), 0.0
         self._sizes[name] = len(triangles)
         size = float(np.ptp(triangles, axis=(0, 1)).max())
         while len(triangles) > self._most and size > 0.0:  # more will not be drawn of it
-            cell = max(size / 1000.0, _GROWTH * cell)
+            cell = max(size / 1000.0, MeshLimits.cell_growth * cell)
             triangles = merged(triangles, cell)
         if not len(triangles):
             raise MeshError("its triangles are too small for its size")
@@ -160,7 +166,7 @@ def read_mesh(file: Path) -> FloatArray:
         MeshError: it cannot be read, is malformed or empty, or has numbers that are not finite.
     """
     try:
-        data = read_at_most(file, LARGEST_MESH_BYTES)
+        data = read_at_most(file, MeshLimits.mesh_bytes)
     except OSError as error:
         raise MeshError(f"it cannot be read: {error.strerror}") from error
     read = {".stl": _stl, ".obj": _obj, ".dae": _collada}[file.suffix.lower()]
@@ -171,8 +177,8 @@ def read_mesh(file: Path) -> FloatArray:
         raise MeshError(f"it is malformed: {str(error)[:100]}") from error
     if not len(triangles):
         raise MeshError("it has no triangles")
-    if len(triangles) > MOST_TRIANGLES:
-        raise MeshError(f"it has more than {MOST_TRIANGLES:,} triangles")
+    if len(triangles) > MeshLimits.triangles:
+        raise MeshError(f"it has more than {MeshLimits.triangles:,} triangles")
     if not np.isfinite(triangles).all():
         raise MeshError("it has vertices that are not finite")
     return triangles
@@ -180,19 +186,19 @@ def read_mesh(file: Path) -> FloatArray:
 
 def stl_bytes(triangles: FloatArray) -> bytes:
     """Return triangles (n, 3, 3) as a binary STL file."""
-    rows = np.zeros(len(triangles), dtype=_STL_TRIANGLE)
+    rows = np.zeros(len(triangles), dtype=STL_TRIANGLE)
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
     rows["normal"] = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
     rows["corners"] = triangles
-    return bytes(_STL_HEAD_BYTES - 4) + len(rows).to_bytes(4, "little") + rows.tobytes()
+    return bytes(STL_HEAD_BYTES - 4) + len(rows).to_bytes(4, "little") + rows.tobytes()
 
 
 def _stl(data: bytes) -> FloatArray:
-    announced = int.from_bytes(data[_STL_HEAD_BYTES - 4 : _STL_HEAD_BYTES], "little")
-    there = (len(data) - _STL_HEAD_BYTES) // _STL_TRIANGLE.itemsize
-    if len(data) >= _STL_HEAD_BYTES and there >= announced and not _is_text(data):
-        rows = np.frombuffer(data, dtype=_STL_TRIANGLE, count=announced, offset=_STL_HEAD_BYTES)
+    announced = int.from_bytes(data[STL_HEAD_BYTES - 4 : STL_HEAD_BYTES], "little")
+    there = (len(data) - STL_HEAD_BYTES) // STL_TRIANGLE.itemsize
+    if len(data) >= STL_HEAD_BYTES and there >= announced and not _is_text(data):
+        rows = np.frombuffer(data, dtype=STL_TRIANGLE, count=announced, offset=STL_HEAD_BYTES)
         return rows["corners"].astype(np.float64)
     if not _is_text(data):
         raise ValueError(f"{announced} triangles are announced, {max(there, 0)} are there")
@@ -211,7 +217,8 @@ def _obj(data: bytes) -> FloatArray:
     vertices: list[list[float]] = []
     corners: list[tuple[int, int, int]] = []
     for line in io.BytesIO(data):
-        if len(line) > _LONGEST_OBJ_LINE or len(vertices) > 3 * MOST_TRIANGLES or len(corners) > MOST_TRIANGLES:
+        most = MeshLimits.triangles
+        if len(line) > MeshLimits.obj_line or len(vertices) > 3 * most or len(corners) > most:
             raise ValueError("it is too long")
         kind, *values = line.split() or [b""]
         if kind not in (b"v", b"f"):
@@ -286,15 +293,15 @@ class _Collada:
         while todo:
             node, T = todo.pop()
             self._nodes += 1
-            if self._nodes > _MOST_NODES:
-                raise ValueError(f"its scene has more than {_MOST_NODES} nodes")
+            if self._nodes > MeshLimits.nodes:
+                raise ValueError(f"its scene has more than {MeshLimits.nodes} nodes")
             for element in node.iterchildren("{*}matrix", "{*}translate", "{*}rotate", "{*}scale"):
                 T = T @ _placement(element)
             for instance in node.iterchildren("{*}instance_geometry"):
                 triangles = self._once(self._geometry, self._named(instance.get("url")))
                 self._count += len(triangles)
-                if self._count > MOST_TRIANGLES:
-                    raise ValueError(f"it has more than {MOST_TRIANGLES:,} triangles")
+                if self._count > MeshLimits.triangles:
+                    raise ValueError(f"it has more than {MeshLimits.triangles:,} triangles")
                 yield triangles @ T[:3, :3].T + T[:3, 3]
             todo += [(child, T) for child in node.iterchildren("{*}node")]
             todo += [(self._named(child.get("url")), T) for child in node.iterchildren("{*}instance_node")]

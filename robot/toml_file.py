@@ -41,8 +41,13 @@ _QUOTED = re.compile(
     re.DOTALL,
 )
 _BETWEEN = re.compile(r"[,=\[\]{}]")
-# The largest robot.toml of ours has 8 KiB. One MiB of keys takes 0.5 GB of memory at most.
-MOST_BYTES, MOST_PARTS = 2**20, 100
+
+
+class _Settings:
+    # The largest robot.toml of ours has 8 KiB. One MiB of keys takes 0.5 GB of memory at most.
+    most_bytes, most_parts = 2**20, 100
+
+
 _PLACE = re.compile(r"(?P<what>.*?) - at `\$(?P<path>[^`]*)`$", re.DOTALL)
 
 
@@ -59,7 +64,7 @@ def read_toml(
         ConfigError: it cannot be read; the message has the line.
     """
     try:
-        data = read_at_most(file, MOST_BYTES)
+        data = read_at_most(file, _Settings.most_bytes)
     except FileNotFoundError as error:
         raise ConfigError("there is no such file", file=file, remedy=written_by) from error
     except IsADirectoryError as error:
@@ -70,7 +75,7 @@ def read_toml(
         raise ConfigError(f"cannot be read: {error.strerror}", file=file, remedy="Fix its permissions") from error
     text = _decoded(data, file, damaged or "Name a robot.toml, or save it as UTF-8")
     if (line := line_of_endless_key(text)) is not None:
-        raise ConfigError(f"a key has more than {MOST_PARTS} parts", file=file, line=line, remedy="Delete it")
+        raise ConfigError(f"a key has more than {_Settings.most_parts} parts", file=file, line=line, remedy="Delete it")
     try:
         return tomllib.loads(text), text
     except tomllib.TOMLDecodeError as error:
@@ -85,11 +90,12 @@ def read_toml(
 
 
 def line_of_endless_key(text: str) -> int | None:
-    """Return the first line (from 1) with a key of more than `MOST_PARTS` parts, which parse slowly; else None."""
+    """Return the first line (from 1) with a key of more than `most_parts` parts, which parse slowly; else None."""
     # With `q` in the place of each string and comment; there are as many lines.
     plain = _QUOTED.sub(lambda found: "q" + "\n" * found[0].count("\n"), text)
     for number, line in enumerate(plain.split("\n"), 1):
-        if line.count(".") > MOST_PARTS and any(piece.count(".") > MOST_PARTS for piece in _BETWEEN.split(line)):
+        most = _Settings.most_parts
+        if line.count(".") > most and any(piece.count(".") > most for piece in _BETWEEN.split(line)):
             return number
     return None
 

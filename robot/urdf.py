@@ -23,10 +23,13 @@ from .suggest import did_you_mean, first_few
 
 REVOLUTE = frozenset({"revolute", "continuous"})
 MOVING = REVOLUTE | {"prismatic"}
-MOST_LINKS = 2000  # a humanoid with hands has a few hundred
-# Realistic axes have length 1 and offsets of metres; squares of these bounds are far from overflow.
-SHORTEST_AXIS, LARGEST_PLACE_M = 1e-9, 1e6
-MOST_QUOTED = 60  # characters of a wrong attribute in a message: one line of a terminal
+
+
+class _Settings:
+    most_links = 2000  # a humanoid with hands has a few hundred
+    # Realistic axes have length 1 and offsets of metres; squares of these bounds are far from overflow.
+    shortest_axis, largest_place_m = 1e-9, 1e6
+    most_quoted = 60  # characters of a wrong attribute in a message: one line of a terminal
 
 
 @dataclass(frozen=True, slots=True)
@@ -263,7 +266,7 @@ def _joint(element: Any, file: Path) -> UrdfJoint:
         raise _wrong(element, file, f"joint {name!r} is of the type {kind!r}", remedy)
     axis = _numbers(element.find("axis"), "xyz", (1.0, 0.0, 0.0), file)
     length = math.hypot(*axis)  # hypot does not overflow
-    if kind != "fixed" and not SHORTEST_AXIS < length < 1.0 / SHORTEST_AXIS:
+    if kind != "fixed" and not _Settings.shortest_axis < length < 1.0 / _Settings.shortest_axis:
         what = "no length" if length == 0 else f"the length {length:.3g}"
         raise _wrong(element, file, f"the axis of joint {name!r} has {what}", 'Write <axis xyz="0 0 1"/>')
     lower, upper = _limits(element, kind, file)
@@ -295,7 +298,7 @@ def _limits(joint: Any, kind: str, file: Path) -> tuple[float, float]:
     if kind == "continuous" or limit is None or limit.get("lower") is None or limit.get("upper") is None:
         return -np.pi, np.pi
     [lower], [upper] = (_numbers(limit, side, (0.0,), file) for side in ("lower", "upper"))
-    if kind == "prismatic" and max(abs(lower), abs(upper)) > LARGEST_PLACE_M:
+    if kind == "prismatic" and max(abs(lower), abs(upper)) > _Settings.largest_place_m:
         what = f"<limit> of {_owner(limit)} lets it slide {max(abs(lower), abs(upper)):.3g} m away"
         raise _wrong(limit, file, what, "Give metres")
     if kind != "prismatic" and max(abs(lower), abs(upper)) > LARGEST_Q:
@@ -314,7 +317,7 @@ def _origin(element: Any, file: Path) -> FloatArray:
         raise _wrong(origin, file, what, "Give radians")
     T[:3, :3] = rotation_of(rpy)
     T[:3, 3] = _numbers(origin, "xyz", (0.0, 0.0, 0.0), file)
-    if np.abs(T[:3, 3]).max() > LARGEST_PLACE_M:
+    if np.abs(T[:3, 3]).max() > _Settings.largest_place_m:
         what = f"the <origin> of {_owner(origin)} is {np.abs(T[:3, 3]).max():.3g} m away"
         raise _wrong(origin, file, what, "Give metres")
     return T
@@ -336,7 +339,7 @@ def _numbers(element: Any, attribute: str, default: tuple[float, ...], file: Pat
 
 
 def _short(text: str) -> str:
-    return repr(text if len(text) <= MOST_QUOTED else text[:MOST_QUOTED] + "...")
+    return repr(text if len(text) <= _Settings.most_quoted else text[: _Settings.most_quoted] + "...")
 
 
 def _owner(element: Any) -> str:
@@ -397,6 +400,7 @@ def parse_urdf(file: Path) -> Any:
         remedy = f"With ROS: `xacro {file.name} > made.urdf`, with the arguments that its makers document; then set "
         what = "this is a xacro file, of which a URDF is made first"
         raise _wrong(macro, file, what, f'{remedy}urdf = "made.urdf" in [robot]')
-    if sum(1 for _ in root.iter("link", "joint")) > 2 * MOST_LINKS:
-        raise RobotError(f"the URDF has more than {MOST_LINKS:,} links", file=file, remedy="Keep the arm's alone")
+    if sum(1 for _ in root.iter("link", "joint")) > 2 * _Settings.most_links:
+        what = f"the URDF has more than {_Settings.most_links:,} links"
+        raise RobotError(what, file=file, remedy="Keep the arm's alone")
     return root

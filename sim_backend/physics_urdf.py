@@ -17,7 +17,7 @@ import numpy as np
 from bodyschema.interfaces.errors import RobotError
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.limited import read_at_most
-from bodyschema.robot.meshes import LARGEST_M, MeshSet, stl_bytes
+from bodyschema.robot.meshes import MeshLimits, MeshSet, stl_bytes
 from bodyschema.robot.rpy import rpy_of
 from bodyschema.robot.shapes import floats, rgba_of
 from bodyschema.robot.suggest import first_few
@@ -330,7 +330,7 @@ def _numbers(values: Sequence[float] | FloatArray) -> str:
 def _sizes(text: str | None, count: int) -> tuple[float, ...] | None:
     """Return the `count` lengths [m] in a text, each possible for a link; None if it is anything else."""
     values = floats(text, count)
-    return values if values is not None and all(0.0 < value <= LARGEST_M for value in values) else None
+    return values if values is not None and all(0.0 < value <= MeshLimits.largest_m for value in values) else None
 
 
 def _origin(element: ElementTree.Element) -> tuple[tuple[float, ...], tuple[float, ...]] | None:
@@ -360,7 +360,7 @@ def _inertia(inertial: ElementTree.Element) -> _Inertia | None:
         return _SMALL._replace(mass_kg=kilograms[0] or _SMALL.mass_kg, xyz=pose[0])
     xx, xy, xz, yy, yz, zz = moments
     least, _, most = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    heaviest = UrdfSettings.heaviest_kg * LARGEST_M**2
+    heaviest = UrdfSettings.heaviest_kg * MeshLimits.largest_m**2
     return _Inertia(kilograms[0], moments, *pose) if 0.0 < least <= most <= heaviest else None
 
 

@@ -22,7 +22,7 @@ from .limits import place_an_arm, reach_m, spread_m
 from .markers import several_markers
 from .reading import Reading
 from .rows import all_shifted, few_outliers, many_apart, partly_carried, partly_shifted
-from .search import ROWS, ReadingFit, ReadingSearch, nameable
+from .search import ReadingFit, ReadingSearch, SearchSettings, nameable
 from .size import of_another_size, size_of
 from .verdict import FEWEST_ROWS, THRESHOLDS, Plausibility, mm
 
@@ -67,7 +67,7 @@ def plausibility(
     exact_m, spread = _Settings.exact * reach_m(robot), spread_m(x)
     if not place_an_arm(len(q), chain.joints) or spread < exact_m:
         return Plausibility()
-    rows = np.unique(np.linspace(0, len(q) - 1, ROWS).astype(np.intp))
+    rows = np.unique(np.linspace(0, len(q) - 1, SearchSettings.rows).astype(np.intp))
     search = ReadingSearch(chain, q[rows], x[rows], exact_m, robot.camera.pose_known)
     noise = 0.0 if sigma_m is None else _Settings.noises * sigma_m
     check = _Check(robot, search, *search.verdict(), spread, noise)

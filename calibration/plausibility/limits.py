@@ -18,7 +18,7 @@ from kbmaps import RigidChain
 BoolArray = NDArray[np.bool_]
 
 
-class _Settings:
+class LimitSettings:
     # Only in another unit can the median distance from the median position reach this many times the arm's reach.
     farthest: float = 2.0
     # A joint of limited range is never this far beyond its limits [rad]: encoders wrap after a turn at the latest.
@@ -34,19 +34,19 @@ class _Settings:
     # Median speed of an arm that is guided or goes from pose to pose [rad/s]: lower bound, and usual value.
     slowest: float = 0.005
     usual: float = 0.3
+    # A fit is measured by this share of the rows, the nearest ones: outliers and rows with another tool are left out.
+    measured_share: float = 0.7
+    # 1-sigma of joint offsets and marker. All arms with offsets of 10° and a marker off by 0.3 m are placed.
+    zeros_rad, slides_m, tool_m = 0.15, 0.05, 0.3
+    # ... and a marker whose place is known, by ruler.
+    known_tool_m: float = 0.01
+    # Stroke that counts as one radian [m], and the minimum number of moves for a verdict.
+    a_radian_m, fewest_moves = 0.1, 20
 
 
 # Divisors that convert other units to metres.
 UNITS_PER_METRE = {"millimetres": 1000.0, "centimetres": 100.0, "inches": 39.37, "feet": 3.281}
-# A fit is measured by this share of the rows, the nearest ones: outliers and rows with another tool are left out.
-MEASURED = 0.7
-# 1-sigma of joint offsets and marker. All arms with offsets of 10° and a marker off by 0.3 m are placed.
-ZEROS_RAD, SLIDES_M, TOOL_M = 0.15, 0.05, 0.3
-# ... and a marker whose place is known, by ruler.
-KNOWN_TOOL_M = 0.01
 _UNITS_PER_SECOND = (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9))
-# Stroke that counts as one radian [m], and the minimum number of moves for a verdict.
-A_RADIAN_M, FEWEST_MOVES = 0.1, 20
 
 
 def place_an_arm(rows: int, joints: int) -> bool:
@@ -91,9 +91,9 @@ def require_units(robot: RobotDescription, recording: Recording, file: Path) -> 
 
 
 def _require_radians(robot: RobotDescription, recording: Recording, file: Path) -> None:
-    beyond = beyond_limits(robot, recording.q, _Settings.beyond_limits_rad).mean(axis=0)
+    beyond = beyond_limits(robot, recording.q, LimitSettings.beyond_limits_rad).mean(axis=0)
     beyond[robot.chain.prismatic] = 0.0
-    if beyond.max() > _Settings.many:
+    if beyond.max() > LimitSettings.many:
         joint = int(beyond.argmax())
         extreme = recording.q[np.abs(recording.q[:, joint]).argmax(), joint]
         raise RecordingError(
@@ -106,7 +106,7 @@ def _require_radians(robot: RobotDescription, recording: Recording, file: Path) 
 
 def _require_metres(robot: RobotDescription, recording: Recording, file: Path) -> None:
     spread, reach = spread_m(recording.x), reach_m(robot)
-    if spread > _Settings.farthest * reach:
+    if spread > LimitSettings.farthest * reach:
         units = _likely_units(robot.chain, recording)
         raise RecordingError(
             f"the positions x, y, z lie about {spread:.4g} m from their middle, and the arm reaches {reach:.3g} m: "
@@ -120,38 +120,38 @@ def _likely_units(chain: RigidChain, recording: Recording) -> list[str]:
     """Return the unit in which the nominal arm fits the positions; if it fits in none, one or two by their size."""
     from kbmaps.chains.placement import place  # imports scipy, which `predict` starts without
 
-    rows = np.unique(np.linspace(0, len(recording.q) - 1, _Settings.fitted_rows).astype(np.intp))
+    rows = np.unique(np.linspace(0, len(recording.q) - 1, LimitSettings.fitted_rows).astype(np.intp))
     q, x, factors = recording.q[rows], recording.x[rows], np.array(list(UNITS_PER_METRE.values()))
     drawn = max(spread_m(chain.positions(q)), 1e-9)
     placed = place(
         chain,
         np.broadcast_to(q, (len(factors), *q.shape)),
         x / factors[:, None, None],
-        zeros_std=np.where(chain.prismatic, SLIDES_M, ZEROS_RAD),
-        tool_std=TOOL_M,
+        zeros_std=np.where(chain.prismatic, LimitSettings.slides_m, LimitSettings.zeros_rad),
+        tool_std=LimitSettings.tool_m,
     )
-    errors = dict(zip(UNITS_PER_METRE, placed.errors(MEASURED).tolist(), strict=True))
+    errors = dict(zip(UNITS_PER_METRE, placed.errors(LimitSettings.measured_share).tolist(), strict=True))
     best = min(errors, key=errors.__getitem__)
-    if errors[best] < _Settings.fitting * drawn:
+    if errors[best] < LimitSettings.fitting * drawn:
         return [best]
     off = {unit: abs(math.log(spread_m(x) / (factor * drawn))) for unit, factor in UNITS_PER_METRE.items()}
     nearest = sorted(off, key=off.__getitem__)
-    return nearest[: 2 if off[nearest[1]] < math.log(_Settings.also) else 1]
+    return nearest[: 2 if off[nearest[1]] < math.log(LimitSettings.also) else 1]
 
 
 def _require_seconds(robot: RobotDescription, recording: Recording, file: Path) -> None:
     if recording.t is None:
         return
-    moves = np.diff(recording.q, axis=0) / np.where(robot.chain.prismatic, A_RADIAN_M, 1.0)
+    moves = np.diff(recording.q, axis=0) / np.where(robot.chain.prismatic, LimitSettings.a_radian_m, 1.0)
     gaps, steps = np.diff(recording.t), np.linalg.norm(moves, axis=1)
     inside = (gaps > 0.0) & (steps > 0.0)
     if recording.segment is not None and np.diff(recording.segment).any():
         inside &= np.diff(recording.segment) == 0
-    if inside.sum() < FEWEST_MOVES:
+    if inside.sum() < LimitSettings.fewest_moves:
         return
     gap, speed = float(np.median(gaps[inside])), float(np.median(steps[inside] / gaps[inside]))
-    if speed < _Settings.slowest:
-        name, factor = min(_UNITS_PER_SECOND, key=lambda unit: abs(math.log(speed * unit[1] / _Settings.usual)))
+    if speed < LimitSettings.slowest:
+        name, factor = min(_UNITS_PER_SECOND, key=lambda unit: abs(math.log(speed * unit[1] / LimitSettings.usual)))
         raise RecordingError(
             f"the times t are {gap:.4g} apart in the middle, in which the joints move by "
             f"{math.degrees(speed * gap):.2g}°: these look like {name}",

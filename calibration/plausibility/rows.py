@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray
 
-from .limits import MEASURED, place_an_arm, spread_m
-from .search import ROWS, ReadingSearch
+from .limits import LimitSettings, place_an_arm, spread_m
+from .search import ReadingSearch, SearchSettings
 from .verdict import FEWEST_ROWS, THRESHOLDS, Plausibility, mm
 
 
@@ -32,7 +32,7 @@ def few_outliers(search: ReadingSearch, before: float) -> str:
     Of many rows, outliers do not keep the others from placing the arm.
     """
     rows, joints = len(search.q), search.chain.joints
-    most = rows - math.ceil(MEASURED * rows)
+    most = rows - math.ceil(LimitSettings.measured_share * rows)
     if math.comb(rows, most) > _Settings.most_choices:
         return ""
     for off in range(1, most + 1):
@@ -154,7 +154,7 @@ def _rows_nearby(count: int) -> tuple[list[int], NDArray[np.intp]]:
     """Return shifts, and rows of a recording of `count` that have neighbours so far away."""
     near = _Settings.near_rows
     shifts = [shift for shift in range(-near, near + 1) if shift]
-    return shifts, np.unique(np.linspace(near, count - 1 - near, ROWS).astype(np.intp))
+    return shifts, np.unique(np.linspace(near, count - 1 - near, SearchSettings.rows).astype(np.intp))
 
 
 def _moved(shift: int) -> tuple[str, str]:

@@ -15,14 +15,10 @@ from kbmaps import ChainParameters, DegenerateDataError, RigidChain, align
 from kbmaps.chains.placement import Placements, place
 from kbmaps.rotations import rotation_vectors
 
-from .limits import A_RADIAN_M, KNOWN_TOOL_M, MEASURED, SLIDES_M, TOOL_M, ZEROS_RAD, spread_m
+from .limits import LimitSettings, spread_m
 from .reading import QUARTER, Reading
 from .size import evidences
 from .verdict import THRESHOLDS
-
-# Rows within this distance, of the joint that moved farthest, are of one pose: along a path the errors of links change
-# slowly.
-_APART_RAD = math.radians(10.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,10 +31,10 @@ class Poses:
     @classmethod
     def of(cls, chain: RigidChain, q: FloatArray) -> Poses:
         """Choose poses of rows q (n, d) [rad, m] that are apart in at least one joint."""
-        q = q / np.where(chain.prismatic, A_RADIAN_M, 1.0)
+        q = q / np.where(chain.prismatic, LimitSettings.a_radian_m, 1.0)
         distances = np.abs(q[:, None] - q).max(axis=2)
         kept: list[int] = []
-        for row, far in enumerate(distances > _APART_RAD):
+        for row, far in enumerate(distances > SearchSettings.apart_rad):
             if far[kept].all():
                 kept.append(row)
         return cls(np.array(kept, dtype=np.intp), distances[:, kept].argmin(axis=1))
@@ -59,12 +55,7 @@ class Poses:
         return gain * max(3.0 * share * len(self.rows) - joints - 9.0, 0.0)
 
 
-# Number of rows to be read in other ways, evenly spread. Twice as many cost twice the time and change no verdict of the
-# tests.
-ROWS = 80
-
-
-class _Settings:
+class SearchSettings:
     # Width and depth of the search over readings: offsets of up to four joints by a quarter turn are found.
     width: int = 4
     depth: int = 5
@@ -89,6 +80,12 @@ class _Settings:
     nearer: float = 5.0
     parallel: float = 0.999  # Axes are parallel if the cosine between them is above this: 2.6°
     listed: int = 2  # maximum number of other, equally good readings that are listed
+    # Rows within this distance, of the joint that moved farthest, are of one pose: along a path the errors of links
+    # change slowly.
+    apart_rad = math.radians(10.0)
+    # Number of rows to be read in other ways, evenly spread. Twice as many cost twice the time and change no verdict of
+    # the tests.
+    rows: int = 80
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,7 +111,7 @@ class ReadingSearch:
     def __init__(self, chain: RigidChain, q: FloatArray, x: FloatArray, exact_m: float, pose_known: bool) -> None:
         self.chain, self.q, self.x, self.exact_m, self._pose_known = chain, q, x, exact_m, pose_known
         self._parameters = ChainParameters(chain)
-        self._std = np.where(chain.prismatic, SLIDES_M, ZEROS_RAD)
+        self._std = np.where(chain.prismatic, LimitSettings.slides_m, LimitSettings.zeros_rad)
         self.poses = Poses.of(chain, q)
         self._tried: set[Reading] = set()
         self.fits: dict[Reading, ReadingFit] = {}  # the best fit of each reading so far
@@ -126,13 +123,14 @@ class ReadingSearch:
         self._try([as_it_is, *as_it_is.neighbours(slides), *self.carrying()])
         if self._best()[0] != as_it_is:
             # With a marker far from nominal, the fit of the right reading may have ended in a local minimum.
-            self._fit([as_it_is] * 6, tools=TOOL_M * np.concatenate([np.eye(3), -np.eye(3)]))
+            self._fit([as_it_is] * 6, tools=LimitSettings.tool_m * np.concatenate([np.eye(3), -np.eye(3)]))
         expanded, spread = [as_it_is], spread_m(self.x)
-        for depth in range(1, _Settings.depth):
+        for depth in range(1, SearchSettings.depth):
             best = self._best()[0]
             left = self.fits[best].error / spread
             if best in expanded and (
-                left < _Settings.enough or (best == as_it_is and (left < _Settings.enough_as_it_is or depth > 1))
+                left < SearchSettings.enough
+                or (best == as_it_is and (left < SearchSettings.enough_as_it_is or depth > 1))
             ):
                 break
             new = self._distinct(expanded)
@@ -141,7 +139,8 @@ class ReadingSearch:
                 self._try(as_it_is.doubles(slides))
             self._try(other for reading in new for other in reading.neighbours(slides))
         best = self._best()[0]
-        if self.fits[best].error > (_Settings.enough_as_it_is if best == as_it_is else _Settings.enough) * spread:
+        enough = SearchSettings.enough_as_it_is if best == as_it_is else SearchSettings.enough
+        if self.fits[best].error > enough * spread:
             self._try(as_it_is.mixed(slides))
         best = self._best()[0]
         if not nameable(best, self.fits[best], spread):
@@ -160,14 +159,14 @@ class ReadingSearch:
             key=lambda reading: (reading.changes, reading.quarters != as_it_is.quarters, self.fits[reading].nats),
         )
         others = [reading for reading in good[1:] if reading.changes <= good[0].changes + 1]
-        return as_it_is, good[0], others[: _Settings.listed]
+        return as_it_is, good[0], others[: SearchSettings.listed]
 
     def carrying(self) -> list[Reading]:
         """Return the columns as they are, but for a joint that counts together with a parallel one before it."""
         axes, turns = self.chain.axes, self.chain.fixed[1:-1, :3, :3]
         along = np.einsum("ki,kij,kj->k", axes[:-1], turns, axes[1:])
         rigid = self.chain.prismatic[:-1] | self.chain.prismatic[1:]
-        parallel = np.flatnonzero(~rigid & (np.abs(along) > _Settings.parallel)) + 1
+        parallel = np.flatnonzero(~rigid & (np.abs(along) > SearchSettings.parallel)) + 1
         plain = Reading.plain(self.chain.joints)
         return [reading for joint in parallel.tolist() for reading in plain.carrying(joint)]
 
@@ -180,28 +179,29 @@ class ReadingSearch:
 
     def has_far_zero(self, joint: int, fit: ReadingFit) -> bool:
         """Return True if a joint's zero is far off in `fit`, and the unchanged columns fit clearly worse with less."""
-        if self.chain.prismatic[joint] or abs(fit.zeros[joint]) <= _Settings.far_zero_rad:
+        if self.chain.prismatic[joint] or abs(fit.zeros[joint]) <= SearchSettings.far_zero_rad:
             return False
         q, here = self.q.copy(), np.arange(self.chain.joints) == joint
-        q[:, joint] += math.copysign(_Settings.near_zero_rad, fit.zeros[joint])
+        q[:, joint] += math.copysign(SearchSettings.near_zero_rad, fit.zeros[joint])
         held = place(
             self.chain,
             q[None],
             self.x[None],
-            zeros_std=np.where(here, _Settings.held, 1.0) * self._std,
-            tool_std=TOOL_M,
+            zeros_std=np.where(here, SearchSettings.held, 1.0) * self._std,
+            tool_std=LimitSettings.tool_m,
         )
-        ratio = max(float(held.errors(MEASURED)[0]), self.exact_m) / fit.error
-        return ratio > THRESHOLDS.much_better and self.is_certain(math.log(ratio), MEASURED)
+        ratio = max(float(held.errors(LimitSettings.measured_share)[0]), self.exact_m) / fit.error
+        return ratio > THRESHOLDS.much_better and self.is_certain(math.log(ratio), LimitSettings.measured_share)
 
     def errors(self, q: FloatArray, x: FloatArray) -> FloatArray:
         """Return the distances (s,) [m] of sets of pairs q (s, n, d) and x (s, n, 3), with the columns as they are."""
-        placed = place(self.chain, q, x, zeros_std=self._std, tool_std=TOOL_M)
-        return np.maximum(placed.errors(MEASURED), self.exact_m)
+        placed = place(self.chain, q, x, zeros_std=self._std, tool_std=LimitSettings.tool_m)
+        return np.maximum(placed.errors(LimitSettings.measured_share), self.exact_m)
 
     def distances(self, q: FloatArray, x: FloatArray, pairs: list[tuple[FloatArray, FloatArray]]) -> FloatArray:
         """Return the distances (s, n) [m] of sets of pairs from the arm as pairs q (n, d) and x (n, 3) place it."""
-        placed, p = place(self.chain, q[None], x[None], zeros_std=self._std, tool_std=TOOL_M), self._parameters
+        placed = place(self.chain, q[None], x[None], zeros_std=self._std, tool_std=LimitSettings.tool_m)
+        p = self._parameters
         change = np.zeros(p.size)
         change[p.zeros], change[p.tool] = placed.zeros[0], placed.tools[0]
         drawn = (p.positions(change, each) @ placed.rotations[0].T + placed.shifts[0] for each, _ in pairs)
@@ -209,11 +209,11 @@ class ReadingSearch:
 
     def is_certain(self, gain: float, share: float = 1.0) -> bool:
         """Return True if the poses are evidence enough for a reading that fits better, as in `Poses.nats`."""
-        return self.poses.nats(gain, self.chain.joints, share) > _Settings.certain
+        return self.poses.nats(gain, self.chain.joints, share) > SearchSettings.certain
 
     def placed_by(self, rows: NDArray[np.intp]) -> Placements:
         """Place the nominal chain to sets of rows (s, n), with the columns as they are."""
-        return place(self.chain, self.q[rows], self.x[rows], zeros_std=self._std, tool_std=TOOL_M)
+        return place(self.chain, self.q[rows], self.x[rows], zeros_std=self._std, tool_std=LimitSettings.tool_m)
 
     def on_hand(self, placed: Placements, one: int) -> FloatArray:
         """Return the positions (n, 3) [m] beside the marker, along the axes of its frame, by one of some placements."""
@@ -232,23 +232,25 @@ class ReadingSearch:
         if self.chain.prismatic[-1]:
             return None
         last = np.arange(self.chain.joints) == self.chain.joints - 1
-        std = np.where(last, _Settings.last_zero_rad, self._std)
+        std = np.where(last, SearchSettings.last_zero_rad, self._std)
         turned = [reading.turned((turns * last).tolist()) for turns in (0, 1, -1, 2)] + self._turned_alike(reading)
-        fits = self._placed(turned, std=std, tool_m=KNOWN_TOOL_M)
+        fits = self._placed(turned, std=std, tool_m=LimitSettings.known_tool_m)
         as_given = fits.pop(reading, None)
-        best = min(fits, key=lambda each: fits[each].nats + _Settings.a_change * each.changes, default=reading)
+        best = min(fits, key=lambda each: fits[each].nats + SearchSettings.a_change * each.changes, default=reading)
         if best not in turned or best == reading:
             return None
         fit = fits[best]
         # Without a fit the known marker itself has led from this reading to another one.
-        clearly = as_given is None or fit.nats + _Settings.certain < as_given.nats
-        far = _Settings.nearer * fit.tool_m < (as_given or self.fits[reading]).tool_m
+        clearly = as_given is None or fit.nats + SearchSettings.certain < as_given.nats
+        far = SearchSettings.nearer * fit.tool_m < (as_given or self.fits[reading]).tool_m
         return (best, fit) if clearly and far else None
 
     def with_marker_nearer(self, reading: Reading) -> Reading | None:
         """Return the reading with other quarter turns, as good a fit, that brings a far marker near to its place."""
         best = min(self._turned_alike(reading), key=lambda each: self.fits[each].tool_m, default=reading)
-        far = self.fits[reading].tool_m > _Settings.nearer * max(self.fits[best].tool_m, KNOWN_TOOL_M)
+        far = self.fits[reading].tool_m > SearchSettings.nearer * max(
+            self.fits[best].tool_m, LimitSettings.known_tool_m
+        )
         return best if far else None
 
     def _turned_alike(self, reading: Reading) -> list[Reading]:
@@ -280,7 +282,9 @@ class ReadingSearch:
         return max(float(np.sqrt(np.square(self.distances(q, x, [(q, x)])).mean())), self.exact_m)
 
     def _best(self) -> list[Reading]:
-        return sorted(self.fits, key=lambda reading: self.fits[reading].nats + _Settings.a_change * reading.changes)
+        return sorted(
+            self.fits, key=lambda reading: self.fits[reading].nats + SearchSettings.a_change * reading.changes
+        )
 
     def _most_probable(self, as_it_is: Reading) -> tuple[Reading, list[float]]:
         """Return the most probable reading with links of some tolerance, and the errors of better fits that it refutes.
@@ -301,9 +305,9 @@ class ReadingSearch:
         slides = self.chain.prismatic
         read = [(each.angles(self.q, slides), each.positions(self.x), each.scale) for each in rivals]
         changes = np.array([reading.changes for reading in rivals])
-        probable = evidences(self.chain, read, self.poses.rows) - _Settings.a_change * changes
+        probable = evidences(self.chain, read, self.poses.rows) - SearchSettings.a_change * changes
         # Where the columns as they are fit best, another reading has to be certain twice.
-        probable[rivals.index(as_it_is)] += 2.0 * _Settings.certain if nearest == as_it_is else 0.0
+        probable[rivals.index(as_it_is)] += 2.0 * SearchSettings.certain if nearest == as_it_is else 0.0
         best = rivals[int(probable.argmax())]
         nats, error = self.fits[best].nats, self.fits[best].error
         fits = [self.fits[reading] for reading in rivals]
@@ -311,7 +315,7 @@ class ReadingSearch:
 
     @staticmethod
     def _alike(error: float, others: list[float]) -> bool:
-        return any(abs(error - other) <= _Settings.same * other for other in others)
+        return any(abs(error - other) <= SearchSettings.same * other for other in others)
 
     def _distinct(self, expanded: list[Reading]) -> list[Reading]:
         """Return the best readings whose fits differ from those already expanded, and from each other."""
@@ -321,13 +325,13 @@ class ReadingSearch:
             if not self._alike(error, seen):
                 new.append(reading)
                 seen.append(error)
-            if len(new) == _Settings.width:
+            if len(new) == SearchSettings.width:
                 break
         return new
 
     @staticmethod
     def _as_good(fit: ReadingFit, best: ReadingFit) -> bool:
-        return fit.nats < best.nats + _Settings.certain or fit.error < THRESHOLDS.as_good * best.error
+        return fit.nats < best.nats + SearchSettings.certain or fit.error < THRESHOLDS.as_good * best.error
 
     def _try(self, readings: Iterable[Reading]) -> None:
         new = [reading for reading in dict.fromkeys(readings) if reading not in self._tried]
@@ -341,13 +345,18 @@ class ReadingSearch:
         Args:
             tools: marker offsets (s, 3) [m] to start from.
         """
-        std = self._std * (_Settings.held if held else 1.0)
+        std = self._std * (SearchSettings.held if held else 1.0)
         for reading, fit in self._placed(new, std=std, tools=tools).items():
             if reading not in self.fits or fit.nats < self.fits[reading].nats:
                 self.fits[reading] = fit
 
     def _placed(
-        self, new: list[Reading], *, std: FloatArray, tool_m: float = TOOL_M, tools: FloatArray | None = None
+        self,
+        new: list[Reading],
+        *,
+        std: FloatArray,
+        tool_m: float = LimitSettings.tool_m,
+        tools: FloatArray | None = None,
     ) -> dict[Reading, ReadingFit]:
         """Return the best fit of each reading; a zero that goes to the next quarter turn makes it another reading.
 
@@ -362,7 +371,9 @@ class ReadingSearch:
         placed = place(self.chain, q, x, zeros_std=std, tool_std=tool_m, tools=tools)
         quarters = np.where(slides, 0, np.rint(placed.zeros / QUARTER)).astype(np.intp)
         zeros = placed.zeros - QUARTER * quarters
-        errors = np.maximum(placed.errors(MEASURED), self.exact_m) * [reading.scale for reading in new]
+        errors = np.maximum(placed.errors(LimitSettings.measured_share), self.exact_m) * [
+            reading.scale for reading in new
+        ]
         moved = np.linalg.norm(placed.tools, axis=1)
         cost = 0.5 * np.square(zeros / std).sum(axis=1) + 0.5 * np.square(moved / tool_m)
         if self._pose_known:
@@ -371,7 +382,7 @@ class ReadingSearch:
                 0.0 if r.mirrored else 0.5 * (turn / THRESHOLDS.turned_rad) ** 2
                 for r, turn in zip(new, turns, strict=True)
             ]
-        nats = 3.0 * MEASURED * len(self.poses.rows) * np.log(errors) + cost
+        nats = 3.0 * LimitSettings.measured_share * len(self.poses.rows) * np.log(errors) + cost
         fits: dict[Reading, ReadingFit] = {}
         for k, reading in enumerate(new):
             found = reading.turned(quarters[k].tolist())

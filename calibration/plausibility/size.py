@@ -10,20 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning.solvers.tolerance_selection import WORKMANSHIP
+from bodyschema.learning.solvers.tolerance_selection import ToleranceSettings
 from kbmaps import ChainParameters, ChainTolerances, RigidChain
 from kbmaps.chains.parameters import WIDE
 from kbmaps.chains.placement import Placements, place
 from kbmaps.rotations import rotation_vectors
 
-from .limits import MEASURED, SLIDES_M, TOOL_M, ZEROS_RAD, BoolArray
+from .limits import BoolArray, LimitSettings
 from .verdict import THRESHOLDS, Plausibility, mm
-
-# The links are linearised about a fit with nominal links: two steps reach 0.1 % from a size that is 20 % off.
-_STEPS = 3
-# Candidate noise levels, as shares of the residuals with nominal links: tolerances explain the rest of these.
-_NOISES = np.geomspace(0.01, 2.0, 16)
-_FAR = 5.0  # rows farther off than this multiple of the median are outliers
 
 
 class _Settings:
@@ -33,6 +27,11 @@ class _Settings:
     # hardly better for it.
     far: float = 5.0
     other: float = 0.04  # Smaller ones are warned of: a joint whose ratio is 2 % off looks like positions 2.4 % off
+    # The links are linearised about a fit with nominal links: two steps reach 0.1 % from a size that is 20 % off.
+    steps: int = 3
+    # Candidate noise levels, as shares of the residuals with nominal links: tolerances explain the rest of these.
+    noises = np.geomspace(0.01, 2.0, 16)
+    far_row: float = 5.0  # rows farther off than this multiple of the median are outliers
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,11 +84,11 @@ def size_of(chain: RigidChain, q: FloatArray, x: FloatArray, apart: NDArray[np.i
         exact_m: distances below this are not distinguished [m].
     """
     log, sigma = 0.0, math.inf
-    for _ in range(_STEPS):
+    for _ in range(_Settings.steps):
         placed = _placed(chain, q[apart], x[apart] / math.exp(log))
         step, sigma = _log_size(chain, q[apart], placed, x[apart] / math.exp(log))
         log += step
-    error = float(_placed(chain, q, x / math.exp(log)).errors(MEASURED)[0])
+    error = float(_placed(chain, q, x / math.exp(log)).errors(LimitSettings.measured_share)[0])
     return Size(math.exp(log), sigma, max(math.exp(log) * error, exact_m))
 
 
@@ -112,8 +111,8 @@ def evidences(
 
 
 def _placed(chain: RigidChain, q: FloatArray, x: FloatArray) -> Placements:
-    std = np.where(chain.prismatic, SLIDES_M, ZEROS_RAD)
-    return place(chain, q[None], x[None], zeros_std=std, tool_std=TOOL_M)
+    std = np.where(chain.prismatic, LimitSettings.slides_m, LimitSettings.zeros_rad)
+    return place(chain, q[None], x[None], zeros_std=std, tool_std=LimitSettings.tool_m)
 
 
 def _log_size(chain: RigidChain, q: FloatArray, placed: Placements, x: FloatArray) -> tuple[float, float]:
@@ -126,7 +125,7 @@ def _log_size(chain: RigidChain, q: FloatArray, placed: Placements, x: FloatArra
 
 
 def _is_near(distances: FloatArray) -> BoolArray:
-    return distances <= _FAR * np.median(distances)
+    return distances <= _Settings.far_row * np.median(distances)
 
 
 def _evidences(chain: RigidChain, q: FloatArray, placed: Placements, x: FloatArray, good: BoolArray) -> FloatArray:
@@ -142,7 +141,7 @@ def _evidences(chain: RigidChain, q: FloatArray, placed: Placements, x: FloatArr
     # The prior of zeros and marker is about nominal, not about their fit.
     residuals = (x[good] - drawn).ravel() + jacobian @ tolerated
     larger = (drawn - drawn.mean(axis=0)).ravel()
-    noises = np.square(_NOISES * np.sqrt(np.square(distances[good]).mean() / 3.0))
+    noises = np.square(_Settings.noises * np.sqrt(np.square(distances[good]).mean() / 3.0))
     # All that the parameters explain is in a few directions.
     basis, effects = np.linalg.qr(jacobian)
     both = np.stack([residuals, larger])
@@ -156,13 +155,13 @@ def _made(parameters: ChainParameters) -> Iterator[FloatArray]:
     """Yield roots (p, k) of the covariance of each workmanship, and of the same with one link of any length."""
     _, _, tangents, _, marker = parameters.tables
     joints = len(tangents)
-    for axes, points in WORKMANSHIP:
+    for axes, points in ToleranceSettings.workmanship:
         tolerances = ChainTolerances(
             axes=axes,
             points=points,
-            zeros=ZEROS_RAD,
-            slide_zeros=SLIDES_M,
-            tool=TOOL_M,
+            zeros=LimitSettings.zeros_rad,
+            slide_zeros=LimitSettings.slides_m,
+            tool=LimitSettings.tool_m,
             base_rotation=WIDE,
             base_translation=WIDE,
         )
@@ -175,7 +174,7 @@ def _made(parameters: ChainParameters) -> Iterator[FloatArray]:
                 (tangents * (np.arange(joints) >= joint)[:, None, None]).swapaxes(1, 2).reshape(-1, 3)
             )
             moved[parameters.tool] = marker[:3, :3].T
-            yield np.hstack([root, TOOL_M * moved])
+            yield np.hstack([root, LimitSettings.tool_m * moved])
 
 
 def _posteriors(

@@ -29,7 +29,7 @@ from bodyschema.diagnosis.report.svg_plot import Layout, Plot
 from bodyschema.interfaces.errors import BusError
 from bodyschema.interfaces.interpreter import end, module_command
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.learning.online_learner import REGION_RAD
+from bodyschema.learning.online_learner import OnlineSettings
 from bodyschema.learning.status import Outlook
 from bodyschema.robot.description import RobotDescription
 from kbmaps import RigidChain, nearest_rotation, rotation_matrices, rotation_vectors
@@ -182,7 +182,7 @@ class Judge:
         if not len(region):
             return None
         poses = region[self._rng.integers(len(region), size=_Settings.poses)]
-        poses = poses + self._rng.normal(0.0, REGION_RAD, poses.shape)
+        poses = poses + self._rng.normal(0.0, OnlineSettings.region_rad, poses.shape)
         poses = np.clip(poses, self._robot.lower, self._robot.upper)
         truth = self.truth()
         x_true = truth.positions(poses)

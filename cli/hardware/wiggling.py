@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bodyschema.calibration.latency import LATEST_S, LatencyError, Wiggle
+from bodyschema.calibration.latency import LatencyError, LatencySettings, Wiggle
 from bodyschema.daemon.sampler.sources import Sources
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import RecordingError, SourceEnded, SourceLost
@@ -74,7 +74,7 @@ def collected(sources: Sources, duration_s: float, tell: Callable[[float], None]
         except Exception as error:
             failures.append(error)
 
-    clock, last = SystemClock(), duration_s + LATEST_S
+    clock, last = SystemClock(), duration_s + LatencySettings.latest_s
     with sources.joints, sources.marker:
         thread = threading.Thread(target=read_joints, name="encoders")
         thread.start()

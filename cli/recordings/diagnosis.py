@@ -26,7 +26,7 @@ from bodyschema.diagnosis.report.conclusion import conclusion
 from bodyschema.diagnosis.report.page import About, page
 from bodyschema.diagnosis.report.result import DiagnosisFile
 from bodyschema.diagnosis.report.text import modelled, remedies
-from bodyschema.diagnosis.search.hypotheses import STILL
+from bodyschema.diagnosis.search.hypotheses import HypothesisSettings
 from bodyschema.effects import EFFECT_TYPES, write_corrected, write_extended
 from bodyschema.effects.effect_type import CameraEffect
 from bodyschema.interfaces.errors import BodyschemaError, RecordingError, RequestError
@@ -196,7 +196,7 @@ def run(config: Config, source: Source, asked: Asked, tell: Tell, *, force: bool
             f"{source.name}: {len(recording)} pairs are too few to tell causes of {len(robot.joints)} joints apart. "
             f"Record at least {fewest}; some hundred are better"
         )
-    if np.ptp(recording.q, axis=0).max() < STILL:
+    if np.ptp(recording.q, axis=0).max() < HypothesisSettings.still:
         raise DiagnosisError(f"{source.name}: no joint ever moved. Guide each joint through its range")
     tell(f"{len(recording)} pairs of {source.name}")
     chain = NominalModel.extended_by(config.simulation).chain

@@ -22,7 +22,7 @@ from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import JointsRequest, PredictReply, decode, encode
 from bodyschema.interfaces.errors import BusError, RecordingError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.recordings.recording import ROW_INTERVAL_S, Recording
+from bodyschema.recordings.recording import Recording, RecordingSettings
 from bodyschema.robot.description import RobotDescription
 from kbmaps import rotation_matrices, rotation_vectors
 
@@ -90,7 +90,7 @@ class Job:
     def drivers(self) -> dict[str, float]:
         """Keys of the table [drivers] for this job."""
         times = self.learnt_rows.play_times
-        live = float(times[-1] - times[0]) / max(len(times) * ROW_INTERVAL_S, _Settings.shortest_s)
+        live = float(times[-1] - times[0]) / max(len(times) * RecordingSettings.row_interval_s, _Settings.shortest_s)
         keys = {"speed": live if self.speed is None else self.speed}
         return keys if self.sigma_m is None else keys | {"recording_sigma_m": self.sigma_m}
 

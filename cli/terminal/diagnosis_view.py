@@ -13,7 +13,7 @@ from rich.text import Text
 from bodyschema.cli.terminal.screen import ScreenSettings
 from bodyschema.diagnosis.report.numbers import chance, mm, numbers_of, percent, place, share, telling
 from bodyschema.diagnosis.report.presenters.registry import named, rival_named
-from bodyschema.diagnosis.report.result import SMALL, DiagnosisFile, Indistinguishable, Verdict
+from bodyschema.diagnosis.report.result import DiagnosisFile, Indistinguishable, ResultSettings, Verdict
 from bodyschema.diagnosis.report.text import in_order, made_to, modelled, other_shares, to_do
 
 _HEADS: dict[Verdict, tuple[str, str]] = {
@@ -67,7 +67,7 @@ def view(diagnosis: DiagnosisFile, remedies: Sequence[str], *, timed: bool) -> G
     if first:
         parts.append(_list("What to do", first, numbered=True))
     if small:
-        parts.append(_list(f"Small causes, each less than {SMALL:.0f} % of the gain", small))
+        parts.append(_list(f"Small causes, each less than {ResultSettings.small_percent:.0f} % of the gain", small))
     if diagnosis.advice:
         parts.append(_list("What to measure next", diagnosis.advice))
     if diagnosis.limitations:

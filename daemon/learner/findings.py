@@ -12,14 +12,14 @@ import numpy as np
 
 from bodyschema.calibration.chain_figures import ChainFigures, is_told, no_surer_than_possible
 from bodyschema.calibration.plausibility.check import plausibility
-from bodyschema.calibration.plausibility.search import ROWS
+from bodyschema.calibration.plausibility.search import SearchSettings
 from bodyschema.calibration.plausibility.verdict import FEWEST_ROWS
 from bodyschema.daemon.transport.status import UNDECIDED, Change
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.learning.data_outlook import LearnerEvidence, Scatter, forecast
 from bodyschema.learning.model_bank import SOLVED
 from bodyschema.learning.online_learner import OnlineLearner
-from bodyschema.learning.solvers.tolerance_selection import WORKMANSHIP, probable
+from bodyschema.learning.solvers.tolerance_selection import ToleranceSettings, probable
 from bodyschema.learning.status import (
     JOINT,
     ChainCalibration,
@@ -134,7 +134,7 @@ class Findings:
         if count < max(FEWEST_ROWS, 2 * self._checked) or begin < self._turns.due_at:
             return
         spent = self._turns.spent()
-        q, x = self._learning.kept(ROWS)
+        q, x = self._learning.kept(SearchSettings.rows)
         if len(q) < FEWEST_ROWS:  # the others are doubted
             return
         self._checked = count
@@ -185,7 +185,9 @@ def figures(robot: RobotDescription, known: LearnerEvidence) -> tuple[ChainFigur
     """
     wide = known.tolerances
     made = [(wide.axes, wide.points)]
-    made += [(axes, points) for axes, points in WORKMANSHIP if axes < wide.axes and points < wide.points]
+    made += [
+        (axes, points) for axes, points in ToleranceSettings.workmanship if axes < wide.axes and points < wide.points
+    ]
     prior = known.nominal.belief(known.wide.parameters.reference, wide)
     belief = no_surer_than_possible(known.wide, prior, robot)
     beliefs = [belief.tightened(wide, replace(wide, axes=axes, points=points)) for axes, points in made]

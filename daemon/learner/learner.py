@@ -33,7 +33,7 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.interfaces.waits import READ_S
 from bodyschema.learning.nominal import NominalModel
 from bodyschema.learning.online_learner import OnlineLearner
-from bodyschema.learning.solvers.solver import LARGEST_NET, Solver
+from bodyschema.learning.solvers.solver import Solver, SolverSettings
 
 log = logging.getLogger(__name__)
 
@@ -214,7 +214,7 @@ class Learner:
             )
         if self._feed.refused is not None:
             yield f"pairs were refused, {self._learning.counters.refused} so far; the last: {self._feed.refused}"
-        if self._nominal.size > LARGEST_NET:
+        if self._nominal.size > SolverSettings.largest_net:
             yield f"{self._nominal.joints} joints are too many for the exact map; the others learn without it"
 
     def _declare(self) -> None:

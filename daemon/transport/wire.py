@@ -226,7 +226,7 @@ def pair_from_wire(message: PairMessage, joints: int) -> Pair:
 
     from bodyschema.interfaces.covariance import from_upper
     from bodyschema.interfaces.records import Pair, frozen_array
-    from bodyschema.recordings.columns import QUATERNION_TOLERANCE
+    from bodyschema.recordings.columns import ColumnLimits
 
     q = np.array(message.q)
     numbers = np.concatenate([q, message.x, message.cov, [message.t], message.R or (), message.cov_R or ()])
@@ -234,7 +234,7 @@ def pair_from_wire(message: PairMessage, joints: int) -> Pair:
         raise RequestError(f"pair {message.seq} has {len(q)} joint angles, this robot has {joints}")
     if not np.isfinite(numbers).all():
         raise RequestError(f"pair {message.seq} has a number that is not finite")
-    if message.R is not None and abs(math.hypot(*message.R) - 1.0) > QUATERNION_TOLERANCE:
+    if message.R is not None and abs(math.hypot(*message.R) - 1.0) > ColumnLimits.quaternion_tolerance:
         raise RequestError(f"pair {message.seq} has an R of the length {math.hypot(*message.R):.6g}, not 1")
     return Pair(
         store=message.store,

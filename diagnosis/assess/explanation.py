@@ -9,7 +9,7 @@ import numpy as np
 
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.noise import wanders
-from bodyschema.diagnosis.fit.worth import NAMED
+from bodyschema.diagnosis.fit.worth import WorthSettings
 from bodyschema.diagnosis.search.held_out import Blocks, held_out_errors, is_marker
 from bodyschema.diagnosis.search.search import Search, describe, named
 from bodyschema.diagnosis.search.together import beyond_tolerances, is_at_limit, tolerated
@@ -246,7 +246,8 @@ def _with_unnamed(
         # Each remaining unnamed cause is worth hardly more than this one.
         if worth + _Settings.slack * (_Settings.most_unnamed - len(chosen)) * max(more, 0.0) < least:
             break
-        if more < NAMED or (more < _Settings.beyond_doubt and unnamed.agreed(here, chosen, way) < 0.0):
+        doubted = more < _Settings.beyond_doubt
+        if more < WorthSettings.named_nats or (doubted and unnamed.agreed(here, chosen, way) < 0.0):
             break
         tried = [unnamed.apart(fit, (*chosen, way), apart) for way, _ in near]
         apart = max(tried, key=lambda one: counted * one.fit.log_likelihood - unnamed.cost(one))
@@ -264,7 +265,7 @@ def cost_of_names(causes: Iterable[Effect], search: Search) -> float:
 def _pruned(explanation: Explanation, unnamed: UnnamedFamilies, search: Search, *, rest: bool) -> Explanation:
     """Remove causes not worth keeping beside unnamed ones; with a remainder, those the unnamed ones can replace."""
     for cause in explanation.fit.causes:
-        least = explanation.worth - (_Settings.as_good if rest else NAMED)
+        least = explanation.worth - (_Settings.as_good if rest else WorthSettings.named_nats)
         fewer = without_one(explanation, cause, unnamed, search, least)
         redundant = _is_as_good(fewer, explanation) if rest else fewer.worth > least
         if fewer.unnamed_causes and redundant:

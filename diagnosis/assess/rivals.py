@@ -9,8 +9,8 @@ import numpy as np
 
 from bodyschema.diagnosis.fit.fit import Fit, amount_columns, solved
 from bodyschema.diagnosis.fit.scatter import beyond_single_rows, limited_rows, remembers
-from bodyschema.diagnosis.fit.tangent import TOLD_APART
-from bodyschema.diagnosis.fit.worth import SAME
+from bodyschema.diagnosis.fit.tangent import TangentSettings
+from bodyschema.diagnosis.fit.worth import WorthSettings
 from bodyschema.diagnosis.search.held_out import Blocks, beside_fit
 from bodyschema.diagnosis.search.scan import Candidate
 from bodyschema.diagnosis.search.search import Search
@@ -22,7 +22,7 @@ from bodyschema.interfaces.records import FloatArray
 from .unnamed_alternative import UnnamedAlternative
 
 
-class _Settings:
+class RivalSettings:
     """Settings of rivals.
 
     Sensitivity, each at 0.3 and 3 times over three recordings with hidden errors: `comes_near` changes who is a rival,
@@ -37,9 +37,7 @@ class _Settings:
     # of the times between them.
     poses, uneven = 400, 1.0
     next_to_it = 1e-3  # smallest move there, as a share of a far one
-
-
-PROBABLE = 0.02  # a less probable rival is not listed
+    probable = 0.02  # a less probable rival is not listed
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,12 +56,12 @@ class Rival:
     @property
     def is_same_here(self) -> bool:
         """True if no data of this motion separates it from the cause."""
-        return self.difference < SAME
+        return self.difference < WorthSettings.same
 
     @property
     def is_same_anywhere(self) -> bool:
         """True if no motion separates it from the cause."""
-        return self.anywhere < _Settings.same_share * self.signal
+        return self.anywhere < RivalSettings.same_share * self.signal
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,11 +95,11 @@ def _standing(
     tried: list[tuple[Fit, Effect]] = []
     behind = list[float]()
     for candidate in beside.candidates:
-        if candidate.gain < _Settings.comes_near * itself.gain:
+        if candidate.gain < RivalSettings.comes_near * itself.gain:
             continue
-        rival = beside.exchanged(candidate, fit.log_likelihood - _Settings.hopeless)
+        rival = beside.exchanged(candidate, fit.log_likelihood - RivalSettings.hopeless)
         doubt = float(np.log(max(candidate.trials / max(itself.trials, 1), 1e-3)))
-        if can_be_measured(cause, candidate.effect) and _difference(fit, rival) < SAME:
+        if can_be_measured(cause, candidate.effect) and _difference(fit, rival) < WorthSettings.same:
             # That one number of a link among many does what a scale does is no chance.
             doubt = 0.0
         more = rival.log_likelihood - fit.log_likelihood - beside.cost_of(candidate) - doubt
@@ -111,7 +109,7 @@ def _standing(
         behind.append(more + (beyond_single_rows(fit, rival) if alike else 0.0))
     others: list[tuple[Fit | UnnamedAlternative, Effect | UnnamedAlternative]] = [_as_fitted(*one) for one in tried]
     if unnamed is not None:
-        near = unnamed.specific(without, _Settings.comes_near * itself.gain)
+        near = unnamed.specific(without, RivalSettings.comes_near * itself.gain)
         aparts = [unnamed.apart(without, (way,)) for way in near]
         if (alternative := UnnamedAlternative.in_place_of(cause, fit, aparts, unnamed, search)) is not None:
             others.append((alternative, alternative))
@@ -119,18 +117,18 @@ def _standing(
     # What a cause is worth allows for blocks already.
     rows = [np.zeros(len(fit.left)), *(_at_rows(fit, other, cause, itself) for other, itself in others)]
     probable = bagged([-worth, *behind], rows, blocks, seed)
-    wide = widened(fit, range(fit.observations.motion.q.shape[1]), uneven=_Settings.uneven)
+    wide = widened(fit, range(fit.observations.motion.q.shape[1]), uneven=RivalSettings.uneven)
     signal = apart_on(fit, without, wide)
     rivals = []
     for (other, alternative), share in zip(others, probable[2:], strict=True):
-        if share >= PROBABLE:
+        if share >= RivalSettings.probable:
             anywhere = apart_on(fit, other, wide)
-            one = anywhere < _Settings.same_share * signal and _is_no_more(other, fit, without, wide)
+            one = anywhere < RivalSettings.same_share * signal and _is_no_more(other, fit, without, wide)
             one = one and not can_be_measured(cause, alternative)
             rivals.append(Rival(other, alternative, float(share), _difference(fit, other), anywhere, signal, one))
     same = sum(rival.probability for rival in rivals if rival.is_one)
     ordered = tuple(sorted(rivals, key=lambda rival: rival.probability, reverse=True))
-    sags = is_like_sag(without, cause, _Settings.comes_near * itself.gain)
+    sags = is_like_sag(without, cause, RivalSettings.comes_near * itself.gain)
     return Standing(itself, float(probable[0]) + same, itself.dof, gain, ordered, sags)
 
 
@@ -160,7 +158,7 @@ def is_like_sag(without: Fit, cause: Effect, least: float) -> bool:
     left = without.evident.ravel()
     toward, squares = beside.T @ left, np.square(beside).sum(axis=0)
     # The share of a column that the fit's own parameters leave may be rounding alone.
-    told = (toward > 0.0) & (squares > TOLD_APART * np.square(columns).sum(axis=(0, 1)))
+    told = (toward > 0.0) & (squares > TangentSettings.told_apart * np.square(columns).sum(axis=(0, 1)))
     explained = np.square(toward[told]) / squares[told]
     rows = 3.0 * float(without.noise.weights.sum())
     share = float(explained.max(initial=0.0)) / max(float(left @ left), 1e-300)
@@ -177,9 +175,9 @@ def bagged(behind: Sequence[float], rows: Sequence[FloatArray], blocks: Blocks, 
         rows: the part of it that each row holds (n,).
     """
     even = np.full(blocks.count, 1.0 / blocks.count)
-    drawn = np.random.default_rng(seed).multinomial(blocks.count, even, _Settings.bagged) - 1
+    drawn = np.random.default_rng(seed).multinomial(blocks.count, even, RivalSettings.bagged) - 1
     nats = np.array(
-        [np.zeros(_Settings.bagged), *(b + drawn @ blocks.sums(own) for b, own in zip(behind, rows, strict=True))]
+        [np.zeros(RivalSettings.bagged), *(b + drawn @ blocks.sums(own) for b, own in zip(behind, rows, strict=True))]
     )
     odds = np.exp(nats - nats.max(axis=0))
     return np.asarray((odds / odds.sum(axis=0)).mean(axis=1), dtype=np.float64)
@@ -199,7 +197,7 @@ def _is_no_more(other: Fit | UnnamedAlternative, fit: Fit, without: Fit, wide: M
     """Return True if the cause, refitted, covers all that a rival can do on any motion."""
     if not isinstance(other, Fit):
         return True
-    return apart_on(other, fit, wide) < _Settings.same_share * apart_on(other, without, wide)
+    return apart_on(other, fit, wide) < RivalSettings.same_share * apart_on(other, without, wide)
 
 
 def _as_fitted(fit: Fit, effect: Effect) -> tuple[Fit, Effect]:
@@ -222,13 +220,14 @@ def widened(fit: Fit, joints: Iterable[int], uneven: float = 0.0) -> Motion:
     motion = fit.observations.motion
     rng = np.random.default_rng(0)
     n = len(motion)
-    rows = np.sort(rng.integers(n, size=min(n, _Settings.poses)))
+    rows = np.sort(rng.integers(n, size=min(n, RivalSettings.poses)))
     q = motion.q[rows].copy()
     for k in joints:
         q[:, k] = rng.uniform(*whole_range(fit, k), len(rows))
         # The second pose of each run is near to far from the first, which separates effects with memory.
         firsts, seconds = q[: len(rows) // 2 * 2 : 2, k], q[1::2, k]
-        seconds[:] = firsts + np.exp(rng.uniform(np.log(_Settings.next_to_it), 0.0, len(seconds))) * (seconds - firsts)
+        reach = np.exp(rng.uniform(np.log(RivalSettings.next_to_it), 0.0, len(seconds)))
+        seconds[:] = firsts + reach * (seconds - firsts)
     clock = motion.clock
     gaps = np.cumsum(np.exp(uneven * rng.normal(size=len(rows))))
     shares = (gaps - gaps[0]) / max(gaps[-1] - gaps[0], 1e-9)

@@ -17,10 +17,12 @@ from bodyschema.effects import Effect, Motion, Simulated
 from bodyschema.effects.motion import crossed
 from bodyschema.interfaces.records import FloatArray
 
-# Number of long blocks of time, each of which is left out once. In short ones a walk stays near where it was.
-_PARTS = 10
-_SURELY = 0.95  # one-sided probability of the t-test
-_POSES = 400  # number of new poses
+
+class _Settings:
+    # Number of long blocks of time, each of which is left out once. In short ones a walk stays near where it was.
+    parts = 10
+    surely = 0.95  # one-sided probability of the t-test
+    poses = 400  # number of new poses
 
 
 def stored(candidates: Sequence[Fit], markers: NDArray[np.bool_]) -> Fit:
@@ -91,7 +93,7 @@ class _Elsewhere:
     def is_better_than(self, simpler: _Elsewhere) -> bool:
         """Return True if this fit is surely better elsewhere."""
         gains = simpler.squares - self.squares
-        unsure = float(np.std(gains, ddof=1)) * np.sqrt(len(gains)) * stdtrit(len(gains) - 1, _SURELY)
+        unsure = float(np.std(gains, ddof=1)) * np.sqrt(len(gains)) * stdtrit(len(gains) - 1, _Settings.surely)
         return float(gains.sum()) - unsure > max(self.variance - simpler.variance, 0.0)
 
 
@@ -104,7 +106,7 @@ def predicted_pose_covariance(fit: Fit) -> FloatArray | None:
     if not fit.covariance.size:
         return None
     motion = fit.observations.motion
-    motion = motion.some(np.arange(0, len(motion), -(-len(motion) // _POSES)))
+    motion = motion.some(np.arange(0, len(motion), -(-len(motion) // _Settings.poses)))
     simulation = fit.settled_simulation
     own = [effect for effect in simulation.effects if _is_of_pose(effect)]
     arm = replace(simulation, effects=tuple(own), residual=None)
@@ -136,7 +138,7 @@ def _pose_columns(fit: Fit, run: Simulated) -> FloatArray:
 
 
 def _long_blocks(rows: int) -> Blocks:
-    return Blocks.cut(rows, _PARTS)
+    return Blocks.cut(rows, _Settings.parts)
 
 
 def _sums(errors: FloatArray, markers: NDArray[np.bool_]) -> FloatArray:
@@ -147,7 +149,7 @@ def _sums(errors: FloatArray, markers: NDArray[np.bool_]) -> FloatArray:
 
 def _new_poses(motion: Motion) -> Motion:
     """Return a motion whose joints have their readings in another order, each joint in its own."""
-    rng, rows = np.random.default_rng(0), np.linspace(0, len(motion) - 1, min(len(motion), _POSES)).astype(int)
+    rng, rows = np.random.default_rng(0), np.linspace(0, len(motion) - 1, min(len(motion), _Settings.poses)).astype(int)
     q = np.stack([rng.permutation(own)[rows] for own in motion.q.T], axis=1)
     return replace(motion, q=q, t=None if motion.t is None else motion.t[rows], segment=motion.segment[rows])
 

@@ -9,13 +9,13 @@ import numpy as np
 
 from bodyschema.diagnosis.fit.fit import Fit, amount_columns
 from bodyschema.diagnosis.search.search import Search
-from bodyschema.diagnosis.unnamed.family_fits import SPECIFIC, Apart, UnnamedFamilies
+from bodyschema.diagnosis.unnamed.family_fits import Apart, FamilySettings, UnnamedFamilies
 from bodyschema.effects import Effect, Motion
 from bodyschema.interfaces.records import FloatArray
 
 from .explanation import cost_of_names
 
-# Prior penalty against a named cause [nats]. Accepting one in place of a cause takes `SPECIFIC` instead, so that a
+# Prior penalty against a named cause [nats]. Accepting one in place of a cause takes `specific_nats` instead, so that a
 # cause is not given up for something that fits as well by chance.
 _LESS_USUAL = 1.5
 
@@ -37,7 +37,7 @@ class UnnamedAlternative:
             fit: the fit with the cause.
             tried: fits without the cause, beside unnamed causes.
         """
-        allowance = cost_of_names([cause], search) + SPECIFIC - _LESS_USUAL
+        allowance = cost_of_names([cause], search) + FamilySettings.specific_nats - _LESS_USUAL
         found = [
             cls(apart, apart.fit.log_likelihood - fit.log_likelihood + allowance - unnamed.cost(apart))
             for apart in tried

@@ -11,7 +11,9 @@ from bodyschema.interfaces.records import FloatArray
 from .fit import Fit, fitted
 from .observations import Observations
 
-_ROUNDS, _KEPT = 10, 0.8
+
+class _Settings:
+    rounds, kept_share = 10, 0.8
 
 
 def aligned(observations: Observations, simulation: Simulation) -> Fit:
@@ -31,10 +33,10 @@ def placed(predicted: FloatArray, x: FloatArray) -> FloatArray:
     """Return the camera pose (6,) from which predicted points (n, 3) match most of the measured points x (n, 3)."""
     kept = np.ones(len(x), dtype=bool)
     turn, shift = np.eye(3), np.zeros(3)
-    for _ in range(_ROUNDS):
+    for _ in range(_Settings.rounds):
         centre, seen = predicted[kept].mean(axis=0), x[kept].mean(axis=0)
         turn = Rotation.align_vectors(predicted[kept] - centre, x[kept] - seen)[0].as_matrix()
         shift = centre - turn @ seen
         distance = np.linalg.norm((predicted - shift) @ turn - x, axis=1)
-        kept = distance <= np.quantile(distance, _KEPT)
+        kept = distance <= np.quantile(distance, _Settings.kept_share)
     return np.concatenate([shift, Rotation.from_matrix(turn).as_rotvec()])

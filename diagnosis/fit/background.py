@@ -16,19 +16,20 @@ from numpy.typing import NDArray
 from bodyschema.effects import Effect, Simulated, Simulation
 from bodyschema.interfaces.records import FloatArray
 
-# Workshop tolerances (1 sigma): link length [m], axis or joint offset [rad], drive over a turn [rad].
-LENGTH_M, ANGLE_RAD, DRIVE_RAD = 0.3e-3, float(np.radians(0.06)), float(np.radians(0.01))
-_DRIVE_M = 0.03e-3  # tolerance of a prismatic joint's drive [m]
-_TWICE = 2.0  # Periodic errors of every drive: once and twice per turn of the joint
-_LIKE_OTHERS = 3.0  # a drive error within this multiple of the usual size is a tolerance
-_COUNTS_IN_FULL = 1e-9  # a row counts in full if its weight differs from 1 by less
-SPREAD = 2.0  # prior standard deviation of the logarithms of the scales
-# Smallest and largest scale. With all at the smallest, the arm is exactly as described, such as a simulated one.
-SMALLEST, MOST = 1e-3, 10.0
+
+class BackgroundSettings:
+    # Workshop tolerances (1 sigma): link length [m], axis or joint offset [rad], drive over a turn [rad].
+    length_m, angle_rad, drive_rad = 0.3e-3, float(np.radians(0.06)), float(np.radians(0.01))
+    drive_m = 0.03e-3  # tolerance of a prismatic joint's drive [m]
+    like_others = 3.0  # a drive error within this multiple of the usual size is a tolerance
+    counts_in_full = 1e-9  # a row counts in full if its weight differs from 1 by less
+    spread = 2.0  # prior standard deviation of the logarithms of the scales
+    # Smallest and largest scale. With all at the smallest, the arm is exactly as described, such as a simulated one.
+    smallest_scale, largest_scale = 1e-3, 10.0
 
 
 class Scales(NamedTuple):
-    """Sizes of the tolerances as multiples of `LENGTH_M`, `ANGLE_RAD`, `DRIVE_RAD`, and `_DRIVE_M` for slides."""
+    """Sizes of the tolerances as multiples of `length_m`, `angle_rad`, `drive_rad`, and `drive_m` for slides."""
 
     lengths: float = 1.0
     angles: float = 1.0
@@ -48,9 +49,9 @@ class Scales(NamedTuple):
     @property
     def doubt(self) -> float:
         """Penalty of these scales under their prior, relative to a scale of 1; 0 for an exact arm [nats]."""
-        if max(self) <= SMALLEST:
+        if max(self) <= BackgroundSettings.smallest_scale:
             return 0.0
-        return float(0.5 * np.square(np.log(self) / SPREAD).sum())
+        return float(0.5 * np.square(np.log(self) / BackgroundSettings.spread).sum())
 
 
 class Background:
@@ -108,8 +109,12 @@ class Background:
         """Return True if an effect is a periodic drive error no larger than those of other drives."""
         if self.scales is None or not effect.kind.of_drive:
             return False
-        usual = self.scales.slides * _DRIVE_M if effect.prismatic else self.scales.drives * DRIVE_RAD
-        return float(np.linalg.norm(effect.values[effect.amounts])) < _LIKE_OTHERS * usual
+        usual = (
+            self.scales.slides * BackgroundSettings.drive_m
+            if effect.prismatic
+            else self.scales.drives * BackgroundSettings.drive_rad
+        )
+        return float(np.linalg.norm(effect.values[effect.amounts])) < BackgroundSettings.like_others * usual
 
     @cached_property
     def precision(self) -> FloatArray:
@@ -148,7 +153,7 @@ class Background:
 
 def rows_in_part(weights: FloatArray) -> NDArray[np.intp]:
     """Return the rows that do not count in full, of weights (n,): the only ones that weighted products visit again."""
-    return np.flatnonzero(1.0 - weights > _COUNTS_IN_FULL)
+    return np.flatnonzero(1.0 - weights > BackgroundSettings.counts_in_full)
 
 
 def background_effects(simulation: Simulation, q: FloatArray) -> tuple[Effect, ...]:
@@ -158,7 +163,8 @@ def background_effects(simulation: Simulation, q: FloatArray) -> tuple[Effect, .
         found.append(Effect.at(robot, "link_geometry", joint))
         if not robot.chain.prismatic[k] and np.ptp(q[:, k]) > 0.0:
             found.append(Effect.at(robot, "joint_eccentricity", joint))
-            found.append(Effect.at(robot, "joint_ripple", joint, values=[0.0, 0.0, _TWICE]))
+            # Periodic errors of every drive: once and twice per turn of the joint.
+            found.append(Effect.at(robot, "joint_ripple", joint, values=[0.0, 0.0, 2.0]))
     return tuple(effect.with_amounts(0.0).one_more(-1) for effect in found)
 
 
@@ -171,5 +177,7 @@ def _groups(effect: Effect) -> np.ndarray:
 
 def _units(effect: Effect) -> FloatArray:
     if effect.kind.of_drive:
-        return np.full(len(effect.amounts), _DRIVE_M if effect.prismatic else DRIVE_RAD)
-    return np.repeat([LENGTH_M, ANGLE_RAD], 3)
+        return np.full(
+            len(effect.amounts), BackgroundSettings.drive_m if effect.prismatic else BackgroundSettings.drive_rad
+        )
+    return np.repeat([BackgroundSettings.length_m, BackgroundSettings.angle_rad], 3)

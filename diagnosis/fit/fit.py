@@ -14,15 +14,13 @@ from numpy.typing import NDArray
 from bodyschema.effects import Effect, Simulated, Simulation
 from bodyschema.interfaces.records import FloatArray
 
-from .background import MOST, SPREAD, Background, Scales
-from .noise import ROUNDED, Noise, correlation
+from .background import Background, BackgroundSettings, Scales
+from .noise import Noise, NoiseSettings, correlation
 from .observations import IntArray, Observations
 from .tangent import Tangent, solved
 
-LARGEST = 10.0  # prior limit of an effect, in units of its usual size; unidentifiable parameters stay near zero
 
-
-class _Settings:
+class FitSettings:
     """Settings of the fit.
 
     Sensitivity, each at 0.3 and 3 times over seven recordings with hidden errors: `rounds`, `enough`, `not_tried` and
@@ -46,6 +44,7 @@ class _Settings:
     nodes = np.linspace(-3.0, 3.0, 13)
     # A direction is left out if tolerances absorb less than this share of it: 1e-9 gave the same within 0.001 nats.
     unabsorbed = 1e-6
+    largest = 10.0  # prior limit of an effect, in units of its usual size; unidentifiable parameters stay near zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +69,7 @@ class Fit:
     def without_outliers(self) -> float:
         """Log-likelihood if all fixes were the marker [nats]."""
         squares = np.square(self.residuals[self.observations.trusted]).sum(axis=1)
-        variance = max(float(squares.mean()) / 3.0, ROUNDED**2)
+        variance = max(float(squares.mean()) / 3.0, NoiseSettings.rounded**2)
         return float(-1.5 * len(squares) * (np.log(2.0 * np.pi * variance) + 1.0))
 
     @cached_property
@@ -84,7 +83,7 @@ class Fit:
     @property
     def is_exact(self) -> bool:
         """True if only numerical rounding is left, as for the simulation's own output."""
-        return self.noise.sigma <= ROUNDED
+        return self.noise.sigma <= NoiseSettings.rounded
 
     @property
     def log_likelihood(self) -> float:
@@ -98,7 +97,7 @@ class Fit:
         beyond += self.background.volume(self.noise.sigma)
         for effect in self.simulation.effects[self.nuisances :]:
             for k in effect.amounts:
-                beyond += float(0.5 * (effect.values[k] / (LARGEST * effect.parameters[k].usual)) ** 2)
+                beyond += float(0.5 * (effect.values[k] / (FitSettings.largest * effect.parameters[k].usual)) ** 2)
         return beyond
 
     @cached_property
@@ -183,7 +182,7 @@ class Fit:
         tolerances = self.background.tolerances
         inner = self.background.inner(self.noise.weights) * np.outer(tolerances, tolerances)
         values, vectors = np.linalg.eigh(inner)
-        there = values > _Settings.unabsorbed * self.noise.sigma**2
+        there = values > FitSettings.unabsorbed * self.noise.sigma**2
         values, vectors = values[there], vectors[:, there]
         directions = self.tolerance_columns @ (tolerances[:, None] * vectors / np.sqrt(values))
         return directions, values / (values + self.noise.sigma**2)
@@ -236,13 +235,13 @@ class Fit:
         """
         columns = np.concatenate([self.columns, self.shape_columns], axis=2)
         flat, variance = columns.reshape(self.left.size, -1), self.noise.sigma**2
-        precision = np.append(self.precision, self._shape_precision / _Settings.untold**2)
+        precision = np.append(self.precision, self._shape_precision / FitSettings.untold**2)
         information = flat.T @ flat / variance + np.diag(precision)
         # Normalise the units, since seconds and radians differ widely in size.
         units = np.outer(scales := np.sqrt(np.diag(information)), scales)
         covariance = np.asarray(np.linalg.pinv(information / units, rcond=1e-14, hermitian=True) / units)
         scores = np.einsum("nip,ni->np", columns, self.left) / variance
-        firsts = np.unique(np.linspace(0, len(scores), _Settings.blocks, endpoint=False).astype(int))
+        firsts = np.unique(np.linspace(0, len(scores), FitSettings.blocks, endpoint=False).astype(int))
         moved = np.add.reduceat(scores, firsts, axis=0) @ covariance
         ratio = np.square(moved).sum(axis=0) / np.maximum(np.diag(covariance), 1e-300)
         products = information - np.diag(precision)
@@ -275,12 +274,13 @@ class Fit:
         for g, scale in enumerate(self.background.scales):
             mine = groups == g
             spent = float(mine.sum() - (here.variances[0] * prior)[mine].sum())
-            unsure = 1.0 / np.sqrt(2.0 * max(spent, 0.0) + 1.0 / SPREAD**2)
-            logs = np.log(scale) + unsure * _Settings.nodes
-            logs = logs[logs < np.log(MOST) + _Settings.enough]
+            unsure = 1.0 / np.sqrt(2.0 * max(spent, 0.0) + 1.0 / BackgroundSettings.spread**2)
+            logs = np.log(scale) + unsure * FitSettings.nodes
+            logs = logs[logs < np.log(BackgroundSettings.largest_scale) + FitSettings.enough]
             other = np.where(mine, np.exp(-2.0 * (logs - np.log(scale)))[:, None], 1.0) * prior
             tried = _posteriors(inner, toward, now, other)
-            evidence = tried.evidence + 0.5 * np.log(other[:, mine]).sum(axis=1) - 0.5 * np.square(logs / SPREAD)
+            of_scale = 0.5 * np.square(logs / BackgroundSettings.spread)
+            evidence = tried.evidence + 0.5 * np.log(other[:, mine]).sum(axis=1) - of_scale
             weights = np.exp(evidence - evidence.max())
             weights /= weights.sum()
             squares = tried.variances + np.square(tried.means - here.means[0])
@@ -502,16 +502,16 @@ def improved(fit: Fit, least: float = -np.inf) -> Fit:
     if not fit.simulation.effects and not len(fit.tolerated):
         return fit
     tangent, is_fresh, before = fit.near_tangent, fit.tangent is None, np.inf
-    for done in range(_Settings.rounds):
+    for done in range(FitSettings.rounds):
         step, promised = fit.step(tangent)
         # In squares, since the noise falls as well.
         square = promised * fit.noise.sigma**2
-        if not is_fresh and square > _Settings.left_over * before:
+        if not is_fresh and square > FitSettings.left_over * before:
             tangent, is_fresh = fit.own_tangent, True
             step, promised = fit.step(tangent)
             square = promised * fit.noise.sigma**2
-        hopeless = fit.log_likelihood + _Settings.slack * _rise(promised, fit) + _Settings.little < least
-        if promised < _Settings.not_tried or (done and hopeless):
+        hopeless = fit.log_likelihood + FitSettings.slack * _rise(promised, fit) + FitSettings.little < least
+        if promised < FitSettings.not_tried or (done and hopeless):
             return fit
         best = _best_of(fit, step)
         if best is None and not is_fresh:
@@ -521,7 +521,7 @@ def improved(fit: Fit, least: float = -np.inf) -> Fit:
             return fit
         gained = best.log_likelihood - fit.log_likelihood
         fit, is_fresh, before = best, False, square
-        if gained < _Settings.enough:
+        if gained < FitSettings.enough:
             break
     return fit
 
@@ -586,7 +586,7 @@ def prior_precision(simulation: Simulation, nuisances: int) -> FloatArray:
     parts = []
     for k, effect in enumerate(simulation.effects):
         usual = np.array([effect.parameters[j].usual for j in effect.amounts])
-        parts.append(1.0 / np.square((LARGEST if k >= nuisances else 1e4) * usual))
+        parts.append(1.0 / np.square((FitSettings.largest if k >= nuisances else 1e4) * usual))
     return np.concatenate(parts) if parts else np.empty(0)
 
 

@@ -9,9 +9,11 @@ import numpy as np
 from .fit import Fit
 from .observations import Observations
 
-_FACTORS = np.geomspace(0.05, 20.0, 61)  # factors by which the stated noise may be wrong
-# Beyond this share of coordinates with more quantisation than noise, the residuals do not show the noise's shape.
-_MOSTLY_ROUNDING = 0.5
+
+class _Settings:
+    factors = np.geomspace(0.05, 20.0, 61)  # factors by which the stated noise may be wrong
+    # Beyond this share of coordinates with more quantisation than noise, the residuals do not show the noise's shape.
+    mostly_rounding = 0.5
 
 
 def reshaped(fit: Fit) -> Observations | None:
@@ -28,7 +30,7 @@ def reshaped(fit: Fit) -> Observations | None:
     left = np.einsum("nji,nj->ni", axes, observations.x - fit.predicted)[rows]
     rounding = np.einsum("nji,njk,nki->ni", axes, observations.rounding, axes)[rows]
     stated = observations.stated_factor**2 * variances[rows]
-    if (rounding > stated).mean() > _MOSTLY_ROUNDING:
+    if (rounding > stated).mean() > _Settings.mostly_rounding:
         return None
     factors = (np.square(left) / (stated + rounding)).mean(axis=0)
     count = fit.independence * float(rows.sum())
@@ -52,6 +54,6 @@ def instrument_factor(fit: Fit) -> float:
     root = np.linalg.inv(np.linalg.cholesky(stated))
     shares, axes = np.linalg.eigh(root @ rounding @ np.swapaxes(root, 1, 2))
     squares = np.square(np.einsum("nji,njk,nk->ni", axes, root, left)).ravel()
-    variances = np.square(_FACTORS)[:, None] + np.maximum(shares, 0.0).ravel()
+    variances = np.square(_Settings.factors)[:, None] + np.maximum(shares, 0.0).ravel()
     likelihood = -0.5 * (np.log(variances) + squares / variances).sum(axis=1)
-    return float(_FACTORS[int(np.argmax(likelihood))])
+    return float(_Settings.factors[int(np.argmax(likelihood))])

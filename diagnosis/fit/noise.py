@@ -12,10 +12,8 @@ from bodyschema.interfaces.records import FloatArray
 
 from .observations import Observations
 
-ROUNDED = 1e-9  # Floor of the residuals, in units of the stated noise: numerical rounding
 
-
-class _Settings:
+class NoiseSettings:
     """Settings of the noise.
 
     Sensitivity: each at 0.3 and 3 times changes figures of seven recordings with hidden errors by 0.2 % at most.
@@ -29,6 +27,7 @@ class _Settings:
     # of six errors that wander were noise.
     most_alike, noise_alike = 0.99, 0.7
     window, burst = 61, 0.45  # a larger share of outliers within a window of so many rows is a change and not outliers
+    rounded = 1e-9  # Floor of the residuals, in units of the stated noise: numerical rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,27 +58,27 @@ class Noise:
         trusted, outlier_density = observations.trusted, observations.outlier_density
         squares = np.einsum("ni,ni->n", residuals, residuals)
         # The median of the sum of three squared standard normal coordinates is 2.366.
-        sigma = float(np.sqrt(max(np.median(squares[trusted]) / 2.366, ROUNDED**2)))
+        sigma = float(np.sqrt(max(np.median(squares[trusted]) / 2.366, NoiseSettings.rounded**2)))
         share = 0.02 if start is None else start.share
         weights, total = np.ones(len(squares)), -np.inf
-        for _ in range(_Settings.rounds):
+        for _ in range(NoiseSettings.rounds):
             inlier = np.log1p(-share) - 1.5 * np.log(2.0 * np.pi * sigma**2) - 0.5 * squares / sigma**2
             outlier = np.log(share) + outlier_density
             both = np.logaddexp(inlier, outlier)
             weights = np.exp(inlier - both)
             off = 1.0 - weights
             bursts = np.zeros(len(off), dtype=np.bool_)
-            if off.sum() > _Settings.burst * _Settings.window:
-                window = np.full(_Settings.window, 1.0 / _Settings.window)
+            if off.sum() > NoiseSettings.burst * NoiseSettings.window:
+                window = np.full(NoiseSettings.window, 1.0 / NoiseSettings.window)
                 near = np.convolve(off, window)[len(window) // 2 :][: len(off)]
-                bursts = near > _Settings.burst
+                bursts = near > NoiseSettings.burst
                 weights[bursts] = 1.0
-            share = float(np.clip(1.0 - weights[trusted].mean(), _Settings.fewest_outliers, 0.5))
+            share = float(np.clip(1.0 - weights[trusted].mean(), NoiseSettings.fewest_outliers, 0.5))
             weights[~trusted] = 0.0
             total = float(np.where(bursts, inlier, both)[trusted].sum())
             counted = max(3.0 * max(float(weights.sum()), 1.0) - spent(sigma), 1.0)
-            before, sigma = sigma, float(np.sqrt(max((weights @ squares) / counted, ROUNDED**2)))
-            if abs(sigma - before) < _Settings.still * sigma:
+            before, sigma = sigma, float(np.sqrt(max((weights @ squares) / counted, NoiseSettings.rounded**2)))
+            if abs(sigma - before) < NoiseSettings.still * sigma:
                 break
         return cls(sigma, share, weights, total)
 
@@ -93,7 +92,7 @@ def correlation(left: FloatArray, begins: NDArray[np.bool_]) -> float:
     follows = ~begins[1:]
     agree = float((left[1:][follows] * left[:-1][follows]).sum())
     squares = float(np.square(left[1:][follows]).sum())
-    rho = float(np.clip(agree / max(squares, 1e-300), 0.0, _Settings.most_alike))
+    rho = float(np.clip(agree / max(squares, 1e-300), 0.0, NoiseSettings.most_alike))
     return rho if rho > 2.0 / np.sqrt(max(3.0 * float(follows.sum()), 1.0)) else 0.0
 
 
@@ -104,4 +103,4 @@ def wanders(rho: float, begins: NDArray[np.bool_]) -> bool:
         rho: their correlation.
         begins: (n,), True in the first row after each break.
     """
-    return rho - 2.0 * np.sqrt((1.0 - rho**2) / max(3.0 * float((~begins[1:]).sum()), 1.0)) > _Settings.noise_alike
+    return rho - 2.0 * np.sqrt((1.0 - rho**2) / max(3.0 * float((~begins[1:]).sum()), 1.0)) > NoiseSettings.noise_alike

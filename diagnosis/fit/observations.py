@@ -15,12 +15,14 @@ from bodyschema.recordings.recording import Recording
 
 IntArray = NDArray[np.intp]
 
-_UNIT_M = 1e-3  # isotropic noise for recordings that state none; its size is estimated in any case [m]
-_OUTLIER_SPREAD = 2.0  # outliers lie within this multiple of the spread of the measured positions
-_SMALLEST_VARIANCE = 1e-4  # floor of a measured variance, as a share of the median one
-_ROWS_A_RUN = 10  # shorter runs are single poses, not paths
-# Closer readings are equal; minimum of distinct gaps to find a step; tolerance around its multiples.
-_SAME_READING, _FEWEST_GAPS, _OFF_A_MULTIPLE = 1e-9, 20, 0.02
+
+class _Settings:
+    unit_m = 1e-3  # isotropic noise for recordings that state none; its size is estimated in any case [m]
+    outlier_spread = 2.0  # outliers lie within this multiple of the spread of the measured positions
+    smallest_variance = 1e-4  # floor of a measured variance, as a share of the median one
+    rows_a_run = 10  # shorter runs are single poses, not paths
+    # Closer readings are equal; minimum of distinct gaps to find a step; tolerance around its multiples.
+    same_reading, fewest_gaps, off_a_multiple = 1e-9, 20, 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +49,7 @@ class Observations:
         elif calibration is not None and calibration.is_stereo:
             stated = _bounded(stereo_covariances(recording.x, calibration))
         else:
-            stated = np.broadcast_to(_UNIT_M**2 * np.eye(3), (len(recording), 3, 3))
+            stated = np.broadcast_to(_Settings.unit_m**2 * np.eye(3), (len(recording), 3, 3))
         motion = Motion.of(recording)
         moved = simulation.run(motion).by_joint * (ticks(recording.q) / np.sqrt(12.0))
         return cls(motion, recording.x, stated, moved @ np.swapaxes(moved, 1, 2))
@@ -111,15 +113,15 @@ class Observations:
         unknown.
         """
         begins = self.motion.begins
-        if self.is_whole or begins.sum() * _ROWS_A_RUN > len(self):
+        if self.is_whole or begins.sum() * _Settings.rows_a_run > len(self):
             begins = np.zeros(len(self), dtype=np.bool_)
         return ~begins if self.doubtful is None else ~(begins | self.doubtful)
 
     @cached_property
     def outlier_density(self) -> FloatArray:
         """Log density (n,) of an outlier, per unit volume of whitened space."""
-        spread = _OUTLIER_SPREAD * np.linalg.norm(self.x - np.median(self.x, axis=0), axis=1).max()
-        volume = 4.0 / 3.0 * np.pi * max(float(spread), _UNIT_M) ** 3
+        spread = _Settings.outlier_spread * np.linalg.norm(self.x - np.median(self.x, axis=0), axis=1).max()
+        volume = 4.0 / 3.0 * np.pi * max(float(spread), _Settings.unit_m) ** 3
         return -np.log(volume) - np.linalg.slogdet(self.whitening)[1]
 
 
@@ -128,11 +130,11 @@ def ticks(q: FloatArray) -> FloatArray:
     steps = np.zeros(q.shape[1])
     for k, column in enumerate(q.T):
         gaps: FloatArray = np.diff(np.unique(column))
-        gaps = gaps[gaps > _SAME_READING]
-        if len(gaps) < _FEWEST_GAPS:
+        gaps = gaps[gaps > _Settings.same_reading]
+        if len(gaps) < _Settings.fewest_gaps:
             continue
         multiples = gaps / gaps.min()
-        if np.abs(multiples - np.round(multiples)).max() < _OFF_A_MULTIPLE:
+        if np.abs(multiples - np.round(multiples)).max() < _Settings.off_a_multiple:
             steps[k] = gaps.min()
     return steps
 
@@ -156,5 +158,5 @@ def stereo_covariances(x: FloatArray, calibration: StereoCalibration) -> FloatAr
 
 def _bounded(covariances: FloatArray) -> FloatArray:
     """Add a floor to each variance, so that no row dominates."""
-    floor = _SMALLEST_VARIANCE * float(np.median(np.trace(covariances, axis1=1, axis2=2))) / 3.0
-    return covariances + (floor if floor > 0.0 else _UNIT_M**2) * np.eye(3)
+    floor = _Settings.smallest_variance * float(np.median(np.trace(covariances, axis1=1, axis2=2))) / 3.0
+    return covariances + (floor if floor > 0.0 else _Settings.unit_m**2) * np.eye(3)

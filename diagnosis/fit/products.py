@@ -16,7 +16,7 @@ from bodyschema.effects import Effect
 from bodyschema.interfaces.records import FloatArray
 
 from .fit import Fit
-from .noise import ROUNDED
+from .noise import NoiseSettings
 
 _ROUNDED_OFF = 1e-9  # relative size below which a direction that all others can change is rounding error
 
@@ -64,7 +64,7 @@ class Products:
             lefts[:, place] -= flat @ (seen - free @ (free.T @ seen))
         # The simulation's own output leaves no residuals except rounding.
         # sum of squared residuals in each place
-        self.squares = np.maximum(np.square(lefts).sum(axis=0), 3.0 * self.rows * ROUNDED**2)
+        self.squares = np.maximum(np.square(lefts).sum(axis=0), 3.0 * self.rows * NoiseSettings.rounded**2)
         # Tested columns are not `unshared`, since their rows are scaled one by one; apply it twice to the rest instead.
         directions, shares = fit.absorbed
         basis = np.concatenate([directions * np.sqrt(shares), fit.unshared(flat)], axis=1)

@@ -11,10 +11,12 @@ from bodyschema.interfaces.records import FloatArray
 
 from .fit import Fit
 
-# Move beyond which the readings' noise does not matter, in multiples of it: a backlash needs only the direction of the
-# move, other effects its size.
-_PLAY_FAR, _FAR = 4.0, 20.0
-_MOST_OF_A_ROW = 1.0  # largest evidence of one row for one memory effect over another [nats]
+
+class _Settings:
+    # Move beyond which the readings' noise does not matter, in multiples of it: a backlash needs only the direction of
+    # the move, other effects its size.
+    play_far, far = 4.0, 20.0
+    most_of_a_row_nats = 1.0  # largest evidence of one row for one memory effect over another [nats]
 
 
 def remembers(effect: Effect) -> bool:
@@ -34,7 +36,7 @@ def instruments(fit: Fit, effect: Effect) -> FloatArray:
     if not remembers(effect):
         return fit.weighted(fit.run.columns(effect)[:, :, effect.amounts])
     motion, joint = fit.observations.motion, fit.simulation.robot.joints.index(str(effect.where))
-    between = _between(fit, motion, joint, _PLAY_FAR if effect.kind.by_direction else _FAR)
+    between = _between(fit, motion, joint, _Settings.play_far if effect.kind.by_direction else _Settings.far)
     columns = np.empty((len(motion), 3, len(effect.amounts)))
     # What the readings alone determine does not change the columns, and takes long.
     simulation = replace(fit.simulation, residual=None)
@@ -58,7 +60,8 @@ def beyond_single_rows(one: Fit, other: Fit) -> float:
 
 def limited_rows(one: Fit, other: Fit) -> FloatArray:
     """Return the log-likelihood of `other` over `one` at each row (n,), with its weight limited [nats]."""
-    return np.clip(other.row_log_likelihoods - one.row_log_likelihoods, -_MOST_OF_A_ROW, _MOST_OF_A_ROW)
+    most = _Settings.most_of_a_row_nats
+    return np.clip(other.row_log_likelihoods - one.row_log_likelihoods, -most, most)
 
 
 def _between(fit: Fit, motion: Motion, joint: int, far: float) -> FloatArray:

@@ -14,11 +14,15 @@ from bodyschema.interfaces.records import FloatArray
 
 from .background import Background
 
-# Columns of unit length with a smaller part beside the others are collinear, for a Cholesky factor [squared length].
-_COLLINEAR = 1e-11
-# A column that keeps a smaller share of its squares beside the others is not identifiable: it is of their rounding.
-TOLD_APART = 1e-7
-_SINGULAR = 1e-12  # relative size below which an eigenvalue of normal equations is rounding
+
+class TangentSettings:
+    # Columns of unit length with a smaller part beside the others are collinear, for a Cholesky factor [squared
+    # length].
+    collinear = 1e-11
+    # A column that keeps a smaller share of its squares beside the others is not identifiable: it is of their rounding.
+    told_apart = 1e-7
+    singular = 1e-12  # relative size below which an eigenvalue of normal equations is rounding
+
 
 dpotrf, dpotrs = get_lapack_funcs(("potrf", "potrs"), dtype=np.float64)
 
@@ -94,10 +98,10 @@ def solved(normal: FloatArray, gradient: FloatArray) -> FloatArray:
     scales = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     scaled, wanted = normal / np.outer(scales, scales), (gradient.T / scales).T
     factor, failed = dpotrf(scaled, lower=True)
-    if not failed and np.square(np.diag(factor)).min(initial=1.0) > _COLLINEAR:
+    if not failed and np.square(np.diag(factor)).min(initial=1.0) > TangentSettings.collinear:
         return (dpotrs(factor, wanted, lower=True)[0].T / scales).T
     # The singular value decomposition of such a matrix need not converge.
     values, vectors = np.linalg.eigh(scaled)
-    there = np.abs(values) > _SINGULAR * np.abs(values).max()
+    there = np.abs(values) > TangentSettings.singular * np.abs(values).max()
     inverse = vectors[:, there] / values[there]
     return ((inverse @ (vectors[:, there].T @ wanted)).T / scales).T

@@ -9,13 +9,15 @@ import numpy as np
 from bodyschema.effects import Effect
 from bodyschema.interfaces.records import FloatArray
 
-# Signals that differ by less than this, twice the log-likelihood that the right one is expected to gain, are one.
-SAME = 6.0
-NAMED = 3.0  # smallest evidence gain of a cause [nats]
-# Cost of each further joint with the same kind of error, which is often set in one session [nats].
-ANOTHER = 2.0
-_CHEAPEST = 1.5  # minimum cost of a parameter [nats]
-_ROUNDS = 30  # fixed-point rounds of `rise_for`
+
+class WorthSettings:
+    # Signals that differ by less than this, twice the log-likelihood that the right one is expected to gain, are one.
+    same = 6.0
+    named_nats = 3.0  # smallest evidence gain of a cause [nats]
+    # Cost of each further joint with the same kind of error, which is often set in one session [nats].
+    another_nats = 2.0
+    cheapest_nats = 1.5  # minimum cost of a parameter [nats]
+    rounds = 30  # fixed-point rounds of `rise_for`
 
 
 def nats(gain: float, dof: int) -> float:
@@ -29,17 +31,17 @@ def cost(gain: float, dof: int) -> float:
     """Return the cost of `dof` parameters that raise twice the log-likelihood by `gain` [nats].
 
     The prior is Gaussian and scaled by empirical Bayes: the size that best explains the gain (George and Foster 2000,
-        equation 5). It is never so narrow that a parameter costs less than `_CHEAPEST`.
+        equation 5). It is never so narrow that a parameter costs less than `WorthSettings.cheapest_nats`.
     """
-    return dof * max(0.5 + 0.5 * math.log(max(gain, 1e-300) / dof), _CHEAPEST) if dof else 0.0
+    return dof * max(0.5 + 0.5 * math.log(max(gain, 1e-300) / dof), WorthSettings.cheapest_nats) if dof else 0.0
 
 
 def rise_for(worth: float, dof: int) -> float:
     """Return the rise of the log-likelihood for which `dof` more parameters are worth `worth` by `nats` [nats]."""
     if dof < 0:
         return -rise_for(-worth, -dof)
-    rise = worth + _CHEAPEST * dof
-    for _ in range(_ROUNDS if dof else 0):
+    rise = worth + WorthSettings.cheapest_nats * dof
+    for _ in range(WorthSettings.rounds if dof else 0):
         rise = worth + cost(2.0 * rise, dof)
     return rise
 

@@ -8,20 +8,20 @@ from itertools import combinations
 import msgspec
 import numpy as np
 
-from bodyschema.diagnosis.assess.rivals import PROBABLE, Rival, Standing, resembles_sag
-from bodyschema.diagnosis.diagnosis import MOST_DOUBTFUL, Diagnosis
-from bodyschema.diagnosis.fit.background import ANGLE_RAD, DRIVE_RAD, LENGTH_M
+from bodyschema.diagnosis.assess.rivals import Rival, RivalSettings, Standing, resembles_sag
+from bodyschema.diagnosis.diagnosis import Diagnosis, DiagnosisSettings
+from bodyschema.diagnosis.fit.background import BackgroundSettings
 from bodyschema.diagnosis.fit.fit import Fit
-from bodyschema.diagnosis.fit.worth import NAMED, nats
+from bodyschema.diagnosis.fit.worth import WorthSettings, nats
 from bodyschema.diagnosis.search.drives import alias_sentences
 from bodyschema.diagnosis.search.scan import Candidate
 from bodyschema.diagnosis.search.together import is_at_limit
 from bodyschema.effects import Effect, Identity
 from bodyschema.interfaces.records import FloatArray
+from kbmaps.robust import HALF_WIDTH_95
 
-from .residuals import SIGNIFICANT
+from .residuals import ResidualSettings
 from .result import (
-    EVEN,
     OUTLIERS,
     Cause,
     DiagnosisFile,
@@ -31,13 +31,13 @@ from .result import (
     Interval,
     Pairs,
     Rejected,
+    ResultSettings,
     Tolerances,
     Unexplained,
     Verdict,
 )
 from .text import advice, evidence, sentence
 
-_HALF_WIDTH_95 = 1.959964
 # Cycles over a joint's range by which two of its ripples have to differ. The waves that were found along five curves
 # differed by 1.0 to 1.4.
 _OF_A_CURVE = 2.0
@@ -88,9 +88,10 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
 def _tolerances(diagnosis: Diagnosis) -> Tolerances:
     found = diagnosis.tolerated
     # A drive errs once and twice per turn, each with a sine and a cosine, of which half the square is the mean.
-    units = np.array([1e3 * LENGTH_M, np.degrees(ANGLE_RAD), np.degrees(math.sqrt(4 / 2) * DRIVE_RAD)])
+    angle_rad, drive_rad = BackgroundSettings.angle_rad, math.sqrt(4 / 2) * BackgroundSettings.drive_rad
+    units = np.array([1e3 * BackgroundSettings.length_m, np.degrees(angle_rad), np.degrees(drive_rad)])
     sizes, seen = units * np.asarray(found.scales)[:3], found.seen[:3]
-    wide = np.exp(_HALF_WIDTH_95 * found.unsure[:3])
+    wide = np.exp(HALF_WIDTH_95 * found.unsure[:3])
     lowest = np.where(seen, sizes / wide, 0.0)
     highest = np.where(seen, sizes * wide, units * found.most[:3])
     ends = zip(sizes.tolist(), lowest.tolist(), highest.tolist(), strict=True)
@@ -98,7 +99,8 @@ def _tolerances(diagnosis: Diagnosis) -> Tolerances:
     shares = diagnosis.shares
     in_extended = diagnosis.stored is diagnosis.extended or diagnosis.stored.background.scales is not None
     links, drives = 100.0 * shares.links, 100.0 * shares.drives
-    probable = [(effect, share) for effect, share in diagnosis.in_place_of_tolerances if share >= PROBABLE]
+    in_place = diagnosis.in_place_of_tolerances
+    probable = [(effect, share) for effect, share in in_place if share >= RivalSettings.probable]
     rivals = tuple(Indistinguishable(*effect.key, "this_motion", share) for effect, share in probable)
     return Tolerances(
         *intervals, links_share_percent=links, drives_share_percent=drives, in_extended=in_extended, rivals=rivals
@@ -129,7 +131,7 @@ def _mean_mm(diagnosis: Diagnosis) -> Errors:
 def _causes(diagnosis: Diagnosis, seen_by: str) -> tuple[Cause, ...]:
     fit, worse = diagnosis.extended, [max(diagnosis.worse_without[c.identity], 1.0) for c in diagnosis.causes]
     # Causes that describe the error, and do not explain it, may not be there at all.
-    sure, causes = EVEN if diagnosis.ended_early else 1.0, []
+    sure, causes = ResultSettings.even if diagnosis.ended_early else 1.0, []
     parts = zip(fit.causes, diagnosis.standings, diagnosis.shares.causes, worse, strict=True)
     for cause, standing, share, squares in parts:
         causes.append(
@@ -176,8 +178,9 @@ def merged_ripples(fit: Fit) -> set[Identity]:
 
 def _or_unnamed(cause: Cause, what: str) -> Cause:
     """Return a cause that may be something without a name, or a part of it."""
-    rival = Indistinguishable("unexplained", None, None, "this_motion", EVEN, what)
-    return msgspec.structs.replace(cause, probability=min(cause.probability, EVEN), rivals=(rival, *cause.rivals))
+    rival = Indistinguishable("unexplained", None, None, "this_motion", ResultSettings.even, what)
+    probability = min(cause.probability, ResultSettings.even)
+    return msgspec.structs.replace(cause, probability=probability, rivals=(rival, *cause.rivals))
 
 
 def _named(rival: Rival) -> Indistinguishable:
@@ -190,7 +193,7 @@ def _named(rival: Rival) -> Indistinguishable:
 def _outliers(diagnosis: Diagnosis) -> Cause:
     n, found = len(diagnosis.markers), diagnosis.outliers
     share = found / n
-    half = _HALF_WIDTH_95 * float(np.sqrt(share * (1.0 - share) / n))
+    half = HALF_WIDTH_95 * float(np.sqrt(share * (1.0 - share) / n))
     return Cause(
         effect=OUTLIERS,
         where=None,
@@ -209,7 +212,7 @@ def _parameters(diagnosis: Diagnosis, cause: Effect, standing: Standing) -> dict
     fit = diagnosis.extended
     places = fit.places(cause)
     covariance = fit.covariance[np.ix_(places, places)]
-    halves = _HALF_WIDTH_95 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    halves = HALF_WIDTH_95 * np.sqrt(np.maximum(np.diag(covariance), 0.0))
     fitted = [*cause.amounts, *cause.shapes]
     numbers = {}
     for k in cause.told:
@@ -240,9 +243,9 @@ def _derived(cause: Effect, covariance: FloatArray) -> dict[str, Interval]:
     sine, cosine = cause.values[:2]
     amplitude = float(np.hypot(sine, cosine))
     radial = np.array([sine, cosine]) / max(amplitude, 1e-300)
-    half = _HALF_WIDTH_95 * float(np.sqrt(max(radial @ covariance[:2, :2] @ radial, 0.0)))
+    half = HALF_WIDTH_95 * float(np.sqrt(max(radial @ covariance[:2, :2] @ radial, 0.0)))
     across = np.array([-cosine, sine]) / max(amplitude, 1e-300)
-    turn = _HALF_WIDTH_95 * float(np.sqrt(max(across @ covariance[:2, :2] @ across, 0.0))) / max(amplitude, 1e-300)
+    turn = HALF_WIDTH_95 * float(np.sqrt(max(across @ covariance[:2, :2] @ across, 0.0))) / max(amplitude, 1e-300)
     phase = float(np.arctan2(cosine, sine))
     return {
         f"amplitude_{unit}": Interval(amplitude, (max(amplitude - half, 0.0), amplitude + half)),
@@ -255,7 +258,7 @@ def _rejected(diagnosis: Diagnosis) -> tuple[Rejected, ...]:
     rows = []
     for candidate, more in diagnosis.rejected:
         chance = min(1.0, more.p_value * tried)
-        why = _why_not(diagnosis, candidate, tried) if chance < SIGNIFICANT else ""
+        why = _why_not(diagnosis, candidate, tried) if chance < ResidualSettings.significant else ""
         rows.append(Rejected(*candidate.effect.key, more.held_out_gain_percent, chance, why))
     return tuple(sorted(rows, key=lambda row: row.held_out_gain_percent, reverse=True))
 
@@ -266,7 +269,7 @@ def _why_not(diagnosis: Diagnosis, candidate: Candidate, tried: int) -> str:
         return "what has no name shows in it"
     if not candidate.effect.is_possible:
         return "it would be negative"
-    if nats(candidate.gain, candidate.dof) - float(np.log(tried * candidate.trials)) < NAMED:
+    if nats(candidate.gain, candidate.dof) - float(np.log(tried * candidate.trials)) < WorthSettings.named_nats:
         return "too little for its numbers"
     if diagnosis.ended_early:
         return "not reached"
@@ -277,7 +280,7 @@ def _limitations(diagnosis: Diagnosis) -> tuple[str, ...]:
     told = list(diagnosis.hypotheses.limitations)
     sided = [cause for cause in diagnosis.causes if cause.kind.by_direction]
     unknown_side = diagnosis.extended.doubtful(sided).mean()
-    if unknown_side > MOST_DOUBTFUL:
+    if unknown_side > DiagnosisSettings.most_doubtful:
         joints = ", ".join(str(cause.where) for cause in sided)
         told.append(
             f"At {100.0 * unknown_side:.0f} % of the pairs it is unknown on which side of its backlash {joints} rests: "

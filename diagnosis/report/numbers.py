@@ -49,12 +49,17 @@ _LABELS = {
 }
 # Parameters already given as amplitude and phase.
 _SAID_AGAIN = ("sine_rad", "cosine_rad", "sine_m", "cosine_m")
-_LEAST_DIGITS, _MOST_DIGITS = 0, 6
-# Half widths of an interval above which a length [m] or an angle [rad] is not identifiable.
-_UNTOLD = (("_rad", 0.5), ("_m", 0.1))
+
+
+class _Settings:
+    least_digits, most_digits = 0, 6
+    # Half widths of an interval above which a length [m] or an angle [rad] is not identifiable.
+    untold = (("_rad", 0.5), ("_m", 0.1))
+    lopsided = 0.3  # an interval whose halves differ by more than this share is written with both its ends
+
+
 # Parameters of time and shape rather than size.
 _SAYS_HOW = ("t0", "cycles", "phase", "time_constant", "length", "hold")
-_LOPSIDED = 0.3  # an interval whose halves differ by more than this share is written with both its ends
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +111,7 @@ def number(name: str, interval: Interval, *, timed: bool = True) -> Number:
         value=f"{row}{_fixed(value, digits, '+' if name.endswith(_SIGNED) else '')}{unit}",
         interval=_range(value, low, high, digits),
         may_be_none=low <= 0.0 <= high and not name.startswith(_SAYS_HOW),
-        is_told=not any(name.endswith(end) and half > factor * limit for end, limit in _UNTOLD),
+        is_told=not any(name.endswith(end) and half > factor * limit for end, limit in _Settings.untold),
     )
 
 
@@ -167,7 +172,7 @@ def _digits(half: float) -> int:
     """Return the digits that give the half width two significant figures."""
     if half <= 0.0 or not math.isfinite(half):
         return 3
-    return min(max(1 - math.floor(math.log10(half)), _LEAST_DIGITS), _MOST_DIGITS)
+    return min(max(1 - math.floor(math.log10(half)), _Settings.least_digits), _Settings.most_digits)
 
 
 def _fixed(value: float, digits: int, sign: str) -> str:
@@ -178,6 +183,6 @@ def _range(value: float, low: float, high: float, digits: int) -> str:
     half = 0.5 * (high - low)
     if not half > 0.0:
         return ""
-    if abs(0.5 * (low + high) - value) > _LOPSIDED * half:
+    if abs(0.5 * (low + high) - value) > _Settings.lopsided * half:
         return f"({_fixed(low, digits, '')} … {_fixed(high, digits, '')})"
     return f"± {half:.{digits}f}"

@@ -37,8 +37,11 @@ _VERDICTS: dict[Verdict, tuple[str, str]] = {
         "nothing on the robot because of them alone.",
     ),
 }
-_NAMED_ROWS = 40  # maximum of outlier rows listed by number
-_OPEN = 4  # number of causes shown with their plots; further and small ones are collapsed
+
+
+class _Settings:
+    named_rows = 40  # maximum of outlier rows listed by number
+    open_causes = 4  # number of causes shown with their plots; further and small ones are collapsed
 
 
 @dataclass(frozen=True)
@@ -136,7 +139,9 @@ def _causes(residuals: Residuals, file: DiagnosisFile, remedies: Sequence[str]) 
     effects = {id(cause): effect for cause, effect in zip_longest(file.causes, residuals.diagnosis.causes)}
     ordered = in_order(file.causes)
     articles = [
-        _cause(residuals, cause, effects[id(cause)], remedy, file, opened=k < _OPEN and not cause.is_small)
+        _cause(
+            residuals, cause, effects[id(cause)], remedy, file, opened=k < _Settings.open_causes and not cause.is_small
+        )
         for k, (cause, remedy) in enumerate(zip(ordered, remedies, strict=True))
     ]
     if more := sum(cause.is_correction for cause in ordered):
@@ -225,7 +230,7 @@ def _limits(file: DiagnosisFile) -> str:
 
 def _done(diagnosis: Diagnosis, file: DiagnosisFile, about: About) -> str:
     away = np.flatnonzero(~diagnosis.markers) + 1
-    rows = ", ".join(str(k) for k in away[:_NAMED_ROWS]) + (" …" if len(away) > _NAMED_ROWS else "")
+    rows = ", ".join(str(k) for k in away[: _Settings.named_rows]) + (" …" if len(away) > _Settings.named_rows else "")
     left_out = f"<p>Rows left out: {rows}.</p>" if len(away) else ""
     return (
         '<section id="method"><h2>What was done</h2>'

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from bodyschema.interfaces.records import FloatArray
 
-from .residuals import ARROWS, POINTS, Residuals, binned, structure
+from .residuals import Residuals, ResidualSettings, binned, structure
 from .svg_plot import ASPECT, Layout, Plot, round_up, span
 
 
@@ -44,7 +44,7 @@ def _compared(
 ) -> Panel:
     """Plot single errors, pale, with their means and 95 % intervals, before and after."""
     rows = residuals.rows
-    some = residuals.some(POINTS)
+    some = residuals.some(ResidualSettings.points)
     means = [(binned(x[rows], y[rows]), look) for y, look in ((before, "before"), (after, "after"))]
     plot = Plot(*axes, span(x[rows]), span(before[rows], after[rows], cut=Layout.cut, around_zero=True))
     marks = [plot.dots(x[some], before[some], "pale before"), plot.dots(x[some], after[some], "pale after")]
@@ -203,7 +203,7 @@ def _noise(residuals: Residuals) -> FloatArray:
 
 def arrows(residuals: Residuals) -> tuple[list[Panel], float]:
     """Return three projections before and three after at the same scale, and the stretch of the arrows."""
-    rows = residuals.some(ARROWS)
+    rows = residuals.some(ResidualSettings.arrows)
     at = residuals.diagnosis.extended.observations.x[rows]
     extent = float(np.ptp(at, axis=0).max()) or 1.0
     usual = float(np.quantile(np.linalg.norm(residuals.before[rows], axis=1), Layout.shorter)) or 1e-6

@@ -14,11 +14,13 @@ from bodyschema.effects import Effect, Simulation
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
 
-POINTS, ARROWS = 450, 220  # maximum of points in a plot, and of arrows in a projection
-# A joint's rows count if it moves the marker by this share of its median effect.
-_TELLS = 0.5
-_BINS, _FEWEST_IN_A_BIN = 16, 8
-SIGNIFICANT = 1e-3  # a larger p-value counts as chance
+
+class ResidualSettings:
+    points, arrows = 450, 220  # maximum of points in a plot, and of arrows in a projection
+    # A joint's rows count if it moves the marker by this share of its median effect.
+    tells = 0.5
+    bins, fewest_in_a_bin = 16, 8
+    significant = 1e-3  # a larger p-value counts as chance
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,7 @@ class Residuals:
         """Return the rows in which a joint moves the marker well."""
         way = np.einsum("nij,nj->ni", self.whitening, self.run.by_joint[:, :, joint])
         arm = np.linalg.norm(way, axis=1)[self.rows]
-        return self.rows[arm >= _TELLS * np.median(arm)]
+        return self.rows[arm >= ResidualSettings.tells * np.median(arm)]
 
     @cached_property
     def direction(self) -> NDArray[np.intp]:
@@ -156,7 +158,7 @@ def structure(x: FloatArray, y: FloatArray) -> float:
     inside = float(np.square(y - means[member]).sum())
     between = float(np.square(means[member] - y.mean()).sum())
     ratio = (between / (groups - 1)) / max(inside / (n - groups), 1e-300)
-    if fdtrc(groups - 1, n - groups, ratio) > SIGNIFICANT:
+    if fdtrc(groups - 1, n - groups, ratio) > ResidualSettings.significant:
         return 0.0
     share = between / max(between + inside, 1e-300)
     return max(share - (groups - 1) / (n - 1), 0.0)
@@ -165,9 +167,9 @@ def structure(x: FloatArray, y: FloatArray) -> float:
 def _members(x: FloatArray) -> NDArray[np.intp]:
     """Return the bin of each row (n,): equal numbers of rows per bin, or one bin per value where x has few."""
     values, member = np.unique(np.round(x, 9), return_inverse=True)
-    if len(values) <= _BINS:
+    if len(values) <= ResidualSettings.bins:
         return member
-    bins = min(_BINS, max(len(x) // _FEWEST_IN_A_BIN, 1))
+    bins = min(ResidualSettings.bins, max(len(x) // ResidualSettings.fewest_in_a_bin, 1))
     of_row = np.empty(len(x), dtype=np.intp)
     of_row[np.argsort(x, kind="stable")] = np.arange(len(x)) * bins // len(x)
     return of_row

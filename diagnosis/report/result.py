@@ -6,11 +6,15 @@ from typing import Literal
 
 import msgspec
 
-SMALL = 5.0  # a cause with less weight [%] is told last and leaves the verdict as it is
-SURE = 0.9  # a less probable cause leaves the verdict open, and is to be confirmed first
+
+class ResultSettings:
+    small_percent = 5.0  # a cause with less weight [%] is told last and leaves the verdict as it is
+    sure = 0.9  # a less probable cause leaves the verdict open, and is to be confirmed first
+    # Probability of what is no more probable than not.
+    even = 0.5
+
+
 OUTLIERS = "outliers"  # fixes that are not the marker, as a cause
-# Probability of what is no more probable than not.
-EVEN = 0.5
 Verdict = Literal["explained", "nothing_found", "undecided", "unexplained"]
 
 
@@ -67,12 +71,12 @@ class Cause(msgspec.Struct, frozen=True):
     @property
     def is_small(self) -> bool:
         """True for an effect of little weight; fixes that are not the marker have none."""
-        return self.effect != OUTLIERS and self.weight_percent < SMALL
+        return self.effect != OUTLIERS and self.weight_percent < ResultSettings.small_percent
 
     @property
     def leaves_open(self) -> bool:
         """True where a rival is not much less probable, and the cause is not small."""
-        return self.probability < SURE and bool(self.rivals) and not self.is_small
+        return self.probability < ResultSettings.sure and bool(self.rivals) and not self.is_small
 
     @property
     def is_outvoted(self) -> bool:
@@ -82,7 +86,7 @@ class Cause(msgspec.Struct, frozen=True):
     @property
     def is_correction(self) -> bool:
         """True for one that makes a small difference, and is no more probable than not: its cause is not known."""
-        return self.is_small and self.probability <= EVEN
+        return self.is_small and self.probability <= ResultSettings.even
 
 
 class Rejected(msgspec.Struct, frozen=True):
@@ -131,7 +135,8 @@ class Tolerances(msgspec.Struct, frozen=True):
     @property
     def leaves_open(self) -> bool:
         """True where a cause may be there in their place, and they are not small."""
-        return self.links_share_percent >= SMALL and any(rival.probability > 1.0 - SURE for rival in self.rivals)
+        probable = any(rival.probability > 1.0 - ResultSettings.sure for rival in self.rivals)
+        return self.links_share_percent >= ResultSettings.small_percent and probable
 
 
 class Pairs(msgspec.Struct, frozen=True):

@@ -20,13 +20,12 @@ from bodyschema.robot.description import RobotDescription
 from .numbers import told_values
 from .result import (
     OUTLIERS,
-    SMALL,
-    SURE,
     Cause,
     DiagnosisFile,
     Errors,
     Gain,
     Interval,
+    ResultSettings,
     Tolerances,
     Unexplained,
     Verdict,
@@ -108,7 +107,8 @@ def remedies(diagnosis: DiagnosisFile, robot: RobotDescription, steps: FloatArra
 
 def _if_sure(cause: Cause, remedy: str, diagnosis: DiagnosisFile) -> str:
     """Return the remedy, preceded by what to confirm before any change."""
-    open_ones = [rival for rival in cause.rivals if rival.by == "this_motion" and cause.probability < SURE]
+    is_open = cause.probability < ResultSettings.sure
+    open_ones = [rival for rival in cause.rivals if rival.by == "this_motion" and is_open]
     rivals = [rival_named(rival, diagnosis.seen_by) for rival in open_ones[:2]]
     if diagnosis.verdict == "unexplained" and cause.effect != OUTLIERS:
         rivals.append("a part of what remains unexplained")
@@ -191,7 +191,7 @@ def _head(causes: Sequence[Cause], tolerances: Tolerances | None, seen_by: str, 
 
 def _shows(tolerances: Tolerances | None) -> bool:
     """Return True if small errors everywhere have more than a small share of the gain."""
-    return tolerances is not None and tolerances.share_percent >= SMALL
+    return tolerances is not None and tolerances.share_percent >= ResultSettings.small_percent
 
 
 def _or(cause: Cause, seen_by: str) -> str:
@@ -259,7 +259,7 @@ def to_do(diagnosis: DiagnosisFile, remedies: Sequence[str]) -> tuple[list[str],
     if more := sum(cause.is_correction for cause, _ in ordered):
         small.append(f"Change nothing because of {corrections(more)}: extended.toml has what is sure of them.")
     of = diagnosis.tolerances
-    if of is not None and of.in_extended and of.share_percent >= SMALL:
+    if of is not None and of.in_extended and of.share_percent >= ResultSettings.small_percent:
         told.append(
             f"Use extended.toml: small errors of links and drives have a share of {of.share_percent:.0f} % of the gain,"
             " and no single one is worth fixing."

@@ -5,14 +5,19 @@ from __future__ import annotations
 import numpy as np
 
 from bodyschema.diagnosis.fit.fit import Fit
-from bodyschema.diagnosis.fit.worth import NAMED, nats, rise_for
+from bodyschema.diagnosis.fit.worth import WorthSettings, nats, rise_for
 from bodyschema.effects import Effect
 from bodyschema.interfaces.records import FloatArray
 
-from .scan import FINEST, Scan
+from .scan import Scan, ScanSettings
 
-_ROUNDS = 8  # maximum of rounds; each may add one ripple per joint
-_APART = 0.75  # ripples whose phases differ by less over a joint's range are the same [turns]
+
+class _Settings:
+    rounds = 8  # maximum of rounds; each may add one ripple per joint
+    apart_turns = 0.75  # ripples whose phases differ by less over a joint's range are the same [turns]
+    # Waves whose phases agree this well over all readings are the same wave.
+    same_phase = 0.97
+    fewest_cycles = 2
 
 
 def with_small_ripples(fit: Fit) -> Fit:
@@ -20,16 +25,16 @@ def with_small_ripples(fit: Fit) -> Fit:
     scales = fit.background.scales
     if scales is None:
         return fit
-    for _ in range(_ROUNDS):
+    for _ in range(_Settings.rounds):
         robot, scan = fit.simulation.robot, Scan(fit)
         moving = np.flatnonzero(np.ptp(fit.observations.motion.q, axis=0) > 0.0)
         found: list[Effect] = []
-        least = 2.0 * rise_for(NAMED + np.log(len(moving)), 2)
+        least = 2.0 * rise_for(WorthSettings.named_nats + np.log(len(moving)), 2)
         for k in moving:
             candidate = scan.candidate(Effect.at(robot, "joint_ripple", robot.joints[k]), least)
             if candidate is None or not fit.background.tolerates(candidate.effect) or _is_there(fit, candidate.effect):
                 continue
-            if nats(candidate.gain, candidate.dof) - np.log(len(moving) * candidate.trials) > NAMED:
+            if nats(candidate.gain, candidate.dof) - np.log(len(moving) * candidate.trials) > WorthSettings.named_nats:
                 found.append(candidate.effect)
         if not found:
             break
@@ -43,14 +48,10 @@ def _is_there(fit: Fit, ripple: Effect) -> bool:
     span = float(np.ptp(fit.observations.motion.q[:, joint])) / (1.0 if ripple.prismatic else 2.0 * np.pi)
     others = [effect for effect in (*fit.causes, *fit.background.effects) if effect.kind is ripple.kind]
     return any(
-        effect.where == ripple.where and abs(float(effect.values[-1] - ripple.values[-1])) * span < _APART
+        effect.where == ripple.where
+        and abs(float(effect.values[-1] - ripple.values[-1])) * span < _Settings.apart_turns
         for effect in others
     )
-
-
-# Waves whose phases agree this well over all readings are the same wave.
-_SAME = 0.97
-_FEWEST_CYCLES = 2
 
 
 def alias_sentences(fit: Fit) -> list[str]:
@@ -71,9 +72,9 @@ def aliases(fit: Fit, ripple: Effect) -> list[float]:
     """Return the other numbers of cycles per turn that look the same as a ripple's own at all readings."""
     q = fit.observations.motion.q[:, fit.simulation.place(ripple).joint]
     own = float(ripple.values[-1])
-    cycles = np.arange(_FEWEST_CYCLES, FINEST + 1.0)
+    cycles = np.arange(_Settings.fewest_cycles, ScanSettings.finest_cycles + 1.0)
     # Compare waves of the same and of opposite phase; close neighbours of a ripple are not aliases.
-    same = np.maximum(_agreement(cycles - own, q), _agreement(cycles + own, q)) > _SAME
+    same = np.maximum(_agreement(cycles - own, q), _agreement(cycles + own, q)) > _Settings.same_phase
     apart = np.abs(cycles - own) > 2.0 * np.pi / max(float(np.ptp(q)), 1e-6)
     return [float(one) for one in cycles[same & apart]]
 

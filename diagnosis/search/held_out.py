@@ -13,16 +13,16 @@ from itertools import pairwise
 import numpy as np
 from scipy.special import fdtrc
 
-from bodyschema.diagnosis.fit.fit import LARGEST, Fit, solved
+from bodyschema.diagnosis.fit.fit import Fit, FitSettings, solved
 from bodyschema.diagnosis.fit.observations import IntArray
 from bodyschema.diagnosis.fit.scatter import instruments
-from bodyschema.diagnosis.fit.tangent import TOLD_APART
+from bodyschema.diagnosis.fit.tangent import TangentSettings
 from bodyschema.interfaces.records import FloatArray
 
 from .scan import Candidate
 
 
-class _Settings:
+class HeldOutSettings:
     """Settings of held-out prediction.
 
     Sensitivity, each at 0.3 and 3 times over three recordings: `folds` and the rows of a block change probabilities by
@@ -34,9 +34,7 @@ class _Settings:
     # Neighbours in time are alike for long, so a gain's interval rests on this many long parts of a recording.
     bootstraps, long_blocks = 2000, 10
     marker = 0.5  # a fix that is less probably the marker is left out of all figures
-
-
-FEWEST_ROWS_A_BLOCK = 5
+    fewest_rows_a_block = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,15 +45,15 @@ class Blocks:
     count: int  # number of blocks
 
     @classmethod
-    def cut(cls, rows: int, most: int = _Settings.most_blocks) -> Blocks:
+    def cut(cls, rows: int, most: int = HeldOutSettings.most_blocks) -> Blocks:
         """Cut rows into blocks of equal length, as many as make sense."""
-        count = int(np.clip(rows // FEWEST_ROWS_A_BLOCK, _Settings.folds, most))
+        count = int(np.clip(rows // HeldOutSettings.fewest_rows_a_block, HeldOutSettings.folds, most))
         return cls(np.arange(rows) * count // max(rows, 1), count)
 
     @property
     def fold(self) -> IntArray:
         """Fold of each row (n,)."""
-        return self.of_row % _Settings.folds
+        return self.of_row % HeldOutSettings.folds
 
     def merged(self, most: int) -> Blocks:
         """Return at most `most` longer blocks of neighbouring blocks."""
@@ -89,15 +87,15 @@ def gain_percent(before: FloatArray, after: FloatArray, blocks: Blocks, seed: in
     The interval is for another recording of the same kind, half as long: long blocks are resampled, since this
     recording is a sample, and as many as the other one has are drawn from them.
     """
-    blocks = blocks.merged(_Settings.long_blocks)
+    blocks = blocks.merged(HeldOutSettings.long_blocks)
     rows = blocks.sums(np.stack([np.square(before), np.square(after)], axis=1))
     rows = rows[rows[:, 0] > 0.0]  # the others have no fix that counts
     if not len(rows):
         return 0.0, (0.0, 0.0)
     count, total = len(rows), rows.sum(axis=0)
     rng = np.random.default_rng(seed)
-    again = rng.integers(count, size=(_Settings.bootstraps, count))
-    other = rng.integers(count, size=(_Settings.bootstraps, max(count // 2, 1)))
+    again = rng.integers(count, size=(HeldOutSettings.bootstraps, count))
+    other = rng.integers(count, size=(HeldOutSettings.bootstraps, max(count // 2, 1)))
     sums = rows[np.take_along_axis(again, other, axis=1)].sum(axis=1)
 
     def percent(before_after: FloatArray) -> FloatArray:
@@ -121,7 +119,7 @@ def added(fit: Fit, candidates: Sequence[Candidate], blocks: Blocks) -> list[Add
     fresh = np.concatenate([np.empty((*fit.left.shape, 0)), *(instruments(fit, one) for one in effects)], axis=2)
     ends = np.cumsum([0, *(len(one.amounts) for one in effects)])
     groups = [np.arange(first, end) for first, end in pairwise(ends)]
-    usual = [LARGEST * one.parameters[j].usual for one in effects for j in one.amounts]
+    usual = [FitSettings.largest * one.parameters[j].usual for one in effects for j in one.amounts]
     products = _Products.of(fit, np.concatenate([fit.columns, fresh], axis=2), blocks)
     precision = np.append(fit.precision, 1.0 / np.square(np.array(usual)))
     before, *after = products.missed(precision, len(fit.precision), [np.arange(0), *groups]).tolist()
@@ -151,7 +149,7 @@ class _Products:
     def of(cls, fit: Fit, columns: FloatArray, blocks: Blocks) -> _Products:
         """Form the products of columns (n, 3, p)."""
         rows = []
-        for fold in range(_Settings.folds):
+        for fold in range(HeldOutSettings.folds):
             own = np.flatnonzero(blocks.fold == fold)
             rows.append((columns[own].reshape(3 * len(own), columns.shape[2]), fit.left[own].ravel()))
         inner, toward = np.array([c.T @ c for c, _ in rows]), np.array([c.T @ left for c, left in rows])
@@ -204,7 +202,7 @@ def _p_value(fit: Fit, beside: FloatArray, blocks: Blocks) -> float:
     inner = flat.T @ flat
     scales = np.sqrt(np.maximum(np.diag(inner), 1e-300))
     values, vectors = np.linalg.eigh(inner / np.outer(scales, scales))
-    told = values > TOLD_APART
+    told = values > TangentSettings.told_apart
     k = int(told.sum())
     if not 0 < k < blocks.count:
         return 1.0
@@ -227,4 +225,4 @@ def scores_p_value(columns: FloatArray, left: FloatArray, blocks: Blocks) -> flo
 
 def is_marker(fit: Fit) -> np.ndarray:
     """Return True for trusted fixes (n,) that are probably the marker."""
-    return fit.noise.weights >= _Settings.marker
+    return fit.noise.weights >= HeldOutSettings.marker

@@ -10,9 +10,11 @@ import numpy as np
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.effects import EFFECT_TYPES, Effect, EffectType, Simulation
 
-# A joint that moves less than this cannot be tested [rad, m].
-STILL = 1e-4
-_FEWEST_ROWS = 20
+
+class HypothesisSettings:
+    # A joint that moves less than this cannot be tested [rad, m].
+    still = 1e-4
+    fewest_rows = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +68,7 @@ class _Limits:
     def __init__(self, simulation: Simulation, observations: Observations) -> None:
         self._simulation, self._motion = simulation, observations.motion
         robot = simulation.robot
-        self.still = np.ptp(observations.motion.q, axis=0) < STILL
+        self.still = np.ptp(observations.motion.q, axis=0) < HypothesisSettings.still
         self.sentences: list[str] = []
         standing = [joint for joint, still in zip(robot.joints, self.still, strict=True) if still]
         if standing:
@@ -102,4 +104,4 @@ class _Limits:
             return True
         if kind.needs_stereo and robot.calibration is None:
             return True
-        return len(self._motion) < _FEWEST_ROWS
+        return len(self._motion) < HypothesisSettings.fewest_rows

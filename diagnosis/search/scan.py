@@ -14,21 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri
 
-from bodyschema.diagnosis.fit.fit import LARGEST, Fit
+from bodyschema.diagnosis.fit.fit import Fit, FitSettings
 from bodyschema.diagnosis.fit.products import Products, System
-from bodyschema.diagnosis.fit.tangent import TOLD_APART
+from bodyschema.diagnosis.fit.tangent import TangentSettings
 from bodyschema.diagnosis.fit.worth import choices, nats, ways_to_choose
 from bodyschema.effects import Effect, Identity
 from bodyschema.effects.encoder import EncoderEffect
 from bodyschema.effects.motion import flanks
 from bodyschema.interfaces.records import FloatArray
 
-# Ripples are searched at every whole number of cycles per turn up to the first limit. Finer ones, up to twice per turn
-# of a strain wave gear of 120, are searched as coarsely as they can be resolved.
-_MOST_CYCLES, FINEST = 100, 240
 
-
-class _Settings:
+class ScanSettings:
     """Settings of the scan.
 
     Sensitivity, each at 0.3 and 3 times over three recordings with hidden errors: `most_moments` and `beside` change
@@ -40,6 +36,9 @@ class _Settings:
     most_moments = 1000  # number of moments tried first, before all those next to the best
     beside = 8  # minimum of rows on either side of a moment
     bent = 0.1  # share of the noise by which an effect has to differ from its first order to be evaluated beyond it
+    # Ripples are searched at every whole number of cycles per turn up to the first limit. Finer ones, up to twice per
+    # turn of a strain wave gear of 120, are searched as coarsely as they can be resolved.
+    most_cycles, finest_cycles = 100, 240
 
 
 # Index of the best choice, gains (m,), its amounts (k,) and degrees of freedom.
@@ -169,7 +168,7 @@ class Scan:
         off = np.square(moved).sum(axis=1, keepdims=True) / (2.0 * max(radius, 1e-6))
         # In all directions alike, since it is not known in which.
         white = observations.whitened(np.broadcast_to(off[:, :, None] * np.eye(3), (len(off), 3, 3)))
-        return bool(np.square(white).sum(axis=(1, 2)).mean() > 3.0 * (_Settings.bent * self._fit.noise.sigma) ** 2)
+        return bool(np.square(white).sum(axis=(1, 2)).mean() > 3.0 * (ScanSettings.bent * self._fit.noise.sigma) ** 2)
 
     @property
     def _left_out(self) -> Identity | None:
@@ -182,13 +181,13 @@ class Scan:
         if not dofs.any():
             return None
         told, best = shapes[dofs > 0], int(np.argmax(np.where(dofs > 0, gains, -np.inf)))
-        if self._times(float(gains[best]), _Settings.between) >= least:
+        if self._times(float(gains[best]), ScanSettings.between) >= least:
             place = int(np.searchsorted(told, shapes[best]))
             shapes = np.linspace(told[max(place - 1, 0)], told[min(place + 1, len(told) - 1)], 13)
             gains, amounts, dofs = self._solved(self._each(effect, shapes), effect)
             best = int(np.argmax(gains))
         values = np.append(amounts[best], shapes[best])
-        trials = _Settings.coarse * effect.kind.further_trials
+        trials = ScanSettings.coarse * effect.kind.further_trials
         return Candidate(effect.with_values(values), float(gains[best]), int(dofs[best]), trials)
 
     def _each(self, effect: Effect, shapes: FloatArray) -> System:
@@ -246,15 +245,15 @@ class Scan:
         place = self._fit.simulation.place(effect)
         span = max(float(np.ptp(self._fit.run.readings.q[:, place.joint])), 1e-6)
         first, step = (2.0, 1.0) if not place.prismatic else (1.0 / span, 1.0 / span)
-        coarse: FloatArray = np.asarray(first + step * np.arange(_MOST_CYCLES - 1), dtype=np.float64)
+        coarse: FloatArray = np.asarray(first + step * np.arange(ScanSettings.most_cycles - 1), dtype=np.float64)
         # The width of a peak is the change that shifts the phase by one turn over the range.
         width = 1.0 / span if place.prismatic else 2.0 * np.pi / span
         bands = [coarse]
         if not place.prismatic:
-            apart = max(min(width, 0.1 * (FINEST - _MOST_CYCLES)), step)
-            bands.append(np.arange(_MOST_CYCLES + 1.0, FINEST, apart))
+            apart = max(min(width, 0.1 * (ScanSettings.finest_cycles - ScanSettings.most_cycles)), step)
+            bands.append(np.arange(ScanSettings.most_cycles + 1.0, ScanSettings.finest_cycles, apart))
         tried, cycles = max(((self._rippled_best(effect, band), band) for band in bands), key=_most_gain)
-        if width < step or self._times(float(tried[1][tried[0]]), _Settings.between) >= least:
+        if width < step or self._times(float(tried[1][tried[0]]), ScanSettings.between) >= least:
             fine: FloatArray = cycles[tried[0]] + 0.5 * max(width, step) * np.linspace(-1.0, 1.0, 61)
             cycles = np.asarray(fine[fine > 0.5 * first], dtype=np.float64)
             tried = self._best(self._rippled(effect, cycles), effect)
@@ -288,7 +287,7 @@ class Scan:
     def _moment(self, effect: Effect) -> Candidate | None:
         """Return the best moment between two rows: a coarse search, then all near the best."""
         n = len(self._fit.left)
-        if n < 2 * _Settings.beside + 1:
+        if n < 2 * ScanSettings.beside + 1:
             return None
         begun = effect.with_values(np.append(effect.values[:-1], -np.inf))
 
@@ -296,14 +295,14 @@ class Scan:
             columns = self._fit.weighted(self._fit.run.columns(begun)[:, :, effect.amounts])
             return self._products.since(columns, rows)
 
-        step = 1 + n // _Settings.most_moments
-        some = range(_Settings.beside, n - _Settings.beside, step)
+        step = 1 + n // ScanSettings.most_moments
+        some = range(ScanSettings.beside, n - ScanSettings.beside, step)
         best, gains, amounts, dof = self._best(self._products.kept(effect, lambda: since(some)), effect)
         if not dof:
             return None
         tried, row = np.asarray(some), some[best]
         if step > 1:
-            beside = range(max(row - step + 1, _Settings.beside), min(row + step, n - _Settings.beside))
+            beside = range(max(row - step + 1, ScanSettings.beside), min(row + step, n - ScanSettings.beside))
             best, closer, amounts, dof = self._best(since(beside), effect)
             row = beside[best]
             tried, first = np.unique(np.append(tried, beside), return_index=True)
@@ -313,7 +312,7 @@ class Scan:
         shapes = 0.5 * (clock[tried - 1] + clock[tried])
         near = np.flatnonzero(gains > gains.max() - float(chdtri(1, 0.05)))
         interval = float(shapes[near[0]]), float(shapes[near[-1]])
-        return Candidate(effect.with_values(values), float(gains.max()), dof, n - 2 * _Settings.beside, interval)
+        return Candidate(effect.with_values(values), float(gains.max()), dof, n - 2 * ScanSettings.beside, interval)
 
     def _linear(self, effect: Effect) -> System:
         """Return the system of an effect that has amounts only."""
@@ -371,7 +370,7 @@ class Scan:
         unit = _units(effect)
         shares = _eigenvalues(inner / np.sqrt(np.maximum(raw[:, :, None] * raw[:, None, :], 1e-300)))
         told = _eigenvalues(inner * unit[:, None] * unit) > 10.0 * self._fit.noise.sigma**2
-        return ((shares > TOLD_APART) & told).sum(axis=1)
+        return ((shares > TangentSettings.told_apart) & told).sum(axis=1)
 
 
 def moment_again(fit: Fit, cause: Effect, doubted: NDArray[np.bool_]) -> Candidate | None:
@@ -394,7 +393,7 @@ def _subsets(count: int) -> NDArray[np.bool_]:
 
 def _units(effect: Effect) -> FloatArray:
     """Return the largest expected size of each of an effect's amounts (k,)."""
-    return LARGEST * np.array([effect.parameters[j].usual for j in effect.amounts])
+    return FitSettings.largest * np.array([effect.parameters[j].usual for j in effect.amounts])
 
 
 def _eigenvalues(matrices: FloatArray) -> FloatArray:

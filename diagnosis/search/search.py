@@ -14,7 +14,7 @@ from scipy.special import chdtri
 from bodyschema.diagnosis.fit.fit import Fit, amount_columns, improved, solved
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.fit.scatter import beyond_single_rows, instruments, remembers
-from bodyschema.diagnosis.fit.worth import ANOTHER, NAMED, SAME, choices, cost, nats, rise_for
+from bodyschema.diagnosis.fit.worth import WorthSettings, choices, cost, nats, rise_for
 from bodyschema.effects import Effect, Identity
 
 from .held_out import Blocks, block_p_value
@@ -201,11 +201,11 @@ class Search:
 
     def _added(self, fit: Fit) -> Fit | None:
         """Add one more cause; None if no candidate is probable enough."""
-        best, most = None, NAMED
+        best, most = None, WorthSettings.named_nats
         known = self._known[1] if self._known[0] is fit else None
         named_so = [one for one in self._open(fit) if not has_simpler_name(one, self._hypotheses, fit.simulation)]
         for candidate in self.shortlist(known or Scan(fit), named_so):
-            if self.agreed(fit, candidate) < NAMED:
+            if self.agreed(fit, candidate) < WorthSettings.named_nats:
                 continue
             doubt = self.doubt(candidate, fit.causes)
             least = fit.log_likelihood + rise_for(most + doubt, candidate.dof)
@@ -235,8 +235,8 @@ class Search:
         to be worth a name beside the offset.
         """
         if contains(fit, cause.effect, other.effect):
-            return NAMED + self.doubt(other)
-        return -NAMED - self.doubt(cause) if contains(fit, other.effect, cause.effect) else 0.0
+            return WorthSettings.named_nats + self.doubt(other)
+        return -WorthSettings.named_nats - self.doubt(cause) if contains(fit, other.effect, cause.effect) else 0.0
 
     def _open(self, fit: Fit) -> list[Effect]:
         """Return the hypotheses that are not causes of a fit, with one more of each that begins at a moment."""
@@ -260,7 +260,7 @@ class Search:
         # All joint offsets together have one name.
         first = self.multiplicity - float(np.log(1 + len(others) - max(len(zeros) - 1, 0)))
         is_another = candidate.effect.kind.is_zero and any(one.kind.is_zero for one in others)
-        return (min(first, ANOTHER) if is_another else first) + float(np.log(candidate.trials))
+        return (min(first, WorthSettings.another_nats) if is_another else first) + float(np.log(candidate.trials))
 
     def doubt_of(self, effect: Effect) -> float:
         """Return the multiplicity penalty of an effect that was a candidate [nats]."""
@@ -282,7 +282,7 @@ class Search:
         gain = float(chdtri(candidate.dof, max(chance, 1e-290)))
         doubt = self.doubt(candidate, fit.causes)
         worth = nats(gain, candidate.dof) - doubt
-        if blocks.count < _Settings.few_blocks and worth < NAMED:
+        if blocks.count < _Settings.few_blocks and worth < WorthSettings.named_nats:
             # Few blocks cannot give a small p-value; a large gain counts without them.
             plain = nats(fit.independence * candidate.gain, candidate.dof) - doubt
             worth = max(worth, plain) if plain > _Settings.beyond_doubt else worth
@@ -362,10 +362,10 @@ class Search:
             if worth > _Settings.elsewhere:
                 return tried
         counted = self._share_that_counts(fit, cause)
-        least = NAMED + self.doubt(beside.itself, beside.others)
+        least = WorthSettings.named_nats + self.doubt(beside.itself, beside.others)
         lost = beside.is_lost_for(least if counted == 1.0 else _rise(least, beside.itself.dof, counted))
         lost = lost or not cause.is_possible
-        if lost or (remembers(cause) and self.agreed(beside.without, beside.itself) < NAMED):
+        if lost or (remembers(cause) and self.agreed(beside.without, beside.itself) < WorthSettings.named_nats):
             self._tell(f"dropped {describe(cause)}")
             return beside.without
         for candidate in beside.candidates:
@@ -429,7 +429,7 @@ def contains(fit: Fit, link: Effect, zero: Effect) -> bool:
     flat, own = columns.reshape(fit.left.size, -1), len(zero.amounts)
     change, others = flat[:, :own] @ zero.values[zero.amounts], flat[:, own:]
     left = change - others @ solved(others.T @ others, others.T @ change)
-    return float(left @ left) < SAME * fit.noise.sigma**2
+    return float(left @ left) < WorthSettings.same * fit.noise.sigma**2
 
 
 def are_a_description(causes: Sequence[Effect]) -> bool:

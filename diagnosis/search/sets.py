@@ -18,34 +18,41 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import get_blas_funcs, get_lapack_funcs
 
-from bodyschema.diagnosis.fit.background import MOST, SMALLEST, SPREAD, Scales
+from bodyschema.diagnosis.fit.background import BackgroundSettings, Scales
 from bodyschema.diagnosis.fit.fit import Fit
-from bodyschema.diagnosis.fit.worth import ANOTHER, NAMED, ways_to_choose
+from bodyschema.diagnosis.fit.worth import WorthSettings, ways_to_choose
 from bodyschema.effects import Effect, EffectType, Identity
 from bodyschema.interfaces.records import FloatArray
 
 from .scan import Candidate
 from .search import Key
 
-# Rounds for scales and noise, from afar and beside a similar set; stop when their logarithms change by less.
-_ROUNDS, _ROUNDS_NEAR, STILL = 25, 8, 0.02
-_FARTHEST = 1.0  # limit of a step in the logarithms
-_QUIETEST = 1e-3  # lower limit of the noise as a share of that of the fit
-_TRIED = 4  # number of the most promising moves that are tried with their own scales
-# Logarithms of the sizes, in usual ones, with which a pose is tried before its own is fitted.
-_SIZES = (0.0, -2.0, -4.0)
-# Prior width of what robot.toml does not know, about the fit, in usual sizes; the same in all fits, to compare them.
-_FREE = 100.0
-# Relative rounding of squares, and of columns that are collinear up to rounding.
-_ROUNDED_OFF, _ONE_BEYOND_ROUNDING = 1e-13, 1e-8
-_SHOWN = 3.0  # evidence loss without a scale's tolerances from which they show in the data [nats]
-# Loss of evidence that rules a scale out with 95 % (a likelihood ratio on one side), and the step of logarithms tried.
-_RULED_OUT, _FINER = 1.35, 0.2
-# Maximum of changes to a set of causes, and of its causes for more to be added: beyond, the first order is not enough.
-_MOST_MOVES, _MOST_TOGETHER = 60, 8
-COMES_NEAR = 15.0  # margin to the best within which a set is refitted, and a change tried [nats]
 
-_LOG_SMALLEST, _LOG_MOST, SCALES = math.log(SMALLEST), math.log(MOST), len(Scales())
+class SetSettings:
+    # Rounds for scales and noise, from afar and beside a similar set; stop when their logarithms change by less.
+    rounds, rounds_near, still = 25, 8, 0.02
+    farthest = 1.0  # limit of a step in the logarithms
+    quietest = 1e-3  # lower limit of the noise as a share of that of the fit
+    tried = 4  # number of the most promising moves that are tried with their own scales
+    # Logarithms of the sizes, in usual ones, with which a pose is tried before its own is fitted.
+    log_sizes = (0.0, -2.0, -4.0)
+    # Prior width of what robot.toml does not know, about the fit, in usual sizes; the same in all fits, to compare
+    # them.
+    free = 100.0
+    # Relative rounding of squares, and of columns that are collinear up to rounding.
+    rounded_off, one_beyond_rounding = 1e-13, 1e-8
+    shown_nats = 3.0  # evidence loss without a scale's tolerances from which they show in the data [nats]
+    # Loss of evidence that rules a scale out with 95 % (a likelihood ratio on one side), and the step of logarithms
+    # tried.
+    ruled_out_nats, finer = 1.35, 0.2
+    # Maximum of changes to a set of causes, and of its causes for more to be added: beyond, the first order is not
+    # enough.
+    most_moves, most_together = 60, 8
+    comes_near_nats = 15.0  # margin to the best within which a set is refitted, and a change tried [nats]
+
+
+_LOG_SMALLEST, _LOG_MOST = math.log(BackgroundSettings.smallest_scale), math.log(BackgroundSettings.largest_scale)
+SCALES = len(Scales())
 
 dpotrf, dpotri, dpotrs = get_lapack_funcs(("potrf", "potri", "potrs"), dtype=np.float64)
 (dtrsm,) = get_blas_funcs(("trsm",), dtype=np.float64)
@@ -100,7 +107,7 @@ class Sets:
         self._of_scale, self._noise = fit.background.group, fit.noise.sigma
         scales = np.asarray(fit.background.scales or Scales())[fit.background.group]
         flat = np.concatenate(parts, axis=2).reshape(rows, -1)
-        unknown = _FREE * _usual(fit.simulation.effects[: fit.nuisances])
+        unknown = SetSettings.free * _usual(fit.simulation.effects[: fit.nuisances])
         self._units = np.concatenate([unknown, fit.background.tolerances / scales, _usual(self.effects)])
         flat *= self._units
         self._inner, self._toward = flat.T @ flat, flat.T @ target
@@ -111,7 +118,7 @@ class Sets:
         self._kinds, self._keys = [one.kind for one in self.effects], [one.key for one in self.effects]
         self._trials = [float(np.log(candidate.trials)) for candidate in candidates]
         self._bits = [sum(1 << k for k in one.amounts) for one in self.effects]
-        self._first = doubt + NAMED
+        self._first = doubt + WorthSettings.named_nats
         ends = np.cumsum([0, *(len(effect.amounts) for effect in self.effects)])
         first = self._nuisances + self._tolerances
         self._places = [np.arange(first + a, first + b) for a, b in pairwise(ends)]
@@ -145,7 +152,7 @@ class Sets:
             exact, others = copy(self), dict[frozenset[int], Together]()
             exact._log_most, exact._known = _LOG_SMALLEST, {}
             near = dict.fromkeys(exact._climbed(start, others).chosen for start in ((), best.chosen))
-            near = [one for one in near if self.of(one, best).worth > best.worth - COMES_NEAR]
+            near = [one for one in near if self.of(one, best).worth > best.worth - SetSettings.comes_near_nats]
             reached |= {self.possible(self._climbed(start, seen)).chosen: None for start in near}
         return list({frozenset(chosen): self.of(chosen) for chosen in reached}.values())
 
@@ -189,12 +196,12 @@ class Sets:
 
     def _climbed(self, start: tuple[int, ...], seen: dict[frozenset[int], Together]) -> Together:
         here = self.of(start)
-        for _ in range(_MOST_MOVES):
+        for _ in range(SetSettings.most_moves):
             if frozenset(here.chosen) in seen:
                 return seen[frozenset(here.chosen)]
             seen[frozenset(here.chosen)] = here
             better = self._without_one(here)
-            if better is None and len({self.effects[k].identity for k in here.chosen}) < _MOST_TOGETHER:
+            if better is None and len({self.effects[k].identity for k in here.chosen}) < SetSettings.most_together:
                 better = self._with_one_more(here) or self._exchanged(here) or self._with_smaller_tolerances(here)
             if better is None:
                 return here
@@ -206,8 +213,8 @@ class Sets:
         present = frozenset(here.chosen)
         groups = [group for group in self._groups if present.issuperset(group)]
         losses = self._losses(here, groups)
-        for k in np.argsort(losses, kind="stable")[:_TRIED].tolist():
-            if losses[k] > COMES_NEAR:
+        for k in np.argsort(losses, kind="stable")[: SetSettings.tried].tolist():
+            if losses[k] > SetSettings.comes_near_nats:
                 break
             if better := _better([self.of(_without(here.chosen, groups[k]), here)], here):
                 return better
@@ -215,7 +222,7 @@ class Sets:
 
     def _with_one_more(self, here: Together) -> Together | None:
         more = self._promising(here, here.worth)
-        return _better([self.of((*here.chosen, *group), here) for group in more[:_TRIED]], here)
+        return _better([self.of((*here.chosen, *group), here) for group in more[: SetSettings.tried]], here)
 
     def _exchanged(self, here: Together) -> Together | None:
         tried = []
@@ -225,7 +232,7 @@ class Sets:
             others = [
                 group for group in self._promising(without, here.worth) if self.effects[group[0]].identity != identity
             ]
-            tried += [self.of((*without.chosen, *group), without) for group in others[:_TRIED]]
+            tried += [self.of((*without.chosen, *group), without) for group in others[: SetSettings.tried]]
         return _better(tried, here)
 
     def _with_smaller_tolerances(self, here: Together) -> Together | None:
@@ -268,7 +275,7 @@ class Sets:
             if kind.in_parts:
                 numbers[self._keys[k]] += self._bits[k]
                 continue
-            total += self._trials[k] + (ANOTHER if kind in kinds else self._first)
+            total += self._trials[k] + (WorthSettings.another_nats if kind in kinds else self._first)
             kinds.add(kind)
         total += sum(self._first + self._of_numbers[key][bits] for key, bits in numbers.items())
         return total - math.lgamma(len(kinds) + len(numbers) + 1)
@@ -306,14 +313,14 @@ class Sets:
         own = [at[self._places_of(group)] for group in open_groups]
         numbers, worths = np.array([len(one) for one in own]), np.full(len(own), -np.inf)
         fixed = np.array([group[0] not in self._sized for group in open_groups])
-        for log in _SIZES:
+        for log in SetSettings.log_sizes:
             narrow = inner + math.exp(-2.0 * log) * np.eye(len(inner))
             squares, volumes = _in_groups(narrow, gradient, own)
-            worth = squares - volumes - numbers * log - 0.5 * (log / SPREAD) ** 2
+            worth = squares - volumes - numbers * log - 0.5 * (log / BackgroundSettings.spread) ** 2
             worths = np.where(fixed & (log != 0.0), worths, np.maximum(worths, worth))
         worths -= self._costs_of(here.chosen, open_groups, are_in=False)
         best = np.argsort(worths)[::-1]
-        return [open_groups[k] for k in best[here.worth + worths[best] > least - COMES_NEAR].tolist()]
+        return [open_groups[k] for k in best[here.worth + worths[best] > least - SetSettings.comes_near_nats].tolist()]
 
     def _costs_of(self, chosen: Sequence[int], groups: Sequence[tuple[int, ...]], *, are_in: bool) -> FloatArray:
         """Return the part of each of some groups in the cost of naming a set [nats], or what it would add to it."""
@@ -333,7 +340,7 @@ class Sets:
                 of_numbers = self._of_numbers[key]
                 costs.append(of_numbers[before + own] + (first if before == 0 else -of_numbers[before]))
             else:
-                costs.append(self._trials[group[0]] + (ANOTHER if kinds[kind] > are_in else first))
+                costs.append(self._trials[group[0]] + (WorthSettings.another_nats if kinds[kind] > are_in else first))
         return np.array(costs)
 
     def of(self, chosen: tuple[int, ...], near: Together | None = None) -> Together:
@@ -352,23 +359,24 @@ class Sets:
         sigma = near.sigma if near else self._noise
         members, spent = (group == np.arange(len(most))[:, None]).astype(np.float64), np.zeros(len(most))
         unit = np.eye(len(columns), order="F")
-        for done in range(_ROUNDS if near is None else _ROUNDS_NEAR):
+        for done in range(SetSettings.rounds if near is None else SetSettings.rounds_near):
             factor, variances, amounts = solution = self._solved(inner, toward, group, logs, sigma)
             inverse = dtrsm(1.0, factor, unit, lower=True)
             told = 1.0 - np.einsum("ij,ij->j", inverse, inverse) / variances
             # Update from a scale's tolerances and its prior (MacKay 1992, equation 4.10).
             spent, squares = members @ told, members @ (np.square(amounts) / variances)
-            steps = (squares - spent - logs / SPREAD**2) / (2.0 * np.maximum(spent, 0.5) + 1.0 / SPREAD**2)
-            steps = np.minimum(np.maximum(steps, -_FARTHEST), _FARTHEST)
+            variance = BackgroundSettings.spread**2
+            steps = (squares - spent - logs / variance) / (2.0 * np.maximum(spent, 0.5) + 1.0 / variance)
+            steps = np.minimum(np.maximum(steps, -SetSettings.farthest), SetSettings.farthest)
             moved = np.minimum(np.maximum(logs + steps, _LOG_SMALLEST), most)
             rss = self._square - 2.0 * float(amounts @ toward) + float(amounts @ inner @ amounts)
             free = max(self._rows - float(told.sum()), 1.0)
             quieter = 0.5 * math.log(max(rss, 1e-300) / free) - math.log(sigma)
-            quieter = min(max(quieter, -_FARTHEST), _FARTHEST)
-            if done and max(np.abs(moved - logs).max(), abs(quieter)) < STILL:
+            quieter = min(max(quieter, -SetSettings.farthest), SetSettings.farthest)
+            if done and max(np.abs(moved - logs).max(), abs(quieter)) < SetSettings.still:
                 break
             logs = moved
-            sigma = max(sigma * math.exp(quieter), _QUIETEST * self._noise)
+            sigma = max(sigma * math.exp(quieter), SetSettings.quietest * self._noise)
         else:
             solution = self._solved(inner, toward, group, logs, sigma)
         scales, sizes = Scales(*np.exp(logs[:SCALES]).tolist()), logs[SCALES:]
@@ -376,9 +384,10 @@ class Sets:
         as_described = np.append(np.full(SCALES, _LOG_SMALLEST), sizes)
         exact = self._solved(inner, toward, group, as_described, sigma)
         if (evidence := self._evidence(exact, toward, sigma)) > worth:
-            worth, solution, scales, logs = evidence, exact, Scales(*[SMALLEST] * SCALES), as_described
-        worth -= 0.5 * float(np.square(sizes / SPREAD).sum()) + _volume(spent[SCALES:])
-        worth += self._outliers - self._cost(chosen) - NAMED * scales.several_times
+            scales = Scales(*[BackgroundSettings.smallest_scale] * SCALES)
+            worth, solution, logs = evidence, exact, as_described
+        worth -= 0.5 * float(np.square(sizes / BackgroundSettings.spread).sum()) + _volume(spent[SCALES:])
+        worth += self._outliers - self._cost(chosen) - WorthSettings.named_nats * scales.several_times
         factor, _, amounts = solution
         return Together(chosen, worth, scales, logs, group, sigma, spent[:SCALES], amounts, factor, columns)
 
@@ -390,7 +399,7 @@ class Sets:
             logs = here.logs.copy()
             logs[g] = _LOG_SMALLEST
             without.append(self._worth(here, logs))
-        return whole - np.array(without) > _SHOWN
+        return whole - np.array(without) > SetSettings.shown_nats
 
     def largest(self, here: Together) -> FloatArray:
         """Return the largest scales (4,), each beside the others as they are, that the data do not rule out."""
@@ -400,9 +409,9 @@ class Sets:
             while logs[g] < _LOG_MOST:
                 worth = self._worth(here, logs)
                 best = max(best, worth)
-                if worth < best - _RULED_OUT:
+                if worth < best - SetSettings.ruled_out_nats:
                     break
-                logs[g] = min(logs[g] + _FINER, _LOG_MOST)
+                logs[g] = min(logs[g] + SetSettings.finer, _LOG_MOST)
             found[g] = np.exp(logs[g])
         return found
 
@@ -439,10 +448,10 @@ class Sets:
         precision = inner / sigma**2
         diagonal = precision.reshape(-1)[:: len(precision) + 1]
         squares = diagonal.copy()
-        diagonal += 1.0 / variances + _ROUNDED_OFF * squares
+        diagonal += 1.0 / variances + SetSettings.rounded_off * squares
         factor, failed = dpotrf(precision, lower=True, clean=False)
         if failed:
-            diagonal += _ONE_BEYOND_ROUNDING * squares
+            diagonal += SetSettings.one_beyond_rounding * squares
             factor = dpotrf(precision, lower=True, clean=False)[0]
         return factor, variances, dpotrs(factor, toward / sigma**2, lower=True)[0]
 
@@ -482,7 +491,7 @@ def _parts(effect: Effect) -> list[tuple[object, ...]]:
 
 def _volume(spent: FloatArray) -> float:
     """Return what integrating over the scales costs beyond taking the best, from the data spent on each (4,) [nats]."""
-    return float(0.5 * np.log1p(2.0 * spent * SPREAD**2).sum())
+    return float(0.5 * np.log1p(2.0 * spent * BackgroundSettings.spread**2).sum())
 
 
 def _in_groups(
@@ -509,4 +518,4 @@ def _without(chosen: tuple[int, ...], group: Sequence[int]) -> tuple[int, ...]:
 
 def _better(tried: Sequence[Together], here: Together) -> Together | None:
     best = max(tried, key=lambda one: one.worth, default=None)
-    return best if best is not None and best.worth > here.worth + STILL else None
+    return best if best is not None and best.worth > here.worth + SetSettings.still else None

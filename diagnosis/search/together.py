@@ -15,20 +15,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyschema.diagnosis.fit.background import MOST, SPREAD, Scales
+from bodyschema.diagnosis.fit.background import BackgroundSettings, Scales
 from bodyschema.diagnosis.fit.fit import Fit, solved
-from bodyschema.diagnosis.fit.worth import NAMED
+from bodyschema.diagnosis.fit.worth import WorthSettings
 from bodyschema.effects import Effect
 from bodyschema.interfaces.records import FloatArray
 
 from .hypotheses import has_simpler_name
 from .scan import Candidate, Scan
 from .search import Key
-from .sets import COMES_NEAR, SCALES, STILL, Sets, Together
+from .sets import SCALES, Sets, SetSettings, Together
 
-_MOST_REFITTED = 8  # maximum of refitted sets
-# Tolerances may stand for a cause of which they leave less than this share of the squares; a third is left of a jump.
-_FOLLOWED = 0.1
+
+class _Settings:
+    most_refitted = 8  # maximum of refitted sets
+    # Tolerances may stand for a cause of which they leave less than this share of the squares; a third is left of a
+    # jump.
+    followed_share = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +54,7 @@ def together(start: Fit, hypotheses: Sequence[Effect], tell: Callable[[str], Non
         tell: called with short messages on progress.
     """
     known = [_Place(start.tolerating(Scales()), hypotheses, ())]
-    while len(known) < _MOST_REFITTED:
+    while len(known) < _Settings.most_refitted:
         looked_at = Counter(place.name for place in known)
         best = max(known, key=lambda place: place.here.worth)
         # A set that was fitted far from its own parameters is fitted once more, from where it seems better than all.
@@ -59,10 +62,11 @@ def together(start: Fit, hypotheses: Sequence[Effect], tell: Callable[[str], Non
             (one.worth, place, one)
             for place in known
             for one in place.reached
-            if not (times := looked_at[place.name_of(one)]) or (times == 1 and one.worth > best.here.worth + STILL)
+            if not (times := looked_at[place.name_of(one)])
+            or (times == 1 and one.worth > best.here.worth + SetSettings.still)
         ]
         worth, place, one = max(proposals, key=lambda proposal: proposal[0], default=(-np.inf, known[0], known[0].here))
-        if worth < best.here.worth - COMES_NEAR:
+        if worth < best.here.worth - SetSettings.comes_near_nats:
             place, one = best, best.with_all_zeros
             if best.here.scales.angles <= 1.0 or place.name_of(one) in looked_at:
                 fewer = best.with_one_less()
@@ -90,8 +94,9 @@ def in_place_of_tolerances(fit: Fit, hypotheses: Sequence[Effect]) -> list[tuple
     large = [Candidate(one, 0.0, 1) for one in _absent(fit, hypotheses) if one.kind.is_like_tolerances]
     sets = _sets_of(fit, large, float(np.log(max(len(hypotheses), 1))))
     here = sets.of(sets.again(fit.causes))
-    found = [(effect, one.worth + NAMED * (one.scales.several_times + 1.0)) for effect, one in sets.with_one(here)]
-    without = here.worth + NAMED * here.scales.several_times
+    named, ones = WorthSettings.named_nats, sets.with_one(here)
+    found = [(effect, one.worth + named * (one.scales.several_times + 1.0)) for effect, one in ones]
+    without = here.worth + named * here.scales.several_times
     odds = np.exp(np.minimum([worth - without for _, worth in found], 700.0))
     shares = (odds / (1.0 + odds.sum())).tolist()
     return sorted(((effect, p) for (effect, _), p in zip(found, shares, strict=True)), key=lambda one: -one[1])
@@ -101,17 +106,21 @@ def tolerated(fit: Fit) -> Tolerated:
     """Return the scales of tolerances with the most evidence beside the causes of a fit."""
     if fit.background.scales is None:
         unseen = np.zeros(SCALES, dtype=np.bool_)
-        return Tolerated(Scales(), np.full(SCALES, SPREAD), unseen, np.full(SCALES, MOST))
+        unsure, most = (np.full(SCALES, each) for each in (BackgroundSettings.spread, BackgroundSettings.largest_scale))
+        return Tolerated(Scales(), unsure, unseen, most)
     causes = [Candidate(cause, 0.0, 1) for cause in fit.causes]
     sets = Sets(fit, causes, 0.0)
     here = sets.of(tuple(range(len(causes))))
-    unsure = 1.0 / np.sqrt(2.0 * here.spent + 1.0 / SPREAD**2)
+    unsure = 1.0 / np.sqrt(2.0 * here.spent + 1.0 / BackgroundSettings.spread**2)
     return Tolerated(here.scales, unsure, sets.shown(here), sets.largest(here))
 
 
 def is_at_limit(scales: Scales | None) -> bool:
     """Return True if tolerances of links or axes are as large as they may be."""
-    return scales is not None and max(scales.lengths, scales.angles) > (1.0 - STILL) * MOST
+    return (
+        scales is not None
+        and max(scales.lengths, scales.angles) > (1.0 - SetSettings.still) * BackgroundSettings.largest_scale
+    )
 
 
 def beyond_tolerances(fit: Fit, cause: Effect, doubt: float) -> bool | None:
@@ -120,7 +129,7 @@ def beyond_tolerances(fit: Fit, cause: Effect, doubt: float) -> bool | None:
     Args:
         doubt: minimum cost of naming it [nats].
     """
-    if fit.background.scales is None or _beside_tolerances(fit, cause) > _FOLLOWED:
+    if fit.background.scales is None or _beside_tolerances(fit, cause) > _Settings.followed_share:
         return None
     everything = [Candidate(one, 0.0, 1) for one in fit.causes]
     others = [one for one in everything if one.effect is not cause]
@@ -128,7 +137,7 @@ def beyond_tolerances(fit: Fit, cause: Effect, doubt: float) -> bool | None:
     # Two causes may each seem to be needed beside tolerances that only both together make small. Whether to name them
     # is one decision then, although each name has been charged with it.
     fewer = Sets(fit, others, doubt).climbed((tuple(range(len(others))), ()))
-    return all(whole.worth > one.worth - NAMED * (len(others) - len(one.chosen)) for one in fewer)
+    return all(whole.worth > one.worth - WorthSettings.named_nats * (len(others) - len(one.chosen)) for one in fewer)
 
 
 def _beside_tolerances(fit: Fit, cause: Effect) -> float:
@@ -153,7 +162,7 @@ class _Place:
         self._sets = _sets_of(fit, [_at_rest(one) for one in _beside_links(fit, _absent(fit, hypotheses))], self._doubt)
         own = self._sets.again(fit.causes)
         self.here = self._sets.of(own)
-        if self.here.worth > max((place.here.worth for place in others), default=-np.inf) + COMES_NEAR:
+        if self.here.worth > max((place.here.worth for place in others), default=-np.inf) + SetSettings.comes_near_nats:
             starts = self._sets.starts(own, links=not others)
         else:
             # A fit that is not clearly better than others leads on from what these have reached.
@@ -190,7 +199,7 @@ class _Place:
                 others = self._sets.again([other for other in self.fit.causes if other is not cause])
                 fewer.append(self.refitted(self._sets.of(others, self.here)))
         best = max(fewer, key=self._worth, default=None)
-        return best if best is not None and self._worth(best) > self.here.worth + STILL else None
+        return best if best is not None and self._worth(best) > self.here.worth + SetSettings.still else None
 
     def numbers_of(self, one: Together) -> list[Effect]:
         """Return the causes of a set, those of which some numbers may be free once for each."""

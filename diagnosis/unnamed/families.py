@@ -30,6 +30,9 @@ class _Settings:
     harmonics, times, joint_times, rows_a_wave = 5, 4, (8, 32, 96), 10
     warming = (0.07, 0.2, 0.6)  # time constants, as shares of the recording's duration
     shortest = 0.02  # a shorter link does not bend [m]
+    shows = 0.05  # smallest share of the variance at which an error counts as depending on a joint
+    # Limit of extrapolation beyond the observed range, as a share of it.
+    beyond = 0.1
 
 
 Columns = Callable[[Simulated], FloatArray]
@@ -324,12 +327,6 @@ def _with_one(amounts: FloatArray) -> FloatArray:
     return np.concatenate([np.ones((len(amounts), 1)), amounts], axis=1)
 
 
-_SHOWS = 0.05  # smallest share of the variance at which an error counts as depending on a joint
-# Limit of extrapolation beyond the observed range, as a share of it.
-_BEYOND = 0.1
-_SEED = 0
-
-
 def joints_of(family: Family, numbers: FloatArray, run: Simulated) -> frozenset[int]:
     """Return the joints that err or on which the error depends, by their indices in q.
 
@@ -339,7 +336,7 @@ def joints_of(family: Family, numbers: FloatArray, run: Simulated) -> frozenset[
     own = frozenset[int]() if family.joint is None else frozenset({family.joint})
     if family.over_time:
         return own
-    return own | frozenset(np.flatnonzero(shares(family, numbers, run) >= _SHOWS).tolist())
+    return own | frozenset(np.flatnonzero(shares(family, numbers, run) >= _Settings.shows).tolist())
 
 
 def shares(family: Family, numbers: FloatArray, run: Simulated) -> FloatArray:
@@ -350,10 +347,10 @@ def shares(family: Family, numbers: FloatArray, run: Simulated) -> FloatArray:
     Args:
         numbers: parameters of the family (p,).
     """
-    rng = np.random.default_rng(_SEED)
+    rng = np.random.default_rng(0)
     amounts, moves = family.amounts(run), family.moves(run)
     low, high = amounts.min(axis=0), amounts.max(axis=0)
-    margin = _BEYOND * (high - low) + 1e-12
+    margin = _Settings.beyond * (high - low) + 1e-12
     by = family.moved_by(run, numbers)
     # Keep each row's directions fixed: the leverage of a joint on the marker does not count.
     lengths = np.einsum("nia,nib->nab", moves, moves)

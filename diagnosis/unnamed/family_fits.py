@@ -18,18 +18,16 @@ from bodyschema.diagnosis.fit.background import rows_in_part
 from bodyschema.diagnosis.fit.fit import Fit, solved
 from bodyschema.diagnosis.fit.noise import Noise
 from bodyschema.diagnosis.fit.observations import Observations
-from bodyschema.diagnosis.fit.tangent import TOLD_APART
+from bodyschema.diagnosis.fit.tangent import TangentSettings
 from bodyschema.diagnosis.fit.worth import nats
-from bodyschema.diagnosis.search.held_out import FEWEST_ROWS_A_BLOCK, Blocks, held_out_square, scores_p_value
+from bodyschema.diagnosis.search.held_out import Blocks, HeldOutSettings, held_out_square, scores_p_value
 from bodyschema.interfaces.records import FloatArray
 
 from .families import Family, families
 from .low_rank import low_rank, numbers_of
 
-SPECIFIC = 5.0  # prior penalty of a family as specific as a named effect [nats]
 
-
-class _Settings:
+class FamilySettings:
     """Settings of unnamed families.
 
     Sensitivity, each at 0.3 and 3 times over three recordings, one with a smooth unnamed error: `number` at 3 times
@@ -44,6 +42,7 @@ class _Settings:
     ranks = (1, 2)  # motions of a body that share one or two functions
     no_worse = 1.02  # largest factor by which an unnamed family may worsen held-out errors
     nearest, near = 3, 0.9  # best families considered, and the share of the best first-order worth that they need
+    specific_nats = 5.0  # prior penalty of a family as specific as a named effect [nats]
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,24 +221,27 @@ class UnnamedFamilies:
             onto, toward = products[:, :-1], products[:, -1]
             inner = way.inner(fit.noise.weights) - onto @ onto.T
             values, vectors = np.linalg.eigh(inner)
-            told = (values > _Settings.told * max(float(values.max()), 1e-12)) & (values > TOLD_APART)
+            told = values > FamilySettings.told * max(float(values.max()), 1e-12)
+            told &= values > TangentSettings.told_apart
             explained = float(np.square(vectors[:, told].T @ toward / np.sqrt(values[told])).sum())
             most, numbers = _nats(explained, rss, rows) - self._doubt_of(way), int(told.sum())
             if numbers >= free:
                 # As many numbers as residuals leave no noise, whatever the rows are.
                 most = -np.inf
-            ranked.append((most - _Settings.number * numbers, way, None))
-            for rank in (rank for rank in _Settings.ranks if rank < min(way.moves, way.amounts)):
+            ranked.append((most - FamilySettings.number * numbers, way, None))
+            for rank in (rank for rank in FamilySettings.ranks if rank < min(way.moves, way.amounts)):
                 fewer = numbers_of(way.moves, way.amounts, rank)
-                best = _Settings.near * max(worth for worth, _, _ in ranked)
+                best = FamilySettings.near * max(worth for worth, _, _ in ranked)
                 # A part explains no more than the whole.
-                if fewer < numbers and most - _Settings.number * fewer > max(best, 0.0):
+                if fewer < numbers and most - FamilySettings.number * fewer > max(best, 0.0):
                     explained, functions = low_rank(inner, toward, way.amounts, rank)
-                    worth = _nats(explained, rss, rows) - self._doubt_of(way) - _Settings.number * fewer
+                    worth = _nats(explained, rss, rows) - self._doubt_of(way) - FamilySettings.number * fewer
                     ranked.append((worth, way, functions))
         ranked.sort(key=lambda one: -one[0])
         ranked = [
-            one for one in ranked[: _Settings.nearest] if one[0] > _Settings.near * ranked[0][0] or one is ranked[0]
+            one
+            for one in ranked[: FamilySettings.nearest]
+            if one[0] > FamilySettings.near * ranked[0][0] or one is ranked[0]
         ]
         return [(way if part is None else way.along(part), worth) for worth, way, part in ranked]
 
@@ -255,11 +257,12 @@ class UnnamedFamilies:
             for k, family in enumerate(self._families)
             if family.is_specific
         ]
-        return [self._way(k) for gain, k in sorted(ranked, reverse=True)[: _Settings.nearest] if gain >= least]
+        return [self._way(k) for gain, k in sorted(ranked, reverse=True)[: FamilySettings.nearest] if gain >= least]
 
     def _doubt_of(self, way: Way) -> float:
         """Return the multiplicity and prior penalty of a family [nats]."""
-        return float(np.log(self.count)) + (SPECIFIC if way.family.is_specific else _Settings.no_name)
+        own = FamilySettings.specific_nats if way.family.is_specific else FamilySettings.no_name
+        return float(np.log(self.count)) + own
 
     def apart(self, fit: Fit, chosen: Sequence[Way], start: Apart | None = None) -> Apart:
         """Fit the causes and unnamed families alternately, each to the residuals of the other.
@@ -280,21 +283,21 @@ class UnnamedFamilies:
         # No function is expected to exceed twice the whole residual.
         precision = 0.25 / max(float(np.square(fit.left).sum()), 1e-300)
         here = Apart(fit.observations, tuple(chosen), numbers, fit if start is None else start.fit, precision)
-        for _ in range(_Settings.rounds):
+        for _ in range(FamilySettings.rounds):
             numbers = self._step(here)
             left = self._without(fit.observations, chosen, numbers)
             tried = here.fit.to(left)
             rise = tried.log_likelihood - here.fit.log_likelihood
             if rise > 0.0:
                 here = replace(here, numbers=numbers, fit=tried)
-            if rise < _Settings.enough:
+            if rise < FamilySettings.enough:
                 break
         return here
 
     def cost(self, apart: Apart) -> float:
         """Return the cost of the families and their parameters [nats]."""
         numbers = self._beside(apart)[0].shape[0] + apart.choice
-        return sum(self._doubt_of(way) for way in apart.chosen) + _Settings.number * numbers
+        return sum(self._doubt_of(way) for way in apart.chosen) + FamilySettings.number * numbers
 
     def told(self, apart: Apart) -> FloatArray:
         """Return the identifiable directions (n, 3, r) [m] that families change beside the causes."""
@@ -315,8 +318,8 @@ class UnnamedFamilies:
         rows = len(alone.observations)
         # Functions of time cannot be extrapolated over long blocks.
         timed = any(way.family.over_time for way in apart.chosen)
-        blocks = Blocks.cut(rows, rows // FEWEST_ROWS_A_BLOCK) if timed else Blocks.cut(rows)
-        return self._missed(apart.fit, blocks, apart) <= _Settings.no_worse * self._missed(alone, blocks)
+        blocks = Blocks.cut(rows, rows // HeldOutSettings.fewest_rows_a_block) if timed else Blocks.cut(rows)
+        return self._missed(apart.fit, blocks, apart) <= FamilySettings.no_worse * self._missed(alone, blocks)
 
     def _missed(self, fit: Fit, blocks: Blocks, apart: Apart | None = None) -> float:
         """Return the mean squared residual of causes and families on held-out rows, whitened."""
@@ -365,12 +368,12 @@ class UnnamedFamilies:
         """Return the worth of a family by the agreement of blocks of time [nats]."""
         basis, left = self.beside(fit, others)
         fresh = self._fresh(fit, basis, way)
-        strongest = np.argsort(-np.abs(fresh.T @ left))[: _Settings.strongest]
+        strongest = np.argsort(-np.abs(fresh.T @ left))[: FamilySettings.strongest]
         columns = fresh[:, strongest].reshape(*fit.left.shape, -1)
         chance = scores_p_value(columns, left.reshape(fit.left.shape), Blocks.cut(len(fit.left)))
         # The strongest directions were selected; each costs one choice among all.
         gain = float(chdtri(len(strongest), max(chance, 1e-290)))
-        choice = len(strongest) * float(np.log(fresh.shape[1])) + _Settings.number * way.choice
+        choice = len(strongest) * float(np.log(fresh.shape[1])) + FamilySettings.number * way.choice
         return nats(gain, len(strongest)) - choice - self._doubt_of(way)
 
     def _fresh(self, fit: Fit, basis: FloatArray, way: Way) -> FloatArray:
@@ -389,7 +392,7 @@ def _directions(columns: FloatArray, fit: Fit, basis: FloatArray) -> tuple[Float
     weighted = fit.unshared(columns * np.repeat(fit.root_weights[:, 0], 3)[:, None])
     weighted = weighted - basis @ (basis.T @ weighted)
     values, vectors = np.linalg.eigh(weighted.T @ weighted)
-    there = values > TOLD_APART
+    there = values > TangentSettings.told_apart
     return weighted, values[there], vectors[:, there]
 
 

@@ -7,8 +7,10 @@ import numpy as np
 from bodyschema.diagnosis.fit.fit import solved
 from bodyschema.interfaces.records import FloatArray
 
-_ROUNDS, _ENOUGH = 12, 0.1  # maximum of alternating rounds; stop when the explained sum rises by less
-_RIDGE = 1e-7  # ridge, relative to columns of unit length
+
+class _Settings:
+    rounds, enough = 12, 0.1  # maximum of alternating rounds; stop when the explained sum rises by less
+    ridge = 1e-7  # ridge, relative to columns of unit length
 
 
 def numbers_of(moves: int, amounts: int, rank: int) -> int:
@@ -28,12 +30,12 @@ def low_rank(inner: FloatArray, toward: FloatArray, amounts: int, rank: int) -> 
         The sum of squares that it explains, and the functions (b, rank) that the motions follow.
     """
     moves = len(toward) // amounts
-    inner = inner + _RIDGE * np.eye(len(toward))
+    inner = inner + _Settings.ridge * np.eye(len(toward))
     table, square = toward.reshape(moves, amounts), inner.reshape(moves, amounts, moves, amounts)
     start = solved(inner, toward).reshape(moves, amounts)
     functions = np.linalg.svd(start, full_matrices=False)[2][:rank].T
     explained = 0.0
-    for _ in range(_ROUNDS):
+    for _ in range(_Settings.rounds):
         follow = np.einsum("ibjc,br,cs->irjs", square, functions, functions).reshape(moves * rank, -1)
         ways = solved(follow, (table @ functions).ravel()).reshape(moves, rank)
         lead = np.einsum("ibjc,ir,js->brcs", square, ways, ways).reshape(amounts * rank, -1)
@@ -41,6 +43,6 @@ def low_rank(inner: FloatArray, toward: FloatArray, amounts: int, rank: int) -> 
         found = solved(lead, wanted)
         functions = np.linalg.qr(found.reshape(amounts, rank))[0]
         before, explained = explained, float(wanted @ found)
-        if explained - before < _ENOUGH:
+        if explained - before < _Settings.enough:
             break
     return explained, functions

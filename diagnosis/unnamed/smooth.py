@@ -35,9 +35,7 @@ class _Settings:
     # Rounds for the curvature of erring joints, which end when held-out errors grow by more than this factor.
     rounds, worse = 3, 1.05
     left_out, too_far_off = 0.02, 0.5  # tolerance of a stored model, and its largest error, in units of the noise
-
-
-_HARMONICS = {1: 14, 2: 4}  # harmonics of one joint's angle, and of each of two joints' angles
+    harmonics = (14, 4)  # harmonics of one joint's angle, and of each of two joints' angles
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,7 +192,7 @@ class _Functions:
         """Return the functions (n, p) of a joint's error: periodic, and finer than those that detect its family."""
         if not family.drivers:
             return family.amounts(run)
-        first, *others = (self._periodic(run, k, _HARMONICS[len(family.drivers)]) for k in family.drivers)
+        first, *others = (self._periodic(run, k, _Settings.harmonics[len(family.drivers) - 1]) for k in family.drivers)
         for other in others:
             first = (first[:, :, None] * other[:, None, :]).reshape(len(first), -1)
         return first

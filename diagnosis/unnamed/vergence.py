@@ -8,8 +8,10 @@ from scipy.spatial.transform import Rotation
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
 
-_STEP = 1e-5  # step for numerical derivatives [rad]
-_ROUNDS = 8  # fixed-point iterations to invert the distortion
+
+class _Settings:
+    step_rad = 1e-5  # step for numerical derivatives [rad]
+    rounds = 8  # fixed-point iterations to invert the distortion
 
 
 def reported(x: FloatArray, calibration: StereoCalibration, turn: FloatArray) -> FloatArray:
@@ -29,12 +31,13 @@ def reported(x: FloatArray, calibration: StereoCalibration, turn: FloatArray) ->
 def undone(x: FloatArray, calibration: StereoCalibration, turn: FloatArray) -> FloatArray:
     """Return the true points (n, 3) [m] that `reported` maps to x (n, 3) [m]."""
     points = x
-    for _ in range(_ROUNDS):
+    for _ in range(_Settings.rounds):
         points = points + (x - reported(points, calibration, turn))
     return points
 
 
 def by_turn(x: FloatArray, calibration: StereoCalibration, axes: FloatArray) -> FloatArray:
     """Return derivatives (n, 3, a) [m/rad] of `reported` at points (n, 3), for turns about axes (a, 3)."""
-    ends = [(reported(x, calibration, _STEP * axis), reported(x, calibration, -_STEP * axis)) for axis in axes]
-    return np.stack([(above - below) / (2.0 * _STEP) for above, below in ends], axis=2)
+    step = _Settings.step_rad
+    ends = [(reported(x, calibration, step * axis), reported(x, calibration, -step * axis)) for axis in axes]
+    return np.stack([(above - below) / (2.0 * step) for above, below in ends], axis=2)

@@ -7,8 +7,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from bodyschema.effects.effect_type import STEP, Effect, SimulationRun
-from bodyschema.effects.encoder import STRAINS_KEPT, EncoderEffect, LiveDriven
+from bodyschema.effects.effect_type import Effect, EffectSettings, SimulationRun
+from bodyschema.effects.encoder import EncoderEffect, EncoderSettings, LiveDriven
 from bodyschema.effects.joint_errors import JointErrors, Rows
 from bodyschema.effects.motion import Motion
 from bodyschema.effects.parameter import Parameter, Place
@@ -35,8 +35,8 @@ class Backlash(EncoderEffect):
         )
 
     def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
-        wider = self.correction(motion, place, values + STEP)
-        return ((wider - self.correction(motion, place, values)) / STEP)[:, None]
+        wider = self.correction(motion, place, values + EffectSettings.step)
+        return ((wider - self.correction(motion, place, values)) / EffectSettings.step)[:, None]
 
     def correction(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:
         return _played(motion, place.joint, abs(float(values[0]))) * np.sign(values[0])
@@ -99,7 +99,7 @@ def played(q: FloatArray, width: float) -> FloatArray:
     return np.clip(begun, low, high) - q
 
 
-@lru_cache(maxsize=STRAINS_KEPT)
+@lru_cache(maxsize=EncoderSettings.strains_kept)
 def _played(motion: Motion, joint: int, width: float) -> FloatArray:
     """Return `played` of one joint; cached, since a search repeats the same widths."""
     return frozen_array(played(motion.q[:, joint], width))

@@ -8,8 +8,6 @@ from bodyschema.effects.effect_type import Effect, SimulationRun, TimeEffect
 from bodyschema.effects.parameter import Parameter
 from bodyschema.interfaces.records import FloatArray
 
-_STEP_S = 1e-5  # step of the numerical derivative [s]
-
 
 class CameraLatency(TimeEffect):
     """Delay of the images' time stamps against the encoders."""
@@ -31,5 +29,6 @@ class CameraLatency(TimeEffect):
     def jacobian(self, run: SimulationRun, effect: Effect) -> FloatArray:
         # Include the encoder errors: they too are those of the earlier moment.
         simulation, latency = run.simulation, run.simulation.latency_s
-        later, sooner = (simulation.unloaded(run.motion.earlier(latency + s)) for s in (_STEP_S, -_STEP_S))
-        return np.einsum("nij,nj->ni", run.by_joint, (later - sooner) / (2.0 * _STEP_S))[:, :, None]
+        step_s = 1e-5
+        later, sooner = (simulation.unloaded(run.motion.earlier(latency + s)) for s in (step_s, -step_s))
+        return np.einsum("nij,nj->ni", run.by_joint, (later - sooner) / (2.0 * step_s))[:, :, None]

@@ -10,8 +10,6 @@ from bodyschema.effects.parameter import T0, Parameter
 from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.records import FloatArray
 
-_MOST_MOMENTS = 12  # An autofocus hunts: it jumps again and again, where what is bumped or slips does so once or twice
-
 
 class CameraRefocused(CameraEffect):
     """Change of the focal length from a moment on: depth alone is scaled."""
@@ -24,7 +22,7 @@ class CameraRefocused(CameraEffect):
 
     @property
     def most_at_one_place(self) -> int:
-        return _MOST_MOMENTS
+        return 12  # an autofocus hunts: it jumps again and again, where what is bumped or slips does so once or twice
 
     def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
         return (Parameter("focal_error", 0.01), T0)

@@ -12,9 +12,11 @@ from bodyschema.effects.motion import Motion, flanks
 from bodyschema.effects.parameter import Parameter, Place
 from bodyschema.interfaces.records import FloatArray
 
-# Uncertainty factor of the friction, and the smallest relative load that counts.
-_FRICTION_WITHIN, _UPRIGHT = 2.0, 0.02
-_HOLDS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35)  # frictions tried, as shares of the largest load
+
+class _Settings:
+    # Uncertainty factor of the friction, and the smallest relative load that counts.
+    friction_within, upright = 2.0, 0.02
+    holds = (0.0, 0.02, 0.05, 0.1, 0.2, 0.35)  # frictions tried, as shares of the largest load
 
 
 class GravityBacklash(StructureEffect):
@@ -49,12 +51,13 @@ class GravityBacklash(StructureEffect):
 
     def trial_shapes(self, motion: Motion) -> FloatArray:
         """Return shares of the largest load."""
-        return np.array(_HOLDS)
+        return np.array(_Settings.holds)
 
     def unknown_state(self, run: SimulationRun, effect: Effect) -> NDArray[np.bool_]:
         """Return rows (n,) at which the side depends on the size of the friction."""
         torque, hold = run.torques[:, run.simulation.place(effect).joint], float(effect.values[1])
-        less, more = hold / _FRICTION_WITHIN, hold * _FRICTION_WITHIN + _UPRIGHT * float(np.abs(torque).max())
+        factor, upright = _Settings.friction_within, _Settings.upright
+        less, more = hold / factor, hold * factor + upright * float(np.abs(torque).max())
         return flanks(torque, less) != flanks(torque, more)
 
     def correction_rows(self, effect: Effect, place: Place) -> Rows:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyschema.effects.effect_type import Effect, SimulationRun
-from bodyschema.effects.encoder import STRAINS_KEPT, EncoderEffect, LiveDriven, carried_on
+from bodyschema.effects.encoder import EncoderEffect, EncoderSettings, LiveDriven, carried_on
 from bodyschema.effects.joint_errors import Rows
 from bodyschema.effects.motion import Motion
 from bodyschema.effects.parameter import Parameter, Place
@@ -16,8 +16,10 @@ from bodyschema.interfaces.records import FloatArray, frozen_array
 
 from .backlash import WIDTHS
 
-_LENGTHS = np.geomspace(5e-4, 0.3, 14)  # lengths tried [rad, m]
-_STRAINED = 3.0  # after this many lengths, only the last direction determines the strain
+
+class _Settings:
+    lengths = np.geomspace(5e-4, 0.3, 14)  # lengths tried [rad, m]
+    strained_lengths = 3.0  # after this many lengths, only the last direction determines the strain
 
 
 class Hysteresis(EncoderEffect):
@@ -53,14 +55,15 @@ class Hysteresis(EncoderEffect):
         return LiveDriven(place, Bristle(length), -lag)
 
     def trial_shapes(self, motion: Motion) -> FloatArray:
-        return _LENGTHS
+        return _Settings.lengths
 
     def correction_rows(self, effect: Effect, place: Place) -> Rows:
         return {"memories": [[place.joint, 1, *effect.values.tolist()]]}
 
     def unknown_state(self, run: SimulationRun, effect: Effect) -> NDArray[np.bool_]:
         """Return rows (n,) before the joint has gone far enough one way in a run."""
-        return run.motion.before_travel(run.simulation.place(effect).joint, _STRAINED * float(effect.values[1]))
+        travel = _Settings.strained_lengths * float(effect.values[1])
+        return run.motion.before_travel(run.simulation.place(effect).joint, travel)
 
 
 class Bristle:
@@ -87,7 +90,7 @@ class Bristle:
         return self.strained
 
 
-@lru_cache(maxsize=STRAINS_KEPT)
+@lru_cache(maxsize=EncoderSettings.strains_kept)
 def _strained(motion: Motion, joint: int, length: float) -> FloatArray:
     """Return the strain of a joint's friction (n,), from -1 to 1; it begins in the direction of the first move.
 

@@ -11,10 +11,12 @@ from bodyschema.effects.motion import Motion
 from bodyschema.effects.parameter import Parameter, Place
 from bodyschema.interfaces.records import FloatArray
 
-# Upper limit of a magnet's eccentricity as a share of its radius; beyond it the encoder cannot be read.
-_FARTHEST_OFF = 0.95
-# Samples of a turn for its Fourier series, and the amplitude [rad] below which a term is rounding.
-_SAMPLES, _NEGLIGIBLE = 256, 1e-15
+
+class _Settings:
+    # Upper limit of a magnet's eccentricity as a share of its radius; beyond it the encoder cannot be read.
+    farthest_off = 0.95
+    # Samples of a turn for its Fourier series, and the amplitude [rad] below which a term is rounding.
+    samples, negligible_rad = 256, 1e-15
 
 
 class JointEccentricity(EncoderEffect):
@@ -42,12 +44,14 @@ class JointEccentricity(EncoderEffect):
         """Return its Fourier series; the waves of an eccentric magnet are the odd harmonics."""
         sine, cosine = effect.values.tolist()
         phase = float(np.arctan2(cosine, sine))
-        t = np.arange(_SAMPLES) * 2.0 * np.pi / _SAMPLES
-        error = np.arcsin(np.clip(np.hypot(sine, cosine) * np.sin(t), -_FARTHEST_OFF, _FARTHEST_OFF))
-        harmonics = np.arange(1, _SAMPLES // 2, 2)
-        amplitudes = 2.0 / _SAMPLES * np.sin(np.outer(harmonics, t)) @ error
+        t = np.arange(_Settings.samples) * 2.0 * np.pi / _Settings.samples
+        error = np.arcsin(np.clip(np.hypot(sine, cosine) * np.sin(t), -_Settings.farthest_off, _Settings.farthest_off))
+        harmonics = np.arange(1, _Settings.samples // 2, 2)
+        amplitudes = 2.0 / _Settings.samples * np.sin(np.outer(harmonics, t)) @ error
         series = [
-            (int(n), float(size)) for n, size in zip(harmonics, amplitudes, strict=True) if abs(size) > _NEGLIGIBLE
+            (int(n), float(size))
+            for n, size in zip(harmonics, amplitudes, strict=True)
+            if abs(size) > _Settings.negligible_rad
         ]
         return {"waves": [[place.joint, size, n, n * phase] for n, size in series]}
 
@@ -59,4 +63,4 @@ class JointEccentricity(EncoderEffect):
         return np.stack([np.sin(q), np.cos(q)], axis=1)
 
     def _sine(self, ring: FloatArray, values: FloatArray) -> FloatArray:
-        return np.clip(ring @ values, -_FARTHEST_OFF, _FARTHEST_OFF)
+        return np.clip(ring @ values, -_Settings.farthest_off, _Settings.farthest_off)

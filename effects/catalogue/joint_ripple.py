@@ -11,8 +11,10 @@ from bodyschema.effects.motion import Motion
 from bodyschema.effects.parameter import Parameter, Place
 from bodyschema.interfaces.records import FloatArray
 
-_OF_A_PEAK = 0.5  # largest step of the phase over the joint's range [rad]
-_FEWEST_CYCLES = 1.5  # at once per turn it would be an eccentricity
+
+class _Settings:
+    of_a_peak_rad = 0.5  # largest step of the phase over the joint's range [rad]
+    fewest_cycles = 1.5  # at once per turn it would be an eccentricity
 
 
 class JointRipple(EncoderEffect):
@@ -42,10 +44,10 @@ class JointRipple(EncoderEffect):
         return columns
 
     def shape_step(self, run: SimulationRun, effect: Effect, k: int) -> float:
-        return _OF_A_PEAK / max(float(np.ptp(run.readings.q[:, run.simulation.place(effect).joint])), 1e-6)
+        return _Settings.of_a_peak_rad / max(float(np.ptp(run.readings.q[:, run.simulation.place(effect).joint])), 1e-6)
 
     def bounded(self, effect: Effect, k: int, value: float, motion: Motion) -> float:
-        return super().bounded(effect, k, value if effect.prismatic else max(value, _FEWEST_CYCLES), motion)
+        return super().bounded(effect, k, value if effect.prismatic else max(value, _Settings.fewest_cycles), motion)
 
     def correction_rows(self, effect: Effect, place: Place) -> Rows:
         sine, cosine, cycles = effect.values.tolist()

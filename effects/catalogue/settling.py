@@ -9,15 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyschema.effects.effect_type import Effect, SimulationRun
-from bodyschema.effects.encoder import STRAINS_KEPT, EncoderEffect, carried_on
+from bodyschema.effects.encoder import EncoderEffect, EncoderSettings, carried_on
 from bodyschema.effects.joint_errors import Rows
 from bodyschema.effects.motion import Motion
 from bodyschema.effects.parameter import Parameter, Place
 from bodyschema.interfaces.records import FloatArray, frozen_array
 
-# Shares of a lag that remain at the next reading: those tried, the largest step, and the largest.
-_MEMORIES, _OF_A_MEMORY, _LONGEST_MEMORY = np.linspace(0.0, 0.9, 19), 0.1, 0.95
-_AT_REST = 0.05  # the joint is at rest when this share of its initial lag remains
+
+class _Settings:
+    # Shares of a lag that remain at the next reading: those tried, the largest step, and the largest.
+    memories, of_a_memory, longest_memory = np.linspace(0.0, 0.9, 19), 0.1, 0.95
+    at_rest = 0.05  # the joint is at rest when this share of its initial lag remains
 
 
 class Settling(EncoderEffect):
@@ -44,13 +46,13 @@ class Settling(EncoderEffect):
         return _LiveSettling(values, row_readings)
 
     def trial_shapes(self, motion: Motion) -> FloatArray:
-        return _MEMORIES
+        return _Settings.memories
 
     def shape_step(self, run: SimulationRun, effect: Effect, k: int) -> float:
-        return _OF_A_MEMORY
+        return _Settings.of_a_memory
 
     def bounded(self, effect: Effect, k: int, value: float, motion: Motion) -> float:
-        return float(np.clip(value, 0.0, _LONGEST_MEMORY))
+        return float(np.clip(value, 0.0, _Settings.longest_memory))
 
     def unknown_state(self, run: SimulationRun, effect: Effect) -> NDArray[np.bool_]:
         """Return rows (n,), except the first of a run, at which the joint has not settled from before the run."""
@@ -58,14 +60,14 @@ class Settling(EncoderEffect):
         rows = np.zeros(len(motion), dtype=np.bool_)
         if memory > 0.0:
             for first, end in motion.runs:
-                rows[first + 1 : end] = memory ** np.cumsum(motion.pace[first + 1 : end]) > _AT_REST
+                rows[first + 1 : end] = memory ** np.cumsum(motion.pace[first + 1 : end]) > _Settings.at_rest
         return rows
 
     def correction_rows(self, effect: Effect, place: Place) -> Rows:
         return {"memories": [[place.joint, 2, *effect.values.tolist()]]}
 
 
-@lru_cache(maxsize=STRAINS_KEPT)
+@lru_cache(maxsize=EncoderSettings.strains_kept)
 def _missing(motion: Motion, joint: int, memory: float) -> FloatArray:
     """Return the lag after the last and earlier moves (n,); cached, since a search repeats the same values."""
     moves = motion.moves[:, joint]

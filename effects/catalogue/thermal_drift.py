@@ -10,8 +10,10 @@ from bodyschema.effects.motion import Motion
 from bodyschema.effects.parameter import Parameter, shifts
 from bodyschema.interfaces.records import FloatArray
 
-_SHORTEST = 0.03  # a drift that ends within a smaller share of the recording is an offset from the beginning
-_TIME_CONSTANTS = np.geomspace(_SHORTEST, 4.0, 24)  # time constants tried, as shares of the recording's duration
+
+class _Settings:
+    shortest = 0.03  # a drift that ends within a smaller share of the recording is an offset from the beginning
+    time_constants = np.geomspace(shortest, 4.0, 24)  # time constants tried, as shares of the recording's duration
 
 
 class ThermalDrift(TimeEffect):
@@ -35,8 +37,8 @@ class ThermalDrift(TimeEffect):
         return settled(motion, float(shape))
 
     def trial_shapes(self, motion: Motion) -> FloatArray:
-        return float(motion.clock[-1] - motion.clock[0]) * _TIME_CONSTANTS
+        return float(motion.clock[-1] - motion.clock[0]) * _Settings.time_constants
 
     def bounded(self, effect: Effect, k: int, value: float, motion: Motion) -> float:
-        shortest = _SHORTEST * float(motion.clock[-1] - motion.clock[0])
+        shortest = _Settings.shortest * float(motion.clock[-1] - motion.clock[0])
         return super().bounded(effect, k, max(value, shortest), motion)

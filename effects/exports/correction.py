@@ -16,7 +16,7 @@ from bodyschema.effects.effect_type import Effect
 from bodyschema.effects.exports.arm_errors import geometry_without_zeros
 from bodyschema.effects.gravity import GRAVITY_M_S2
 from bodyschema.effects.joint_errors import Rows
-from bodyschema.effects.simulation import SPRING_ROUNDS, Simulation
+from bodyschema.effects.simulation import Simulation, SimulationSettings
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.urdf import inverse
 
@@ -157,7 +157,7 @@ def _add_weights(simulation: Simulation, program: _Program) -> None:
         for joint, half, hold in (_rows(simulation, effect) or {}).get("loose", []):
             loose[joint] = half, hold, program.room(0.0)
     weights = _Weights(simulation, program, {k for k in joints if springs[k] or k in loose})
-    for _ in range(SPRING_ROUNDS if springs.any() else 0):
+    for _ in range(SimulationSettings.spring_rounds if springs.any() else 0):
         for k, torque in weights.torques():
             if springs[k]:
                 program.angles[k] = program.step(ADD, ANGLES + k, weights.unloaded[k], torque, springs[k])

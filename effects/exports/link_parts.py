@@ -14,7 +14,7 @@ import numpy as np
 
 from bodyschema.interfaces.errors import RobotError
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.robot.meshes import find_mesh
+from bodyschema.robot.meshes import STL_HEAD_BYTES, STL_TRIANGLE, find_mesh
 from bodyschema.robot.rpy import rotation_of
 from bodyschema.robot.shapes import Shape, link_shapes
 from bodyschema.robot.urdf import parse_urdf
@@ -22,11 +22,15 @@ from kbmaps.rotations import quaternions
 
 # Mesh formats that MuJoCo reads, and its limit of triangles in an STL file.
 _MESHES = (".stl", ".obj", ".msh")
-_MOST_TRIANGLES = 200_000
-_STL_HEADER, _STL_TRIANGLE = 84, 50
-_ROD_RADIUS, _SHORTEST_ROD = 0.02, 0.01  # a link without a shape becomes a rod from its joint to the next one [m]
-# Floor of a moment of inertia [kg·m²]; MuJoCo needs a positive one.
-LEAST_INERTIA = 1e-9
+
+
+class PartSettings:
+    most_triangles = 200_000
+    rod_radius_m, shortest_rod_m = 0.02, 0.01  # a link without a shape becomes a rod from its joint to the next one [m]
+    # Floor of a moment of inertia [kg·m²]; MuJoCo needs a positive one.
+    least_inertia_kgm2 = 1e-9
+
+
 _GREY = "0.7 0.7 0.72 1"
 
 
@@ -91,9 +95,10 @@ def _primitive(shape: Shape) -> dict[str, str]:
 
 def rod(end: FloatArray) -> dict[str, str] | None:
     """Return a rod from a link's origin to `end` (3,) [m] in its frame; None where it would be too short."""
-    if np.linalg.norm(end) < _SHORTEST_ROD:
+    if np.linalg.norm(end) < PartSettings.shortest_rod_m:
         return None
-    return {"type": "capsule", "fromto": f"0 0 0 {texts(end)}", "size": texts(np.array([_ROD_RADIUS])), "rgba": _GREY}
+    size = texts(np.array([PartSettings.rod_radius_m]))
+    return {"type": "capsule", "fromto": f"0 0 0 {texts(end)}", "size": size, "rgba": _GREY}
 
 
 def placed(T: FloatArray) -> dict[str, str]:
@@ -126,7 +131,7 @@ def _inertia(inertial: Any) -> FloatArray:
         T[:3, :3] = rotation_of(_floats(origin.get("rpy", "0 0 0")))
         T[:3, 3] = _floats(origin.get("xyz", "0 0 0"))
     R = T[:3, :3] @ axes
-    return R @ np.diag(np.maximum(moments, LEAST_INERTIA)) @ R.T
+    return R @ np.diag(np.maximum(moments, PartSettings.least_inertia_kgm2)) @ R.T
 
 
 def _floats(text: str) -> FloatArray:
@@ -139,8 +144,9 @@ def _readable(file: Path) -> bool:
     if file.suffix.lower() != ".stl":
         return True
     with file.open("rb") as stream:
-        head = stream.read(_STL_HEADER)
-    if len(head) < _STL_HEADER:
+        head = stream.read(STL_HEAD_BYTES)
+    if len(head) < STL_HEAD_BYTES:
         return False
     (triangles,) = struct.unpack("<I", head[-4:])
-    return 0 < triangles <= _MOST_TRIANGLES and file.stat().st_size == _STL_HEADER + _STL_TRIANGLE * triangles
+    size = STL_HEAD_BYTES + STL_TRIANGLE.itemsize * triangles
+    return 0 < triangles <= PartSettings.most_triangles and file.stat().st_size == size

@@ -29,7 +29,7 @@ from bodyschema.interfaces.records import FloatArray
 from bodyschema.robot.urdf import MOVING, UrdfJoint, standing
 
 from .arm_errors import ArmErrors, numbers
-from .link_parts import LEAST_INERTIA, LinkParts, placed, rod, texts
+from .link_parts import LinkParts, PartSettings, placed, rod, texts
 
 MARKER, MEASUREMENT = "marker", "measurement_frame"
 LOOSE = "_gravity_backlash"
@@ -144,7 +144,7 @@ class _Document:
             inertiafromgeom="false",
             balanceinertia="true",
             boundmass="1e-6",
-            boundinertia=f"{LEAST_INERTIA:g}",
+            boundinertia=f"{PartSettings.least_inertia_kgm2:g}",
         )
         gravity = texts(np.array([0.0, 0.0, -GRAVITY_M_S2]))
         self._add(self._root, "option", timestep=f"{_Settings.step_s:g}", integrator="implicitfast", gravity=gravity)
@@ -181,7 +181,7 @@ class _Document:
     def _payloads(self, body: Any) -> None:
         for count, payload in enumerate(self._errors.payloads):
             held = self._add(body, "body", name=f"{self._robot.robot.marker_link}_payload_{count}")
-            centre, inertia = texts(payload.centre), texts(np.full(3, LEAST_INERTIA))
+            centre, inertia = texts(payload.centre), texts(np.full(3, PartSettings.least_inertia_kgm2))
             self._add(held, "inertial", pos=centre, mass=repr(payload.mass_kg), diaginertia=inertia)
 
     def _moves(self, joint: UrdfJoint) -> bool:

@@ -15,7 +15,7 @@ from kbmaps.chains.parameters import ChainParameters, ChainTolerances
 from kbmaps.errors import DegenerateDataError, ShapeError
 from kbmaps.maps.kbmap import POSITION_OUTPUTS, KBMap
 from kbmaps.pairs import checked_pairs
-from kbmaps.robust import ROUNDING_M, UNCALIBRATED_SIGMAS, middle_sigma
+from kbmaps.robust import RobustSettings, middle_sigma
 from kbmaps.rotations import cross_matrix, exponentials, nearest_rotation, rotation_vector
 
 
@@ -202,7 +202,7 @@ def _start_shift(fit: _Fit, sigma: float, turns: FloatArray | None) -> FloatArra
         _fit_robustly(trial, sigma, _Settings.trial_tolerance)
         spread = trial.spread(0.0)
         # A new start must be clearly better, so that rounding does not choose among equals.
-        if spread < 0.9 * best_spread - ROUNDING_M:
+        if spread < 0.9 * best_spread - RobustSettings.rounding_m:
             best, best_spread = trial.shift, spread
     return best
 
@@ -253,7 +253,7 @@ def _fit_robustly(fit: _Fit, sigma: float, tolerance: float = _Settings.step_tol
             break
     inliers = np.ones(len(fit.x), dtype=np.bool_)
     for _ in range(_Settings.rounds):
-        chosen = norms <= max(UNCALIBRATED_SIGMAS * fit.spread(sigma), ROUNDING_M)
+        chosen = norms <= max(RobustSettings.uncalibrated_sigmas * fit.spread(sigma), RobustSettings.rounding_m)
         step = fit.improve(chosen.astype(np.float64))
         norms = fit.norms()
         settled = bool((chosen == inliers).all()) and step < tolerance
@@ -349,7 +349,9 @@ def _robust_mean(offsets: FloatArray, sigma: float) -> FloatArray:
         distances = np.linalg.norm(offsets - centre, axis=1)
         # One pair is always explained by an offset.
         spread = max(middle_sigma(distances, len(distances) // 2 + 1), sigma)
-        mean = offsets[distances <= ROUNDING_M + UNCALIBRATED_SIGMAS * spread].mean(axis=0)
+        mean = offsets[distances <= RobustSettings.rounding_m + RobustSettings.uncalibrated_sigmas * spread].mean(
+            axis=0
+        )
         if (mean == centre).all():
             break
         centre = mean

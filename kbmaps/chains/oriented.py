@@ -20,12 +20,17 @@ from kbmaps.robust import MEDIAN_NORM
 from kbmaps.rotations import exponentials, nearest_rotation, rotation_matrices, rotation_vectors
 
 _KIND = "oriented chain, 1"
-# Number of candidate rotations of the marker on the hand to start from.
-_CANDIDATES = 64
-_STEPS = 8
-# Degrees of freedom of Student's t: a residual of many sigmas counts little, one within them nearly as in least
-# squares.
-_FREEDOM = 6.0
+
+
+class _Settings:
+    # Number of candidate rotations of the marker on the hand to start from.
+    candidates = 64
+    steps = 8
+    # Degrees of freedom of Student's t: a residual of many sigmas counts little, one within them nearly as in least
+    # squares.
+    freedom = 6.0
+
+
 # Lower bound of the noise of a measured orientation [rad]: below is rounding.
 _ROUNDING_RAD = float(np.sqrt(np.finfo(np.float64).eps))
 
@@ -144,7 +149,7 @@ def fitted_orientation(belief: ChainBelief, q: ArrayLike, rotation: ArrayLike) -
     if not len(angles):
         raise DegenerateDataError("there are no orientations to fit")
     fit = _Fit(belief, angles, measured)
-    for _ in range(_STEPS):
+    for _ in range(_Settings.steps):
         fit.step()
     return fit.result()
 
@@ -164,7 +169,7 @@ class _Fit:
         errors, columns = self._linearised()
         lengths = np.linalg.norm(errors, axis=1)
         noise = self._noise(lengths)
-        weights = (_FREEDOM + 3.0) / (_FREEDOM + np.square(lengths / noise))
+        weights = (_Settings.freedom + 3.0) / (_Settings.freedom + np.square(lengths / noise))
         shared = shared_by(errors[lengths <= 3.0 * MEDIAN_NORM * noise])
         scale = np.sqrt(weights / shared)[:, None] / noise
         free = len(self._chosen)
@@ -205,7 +210,7 @@ class _Fit:
 def _likely_turn(hand: FloatArray, measured: FloatArray) -> FloatArray:
     """Return the rotation, among those of single orientations, with the smallest median distance to the others."""
     turns = hand.swapaxes(1, 2) @ measured
-    tried = turns[evenly_spread(len(turns), _CANDIDATES)]
+    tried = turns[evenly_spread(len(turns), _Settings.candidates)]
     # tr(AᵀB) = 1 + 2 cos of the angle between them.
     traces = np.einsum("aij,bij->ab", tried, turns)
     return tried[int(np.median(traces, axis=1).argmax())]

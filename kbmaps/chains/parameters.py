@@ -14,13 +14,12 @@ from kbmaps.chains.chain import RigidChain
 from kbmaps.errors import ModelFormatError, SettingError
 from kbmaps.maps.code_path import FilterKernel, filter_kernel
 from kbmaps.packed import named, or_infinite, unless_infinite
-from kbmaps.rotations import SMALL_ANGLE, cross_matrix, exponentials
+from kbmaps.rotations import RotationSettings, cross_matrix, exponentials
 
 # Finite stand-in for an infinite tolerance [rad, m]: far beyond anything real, and still a proper prior.
 WIDE = 10.0
 _FIXED_PARAMETERS = 9
 _JOINT_PARAMETERS = 5
-_CONSTANTS = 7  # that the filter's kernel takes; its linearisation reads the small angle alone
 _EYE = np.eye(3)
 
 
@@ -303,7 +302,8 @@ class ChainParameters:
     def _kernel_of(self, columns: IntArray) -> FilterKernel | None:
         scales = np.zeros(self.size)
         scales[columns] = 1.0
-        return filter_kernel(*self.tables, scales, scales, np.full(_CONSTANTS, SMALL_ANGLE))
+        # Of the kernel's seven constants the linearisation reads the small angle alone.
+        return filter_kernel(*self.tables, scales, scales, np.full(7, RotationSettings.small_rad))
 
     def _positions(self, change: FloatArray, q: FloatArray) -> FloatArray:
         if self._kernel is not None:

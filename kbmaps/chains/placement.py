@@ -10,7 +10,7 @@ import numpy as np
 from kbmaps.arrays import BoolArray, FloatArray, IntArray
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.parameters import ChainParameters
-from kbmaps.robust import MEDIAN_NORM, ROUNDING_M
+from kbmaps.robust import MEDIAN_NORM, RobustSettings
 from kbmaps.rotations import cross_matrix, exponentials, rotation_vectors
 
 
@@ -109,7 +109,9 @@ class _Fitter:
         for k in range(_Settings.steps):
             reach = max(_Settings.first_reach * 0.5**k, _Settings.least_reach)
             distances = state.distances[active]
-            sigma = np.maximum(np.partition(distances, self._middle)[:, self._middle] / MEDIAN_NORM, ROUNDING_M)
+            sigma = np.maximum(
+                np.partition(distances, self._middle)[:, self._middle] / MEDIAN_NORM, RobustSettings.rounding_m
+            )
             scale = np.square(reach * sigma)[:, None]
             weights = np.repeat(np.square(scale / (scale + np.square(distances))), 3, axis=1) / sigma[:, None] ** 2
             tried = self._moved(state, active, self._step(state, active, weights, damping[active]))

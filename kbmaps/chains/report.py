@@ -9,8 +9,7 @@ import numpy as np
 
 from kbmaps.arrays import BoolArray, FloatArray, frozen
 from kbmaps.chains.parameters import ChainParameters
-
-_HALF_WIDTH_95 = 1.959964  # in standard deviations of a Gaussian
+from kbmaps.robust import HALF_WIDTH_95
 
 _DEG = math.degrees(1.0)
 _MM = 1e3
@@ -114,7 +113,7 @@ def chain_report(
     """
 
     def interval(part: slice) -> Interval:
-        return Interval(frozen(change[part]), frozen(_HALF_WIDTH_95 * deviation[part]))
+        return Interval(frozen(change[part]), frozen(HALF_WIDTH_95 * deviation[part]))
 
     names = parameters.names()
     return ChainReport(

@@ -15,21 +15,22 @@ from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.parameters import WIDE, ChainParameters, ChainTolerances
 from kbmaps.errors import NonFiniteError, SettingError, ShapeError
 from kbmaps.maps.code_path import FilterKernel, filter_kernel
-from kbmaps.robust import OUTLIER_SIGMAS
-from kbmaps.rotations import SMALL_ANGLE
+from kbmaps.robust import RobustSettings
+from kbmaps.rotations import RotationSettings
 
 # Squared Mahalanobis distance of an innovation beyond which a pair is down-weighted.
-_GATE = OUTLIER_SIGMAS * OUTLIER_SIGMAS
-# The noise estimate starts with the weight of this many coordinates, and forgets all but this many of the last ones.
-NOISE_COORDINATES, NOISE_MEMORY = 6.0, 900.0
-LEAST_NOISE_M = 1e-6  # no camera is better, and the formulas need a positive value
+_GATE = RobustSettings.outlier_sigmas * RobustSettings.outlier_sigmas
 _EYE = np.eye(3)
 
 
-class _Settings:
+class FilterSettings:
     tool_unit = 0.1  # scale of the marker's position where its tolerance is 0, so that a tool change can loosen it [m]
     # Relinearise, at most this often, while the last step's curvature may move the marker by this share of the noise.
     iterations, small_bend = 5, 0.1
+    # The noise estimate starts with the weight of this many coordinates, and forgets all but this many of the last
+    # ones.
+    noise_coordinates, noise_memory = 6.0, 900.0
+    least_noise_m = 1e-6  # no camera is better, and the formulas need a positive value
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +64,7 @@ class RigidFilter:
         tool = np.zeros(parameters.size, dtype=np.bool_)
         tool[parameters.tool] = True
         self._active = (std > 0.0) | tool
-        self._scales = np.where((std == 0.0) & tool, _Settings.tool_unit, std)[self._active]
+        self._scales = np.where((std == 0.0) & tool, FilterSettings.tool_unit, std)[self._active]
         self._bends = parameters.turning.astype(np.float64)[self._active]
         self._reach = parameters.reach
         self._kernel = self._filter_kernel()
@@ -76,7 +77,7 @@ class RigidFilter:
         self._covariance: FloatArray = np.diag(np.square(std[self._active] / self._scales))
         # the estimated variance [m²] of a coordinate of the pairs that came without their sigma
         self.noise_square = noise**2
-        self.noise_coordinates = NOISE_COORDINATES  # number of coordinates that this estimate rests on
+        self.noise_coordinates = FilterSettings.noise_coordinates  # number of coordinates that this estimate rests on
 
     @property
     def covariance(self) -> FloatArray:
@@ -155,8 +156,14 @@ class RigidFilter:
     def _filter_kernel(self) -> FilterKernel | None:
         scales = np.zeros(self.parameters.size)
         scales[self._active] = self._scales
-        of_steps = [_Settings.iterations, _Settings.small_bend, _GATE]
-        constants = [*of_steps, NOISE_MEMORY, LEAST_NOISE_M**2, SMALL_ANGLE, self._reach]
+        of_steps = [FilterSettings.iterations, FilterSettings.small_bend, _GATE]
+        constants = [
+            *of_steps,
+            FilterSettings.noise_memory,
+            FilterSettings.least_noise_m**2,
+            RotationSettings.small_rad,
+            self._reach,
+        ]
         return filter_kernel(
             *self.parameters.tables, scales, self.parameters.turning.astype(np.float64), np.array(constants)
         )
@@ -192,8 +199,8 @@ class RigidFilter:
         weight = distance / update.distance if distance > 0.0 else 1.0
         if weight < 1.0:
             update = self._update(self.change, np.zeros(len(self._scales)), q, x, noise_square, weight)
-        for _ in range(_Settings.iterations):
-            if update.bend <= _Settings.small_bend * math.sqrt(update.variance):
+        for _ in range(FilterSettings.iterations):
+            if update.bend <= FilterSettings.small_bend * math.sqrt(update.variance):
                 break
             update = self._update(self._moved(update.step), update.step, q, x, noise_square, weight)
         self.change = self._moved(update.step)
@@ -240,5 +247,5 @@ class RigidFilter:
         share = self.noise_square * float(np.trace(precision)) / 3.0
         total = self.noise_coordinates + 3.0 * share**2
         square = self.noise_square * (1.0 + share * (distance - 3.0) / total)
-        self.noise_square = max(square, LEAST_NOISE_M**2)
-        self.noise_coordinates = min(total, NOISE_MEMORY)
+        self.noise_square = max(square, FilterSettings.least_noise_m**2)
+        self.noise_coordinates = min(total, FilterSettings.noise_memory)

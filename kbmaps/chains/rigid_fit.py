@@ -12,7 +12,7 @@ from scipy.special import chdtrc  # pyright: ignore[reportMissingTypeStubs, repo
 from kbmaps.arrays import BoolArray, FloatArray
 from kbmaps.chains.belief import ChainBelief, squared
 from kbmaps.pairs import Pairs
-from kbmaps.robust import OUTLIER_SIGMAS, ROUNDING_M, middle_sigma
+from kbmaps.robust import RobustSettings, middle_sigma
 
 
 class _Settings:
@@ -111,7 +111,7 @@ class _Fitter:
         self._common = pairs.whitened(common)
         first = cast(FloatArray, np.linalg.solve(self.root, (start - prior.mean)[self.free]))
         self.point = self._at(np.concatenate([first, np.zeros(common.shape[2])]))
-        self.least_noise = 1.0 if pairs.known else ROUNDING_M / float(pairs.unit.min())
+        self.least_noise = 1.0 if pairs.known else RobustSettings.rounding_m / float(pairs.unit.min())
         self._damping = _Settings.first_damping
         # Residual coordinates that the parameters use up.
         self.used = float(min(len(self.point.offset), 3 * len(pairs)))
@@ -218,7 +218,7 @@ def _anneal(fitter: _Fitter) -> None:
 def _polish(fitter: _Fitter, before: NoiseKnowledge) -> RigidFit:
     pairs = fitter.pairs
     typical = fitter.typical()
-    inliers = fitter.point.norms <= OUTLIER_SIGMAS * typical
+    inliers = fitter.point.norms <= RobustSettings.outlier_sigmas * typical
     # Few pairs can be fitted with much noise or with little; a given noise is tried first.
     noise = 1.0 if pairs.known else typical
     freedom = 0.0
@@ -228,7 +228,7 @@ def _polish(fitter: _Fitter, before: NoiseKnowledge) -> RigidFit:
         square = float(np.square(fitter.point.norms[inliers]).sum())
         estimate = _told_noise(square, freedom) if pairs.known else _found_noise(square, freedom, before, fitter)
         distances = fitter.point.deletion_distances(inliers, pairs.unit * max(estimate, fitter.typical()))
-        chosen = distances <= OUTLIER_SIGMAS
+        chosen = distances <= RobustSettings.outlier_sigmas
         settled = bool((chosen == inliers).all()) and abs(estimate - noise) <= 1e-3 * noise
         inliers, noise = chosen, estimate
         if settled and step < _Settings.small_step * math.sqrt(1.0 + freedom):

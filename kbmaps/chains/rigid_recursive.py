@@ -22,7 +22,7 @@ from kbmaps.chains.parameters import (
     describe_tolerances,
     parse_tolerances,
 )
-from kbmaps.chains.rigid_filter import LEAST_NOISE_M, NOISE_COORDINATES, NOISE_MEMORY, RigidFilter
+from kbmaps.chains.rigid_filter import FilterSettings, RigidFilter
 from kbmaps.chains.rigid_fit import NOTHING_KNOWN, NoiseKnowledge, RigidFit, fit_chain, folded
 from kbmaps.errors import ModelFormatError, SettingError
 from kbmaps.model import Estimate, Model, near_data, widest
@@ -126,7 +126,7 @@ class RigidWindow:
         self.belief = folded(self.belief, pairs.chosen(good), fit.belief.mean, fit.noise)
         if not pairs.known:
             told = self.noise.coordinates + fit.freedom * count / self._count
-            self.noise = NoiseKnowledge(min(told, NOISE_MEMORY), fit.noise**2)
+            self.noise = NoiseKnowledge(min(told, FilterSettings.noise_memory), fit.noise**2)
         self._begun = True
         self._count -= count
         self._rows[: self._count] = self._rows[count : count + self._count].copy()
@@ -362,7 +362,9 @@ class RecursiveRigidLearner(Model):
         fit = self._window.fitted(self._filter.change)
         self._filter.go_on_from(fit.belief, fitted=True)
         if self._window.finds_noise:
-            self._filter.noise_square = max(fit.noise, LEAST_NOISE_M) ** 2
+            self._filter.noise_square = max(fit.noise, FilterSettings.least_noise_m) ** 2
             coordinates = fit.freedom + self._window.noise.coordinates
-            self._filter.noise_coordinates = float(np.clip(coordinates, NOISE_COORDINATES, NOISE_MEMORY))
+            self._filter.noise_coordinates = float(
+                np.clip(coordinates, FilterSettings.noise_coordinates, FilterSettings.noise_memory)
+            )
         return fit

@@ -13,7 +13,7 @@ from kbmaps.arrays import BoolArray, FloatArray, IntArray, matching_rows, requir
 from kbmaps.chains.chain import RigidChain
 from kbmaps.chains.parameters import tangents
 from kbmaps.errors import DegenerateDataError, SettingError, ShapeError
-from kbmaps.robust import ROUNDING_M
+from kbmaps.robust import RobustSettings
 from kbmaps.rotations import cross_matrix
 
 
@@ -250,9 +250,12 @@ def find_chain(
             f"{len(angles)} pairs cannot determine the {unknowns} unknowns of this chain; record {-(-unknowns // 3)}"
         )
     size = float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).mean())
-    if not size > ROUNDING_M:
+    if not size > RobustSettings.rounding_m:
         raise DegenerateDataError("all positions lie in one place; record pairs that spread out")
-    enough = max(ROUNDING_M, _Settings.explained * (sigma or 0.0) * math.sqrt(max(3.0 - unknowns / len(angles), 0.0)))
+    enough = max(
+        RobustSettings.rounding_m,
+        _Settings.explained * (sigma or 0.0) * math.sqrt(max(3.0 - unknowns / len(angles), 0.0)),
+    )
     return _best_of(angles, positions, slides, size, rng, starts, enough)
 
 

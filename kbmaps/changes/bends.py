@@ -12,10 +12,10 @@ from scipy.special import ive  # pyright: ignore[reportMissingTypeStubs, reportU
 
 from kbmaps.arrays import FloatArray, IntArray
 from kbmaps.changes.kinds import log_ratios
-from kbmaps.robust import CLIPPED_SIGMAS
+from kbmaps.robust import RobustSettings
 
 
-class _Settings:
+class BendSettings:
     # Correlation length of a bend [rad of all joints together], its size over the noise of a pair, the marker's motion
     # from a joint's own error over that noise, and the noise over its nominal value. All are equally probable, except
     # an arm without bends and such errors, which is as probable as all others together.
@@ -44,10 +44,11 @@ class _Settings:
     # A pair far from the median of this many neighbours is clipped. Where more than half of them moved together, the
     # median moved as well.
     neighbours = 5
+    most_pairs: int = 1200  # maximum number of pairs, the newest ones, that are evaluated
 
 
 # Log evidence of other pairs about bends of each length, without any such pairs.
-NOTHING_SEEN = (0.0,) * len(_Settings.lengths)
+NOTHING_SEEN = (0.0,) * len(BendSettings.lengths)
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +102,7 @@ class Runs:
         on_circles = np.concatenate([np.cos(self.angles), np.sin(self.angles)], axis=1)
         alike, lengths = on_circles @ on_circles.T - self.angles.shape[1], self.lengths
         found = list[tuple[FloatArray, FloatArray]]()
-        for length in _Settings.lengths:
+        for length in BendSettings.lengths:
             kernel = np.exp(alike / length**2)
             summed = np.add.reduceat(np.add.reduceat(kernel, self.starts, axis=0), self.starts, axis=1)
             values, axes = np.linalg.eigh(summed / np.sqrt(lengths * lengths[:, None]))
@@ -140,7 +141,7 @@ def log_evidence(runs: Runs) -> list[FloatArray]:
         logs = 1.5 * np.log(weights).sum(axis=1) - 0.5 * runs.within / noises - alone * np.log(noises)
         crossed = sums[:, :known, known:]
         of_length: list[FloatArray] = []
-        for turn in _Settings.turns:
+        for turn in BendSettings.turns:
             prior = _prior(runs, k, turn)
             precision = sums[:, :known, :known] + prior[:, None] * np.eye(known)
             left = sums[:, known:, known:] - crossed.transpose(0, 2, 1) @ np.linalg.solve(precision, crossed)
@@ -156,15 +157,20 @@ def probable_bends(runs: Runs, before: Sequence[FloatArray | float]) -> list[Ben
     logs = [now + past + _log_prior(k) for k, (now, past) in enumerate(evidence)]
     total = np.logaddexp.reduce(np.concatenate(logs))
     return [
-        _chosen(runs, k, each - total) for k, each in enumerate(logs) if (each - total > np.log(_Settings.least)).any()
+        _chosen(runs, k, each - total)
+        for k, each in enumerate(logs)
+        if (each - total > np.log(BendSettings.least)).any()
     ]
 
 
 def _chosen(runs: Runs, k: int, logs: FloatArray) -> Bends:
     values, axes = runs.axes[k]
-    probable = np.flatnonzero(logs > np.log(_Settings.least))
+    probable = np.flatnonzero(logs > np.log(BendSettings.least))
     every = _weights(k, values)[0]
-    weights, priors = every[probable % len(every)], np.concatenate([_prior(runs, k, turn) for turn in _Settings.turns])
+    weights, priors = (
+        every[probable % len(every)],
+        np.concatenate([_prior(runs, k, turn) for turn in BendSettings.turns]),
+    )
     turned = np.tensordot(axes.T, runs.rows[..., :-1], axes=1)
     known = np.empty((len(probable), turned.shape[2], turned.shape[0] * 3))
     for h, (prior, weight) in enumerate(zip(priors[probable], weights, strict=True)):
@@ -177,31 +183,33 @@ def _chosen(runs: Runs, k: int, logs: FloatArray) -> Bends:
 def _log_prior(k: int) -> FloatArray:
     """Return the log prior of each hypothesis (h,) of the k-th length, not normalised."""
     sizes, turns = (
-        np.tile(_sizes(k), len(_Settings.turns) * len(_Settings.noises)),
-        np.repeat(_Settings.turns, len(_Settings.noises) * len(_sizes(k))),
+        np.tile(_sizes(k), len(BendSettings.turns) * len(BendSettings.noises)),
+        np.repeat(BendSettings.turns, len(BendSettings.noises) * len(_sizes(k))),
     )
     # A bend of size zero has no length: it counts once for each length.
-    shares = np.where(sizes == 0.0, float(len(_Settings.lengths)), 1.0)
-    return np.log(np.where(sizes + turns == 0.0, shares * (len(_Settings.bends) * len(_Settings.turns) - 1.0), shares))
+    shares = np.where(sizes == 0.0, float(len(BendSettings.lengths)), 1.0)
+    return np.log(
+        np.where(sizes + turns == 0.0, shares * (len(BendSettings.bends) * len(BendSettings.turns) - 1.0), shares)
+    )
 
 
 def _sizes(k: int) -> FloatArray:
-    return np.array(_Settings.bends if k == 0 else _Settings.bends[1:])
+    return np.array(BendSettings.bends if k == 0 else BendSettings.bends[1:])
 
 
 def _weights(k: int, values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return inverse variances of runs (h, m) for each noise with each size of a bend, and the noises squared (h,)."""
-    noises = np.repeat(np.square(_Settings.noises), len(_sizes(k)))
-    sizes = np.tile(np.square(_sizes(k)), len(_Settings.noises))
+    noises = np.repeat(np.square(BendSettings.noises), len(_sizes(k)))
+    sizes = np.tile(np.square(_sizes(k)), len(BendSettings.noises))
     return 1.0 / (noises[:, None] * (1.0 + sizes[:, None] * values)), noises
 
 
 def _prior(runs: Runs, k: int, turn: float) -> FloatArray:
     """Return the prior precision (h, p) of the known parameters and joints' own errors, for each noise and bend."""
-    squares = np.tile(np.square(_sizes(k)), len(_Settings.noises)) + turn**2
-    left_open = np.full(len(squares), _Settings.open**2) if runs.fitted else 1.0 + _Settings.taken_along * squares
+    squares = np.tile(np.square(_sizes(k)), len(BendSettings.noises)) + turn**2
+    left_open = np.full(len(squares), BendSettings.open**2) if runs.fitted else 1.0 + BendSettings.taken_along * squares
     known = np.repeat(1.0 / left_open[:, None], runs.known, axis=1)
-    own = np.full((len(known), runs.rows.shape[2] - 1 - runs.known), max(turn, _Settings.none) ** -2.0)
+    own = np.full((len(known), runs.rows.shape[2] - 1 - runs.known), max(turn, BendSettings.none) ** -2.0)
     return np.concatenate([known, own], axis=1)
 
 
@@ -212,14 +220,11 @@ def _own_errors(angles: FloatArray, turning: FloatArray) -> FloatArray:
     function I_n.
     """
     columns: list[FloatArray] = []
-    for wave in range(1, _Settings.harmonics + 1):
-        share = 2.0 * float(ive(wave, _Settings.own_length**-2.0))
+    for wave in range(1, BendSettings.harmonics + 1):
+        share = 2.0 * float(ive(wave, BendSettings.own_length**-2.0))
         for of_angle in (np.cos, np.sin):
             columns.append(np.sqrt(share) * of_angle(wave * angles)[:, None] * turning)
     return np.concatenate(columns, axis=2)
-
-
-MOST_PAIRS = 1200  # maximum number of pairs, the newest ones, that are evaluated
 
 
 def log_ratios_if_it_bends(
@@ -241,7 +246,7 @@ def log_ratios_if_it_bends(
     and ℓ and the noise are weighted by their probability given all pairs without a change.
 
     Args:
-        angles: configurations (n, d) [rad, or for a prismatic joint the equivalent], n at most `MOST_PAIRS`.
+        angles: configurations (n, d) [rad, or for a prismatic joint the equivalent], at most `BendSettings.most_pairs`.
         errors: of a model that knows none of the pairs, in units of their noise (n, 3).
         known: their derivatives by the known parameters, whose prior is of variance 1 (n, 3, k).
         turning: by each joint, such that 1 moves the marker by about the noise (n, 3, d).
@@ -255,7 +260,7 @@ def log_ratios_if_it_bends(
         Onsets (t,), ascending, the number of pairs that each stands for, and the ratios (t, kinds).
     """
     pairs, errors = len(angles), _without_outliers(errors)
-    ages = _ages(pairs, _Settings.run_share, _Settings.longest_run)
+    ages = _ages(pairs, BendSettings.run_share, BendSettings.longest_run)
     starts = np.array(sorted({suspected, *(pairs - age for age in ages)}))
     runs = Runs.of(angles, known, turning, errors, starts, fitted=False)
     bends = probable_bends(runs, before)
@@ -278,7 +283,7 @@ def log_evidence_of_bends(
 
     Arguments as in `log_ratios_if_it_bends`.
     """
-    starts = np.arange(0, len(angles), _Settings.longest_run)
+    starts = np.arange(0, len(angles), BendSettings.longest_run)
     return log_evidence(Runs.of(angles, known, turning, _without_outliers(errors), starts, fitted=True))
 
 
@@ -296,14 +301,14 @@ def _compared(sums: FloatArray, places: Sequence[slice], sizes: FloatArray) -> F
 
 def _without_outliers(errors: FloatArray) -> FloatArray:
     """Return errors (n, 3) in units of their noise, clipped to lie near their neighbours."""
-    if len(errors) < _Settings.neighbours:
+    if len(errors) < BendSettings.neighbours:
         return errors
-    middles = np.median(np.lib.stride_tricks.sliding_window_view(errors, _Settings.neighbours, axis=0), axis=2)
-    ends = (_Settings.neighbours // 2, _Settings.neighbours // 2)
+    middles = np.median(np.lib.stride_tricks.sliding_window_view(errors, BendSettings.neighbours, axis=0), axis=2)
+    ends = (BendSettings.neighbours // 2, BendSettings.neighbours // 2)
     middles = np.pad(middles, (ends, (0, 0)), mode="edge")
     off = errors - middles
     far = np.linalg.norm(off, axis=1, keepdims=True)
-    return middles + off * np.minimum(1.0, CLIPPED_SIGMAS / np.maximum(far, 1e-300))
+    return middles + off * np.minimum(1.0, RobustSettings.clipped_sigmas / np.maximum(far, 1e-300))
 
 
 def _ages(pairs: int, share: float, longest: int) -> list[int]:
@@ -318,7 +323,7 @@ def _apart(starts: IntArray, pairs: int, suspected: int) -> IntArray:
     """Return starts (m,) that are far enough apart for their age, with the newest, the first and the suspected one."""
     kept = [int(starts[-1])]
     for start in starts[-2::-1].tolist():
-        age, next_age = pairs - start, (1.0 + _Settings.spacing) * (pairs - kept[-1])
-        if age <= _Settings.each or age >= next_age or start in (starts[0], suspected):
+        age, next_age = pairs - start, (1.0 + BendSettings.spacing) * (pairs - kept[-1])
+        if age <= BendSettings.each or age >= next_age or start in (starts[0], suspected):
             kept.append(start)
     return np.array(kept[::-1])

@@ -11,14 +11,14 @@ import numpy as np
 
 from kbmaps.arrays import FloatArray, IntArray
 from kbmaps.chains.belief import ChainBelief
-from kbmaps.changes.bends import MOST_PAIRS, NOTHING_SEEN, log_evidence_of_bends, log_ratios_if_it_bends
-from kbmaps.changes.kinds import JOINT, SIZES, ChangeKind, change_kinds, log_ratios
+from kbmaps.changes.bends import NOTHING_SEEN, BendSettings, log_evidence_of_bends, log_ratios_if_it_bends
+from kbmaps.changes.kinds import JOINT, ChangeKind, KindSettings, change_kinds, log_ratios
 from kbmaps.changes.white_noise import SharedNoise
-from kbmaps.robust import CLIPPED_SIGMAS
+from kbmaps.robust import RobustSettings
 from kbmaps.variance_components import inverse_roots
 
 
-class _Settings:
+class DetectorSettings:
     # Each of the newest pairs may be the first of a change; older onsets are thinned to this share of their age.
     spacing: float = 0.15
     slots: int = 96
@@ -33,6 +33,9 @@ class _Settings:
     look_every: int = 5
     strange_sigmas: float = 3.0
     look_closely: float = 4.0
+    # Minimum average number of pairs between two false alarms, if the model's uncertainty is correct.
+    pairs_between_false_alarms: float = 75_000.0
+    most_surprises: int = 3000  # number of the newest errors that are kept
 
 
 class Onsets:
@@ -46,12 +49,12 @@ class Onsets:
     def __init__(self, known: int, changes: int) -> None:
         self._crossed, self._information = np.zeros((known, changes)), np.zeros((changes, changes))
         self._score = np.zeros(changes)
-        self._crossed_before = np.zeros((_Settings.slots, known, changes))
-        self._information_before = np.zeros((_Settings.slots, changes, changes))
-        self._score_before = np.zeros((_Settings.slots, changes))
-        self._onset = np.zeros(_Settings.slots, dtype=np.intp)
+        self._crossed_before = np.zeros((DetectorSettings.slots, known, changes))
+        self._information_before = np.zeros((DetectorSettings.slots, changes, changes))
+        self._score_before = np.zeros((DetectorSettings.slots, changes))
+        self._onset = np.zeros(DetectorSettings.slots, dtype=np.intp)
         self._slots: list[int] = []
-        self._free = list(range(_Settings.slots))
+        self._free = list(range(DetectorSettings.slots))
         self.pairs = 0
 
     @property
@@ -87,16 +90,11 @@ class Onsets:
         """Drop the newest onset, except the first, whose neighbours are near enough to each other for their age."""
         for k in range(len(self._slots) - 2, 0, -1):
             before, after = self._onset[self._slots[k - 1]], self._onset[self._slots[k + 1]]
-            if after - before <= _Settings.spacing * (self.pairs - after):
+            if after - before <= DetectorSettings.spacing * (self.pairs - after):
                 self._free.append(self._slots.pop(k))
                 return
         if not self._free:
             self._free.append(self._slots.pop(1))
-
-
-# Minimum average number of pairs between two false alarms, if the model's uncertainty is correct.
-PAIRS_BETWEEN_FALSE_ALARMS = 75_000.0
-MOST_SURPRISES = 3000  # number of the newest errors that are kept
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +103,7 @@ class ChangeScore:
 
     Attributes:
         log_odds: logarithm of the Shiryaev-Roberts statistic: of all likelihood ratios together.
-        alarm: True if that exceeds the limit set by `PAIRS_BETWEEN_FALSE_ALARMS`.
+        alarm: True if that exceeds the limit set by `DetectorSettings.pairs_between_false_alarms`.
         onsets: candidate first pairs (m,) of the change, counted from the detector's first.
         shares: probability of each onset (m,), given a change.
         kinds: probability of each kind (k,), in the order of the detector's kinds, given a change.
@@ -160,7 +158,7 @@ class ChangeDetector:
         noise: SharedNoise,
         noise_m: float,
         distance_m: float,
-        pairs_between_false_alarms: float = PAIRS_BETWEEN_FALSE_ALARMS,
+        pairs_between_false_alarms: float = DetectorSettings.pairs_between_false_alarms,
     ) -> None:
         self._belief, self._noise = belief, noise
         self._root = belief.root[:, np.square(belief.root).any(axis=0)]
@@ -171,15 +169,15 @@ class ChangeDetector:
         self._zeros = np.array([end - 1 for end, kind in zip(ends, self.kinds, strict=True) if kind.name == JOINT])
         self._places = [slice(end - len(kind.columns), end) for kind, end in zip(self.kinds, ends, strict=True)]
         self._log_shares = np.log([kind.share for kind in self.kinds])
-        self._noise_m, self._sizes = noise_m, noise_m * np.array(SIZES)
+        self._noise_m, self._sizes = noise_m, noise_m * np.array(KindSettings.sizes)
         self._limit = self.log_limit(pairs_between_false_alarms)
         known = self._root.shape[1]
         # A root of the covariance: the difference of two covariances would lose all digits after thousands of pairs.
         self._posterior_root, self._mean = np.eye(known), np.zeros(known)
         self._onsets = Onsets(known, len(self._columns))
-        self._differences: deque[float] = deque(maxlen=_Settings.recent)
-        self._surprises: deque[FloatArray] = deque(maxlen=MOST_SURPRISES)
-        self._rows: deque[tuple[FloatArray, FloatArray, FloatArray, FloatArray]] = deque(maxlen=MOST_PAIRS)
+        self._differences: deque[float] = deque(maxlen=DetectorSettings.recent)
+        self._surprises: deque[FloatArray] = deque(maxlen=DetectorSettings.most_surprises)
+        self._rows: deque[tuple[FloatArray, FloatArray, FloatArray, FloatArray]] = deque(maxlen=BendSettings.most_pairs)
         self._strange, self._looked_at, self._log_odds = False, 0, -math.inf
         self._fitted: tuple[FloatArray, FloatArray, FloatArray] | None = None
         self._bends_before: list[FloatArray] | None = None
@@ -187,7 +185,7 @@ class ChangeDetector:
     @staticmethod
     def log_limit(pairs_between_false_alarms: float) -> float:
         """Return the log odds above which there is an alarm."""
-        return math.log(_Settings.overshoot * pairs_between_false_alarms)
+        return math.log(DetectorSettings.overshoot * pairs_between_false_alarms)
 
     @property
     def pairs(self) -> int:
@@ -201,7 +199,7 @@ class ChangeDetector:
 
     @property
     def surprises(self) -> FloatArray:
-        """Whitened errors (n, 3) of the newest pairs, n at most `MOST_SURPRISES`.
+        """Whitened errors (n, 3) of the newest pairs, n at most `DetectorSettings.most_surprises`.
 
         Each is against the prediction from the pairs before it. They are in units of the noise: the model's own
         uncertainty is taken out.
@@ -247,13 +245,13 @@ class ChangeDetector:
         covariance = seen @ seen.T
         spread = math.sqrt(self._noise.single + float(np.trace(covariance)) / 3.0)
         off = error - expected
-        off = off * min(1.0, CLIPPED_SIGMAS * spread / max(float(np.linalg.norm(off)), 1e-300))
+        off = off * min(1.0, RobustSettings.clipped_sigmas * spread / max(float(np.linalg.norm(off)), 1e-300))
         if self._surprises:
             apart = float(np.square(off * math.sqrt(self._noise.single) / spread - self._surprises[-1]).mean()) / 2.0
             self._differences.append(apart)
         self._surprises.append(off * math.sqrt(self._noise.single) / spread)
         error = expected + off
-        self._strange = float(np.linalg.norm(off)) > _Settings.strange_sigmas * spread
+        self._strange = float(np.linalg.norm(off)) > DetectorSettings.strange_sigmas * spread
         self._onsets.add(known.T @ changed, changed.T @ changed, changed.T @ error)
         step = np.linalg.solve(covariance + self._noise.whole * np.eye(3), seen)
         self._mean = self._mean + self._posterior_root @ (off @ step)
@@ -264,8 +262,10 @@ class ChangeDetector:
     @property
     def due(self) -> bool:
         """True if `suspicion` may have grown enough to be worth evaluating."""
-        late = self.pairs - self._looked_at >= _Settings.look_every
-        return self.pairs > self._looked_at and (late or self._strange or self._log_odds > _Settings.look_closely)
+        late = self.pairs - self._looked_at >= DetectorSettings.look_every
+        return self.pairs > self._looked_at and (
+            late or self._strange or self._log_odds > DetectorSettings.look_closely
+        )
 
     def sums(self) -> tuple[IntArray, FloatArray, FloatArray]:
         """Return the information about all possible changes in the pairs since each onset (m,).
@@ -333,7 +333,7 @@ class ChangeDetector:
 
     def _grown_noise(self) -> SharedNoise:
         """Return the noise, or more where the newest pairs scatter more: that is not a change of the arm."""
-        if len(self._differences) < _Settings.recent:
+        if len(self._differences) < DetectorSettings.recent:
             return self._noise
-        chance = 1.0 + _Settings.clearly * math.sqrt(1.0 / _Settings.recent)
+        chance = 1.0 + DetectorSettings.clearly * math.sqrt(1.0 / DetectorSettings.recent)
         return self._noise.times(max(1.0, float(np.mean(self._differences)) / (self._noise.single * chance)))

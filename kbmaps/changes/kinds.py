@@ -12,10 +12,18 @@ import numpy as np
 from kbmaps.arrays import FloatArray, IntArray, evenly_spread
 from kbmaps.chains.belief import ChainBelief
 from kbmaps.chains.parameters import ChainParameters
-from kbmaps.robust import OUTLIER_SIGMAS
+from kbmaps.robust import RobustSettings
 
-# Sizes of a change over the noise of one measurement, equally probable: from a fraction of it to far beyond it.
-SIZES = (0.5, 2.5, 12.0, 60.0)
+
+class KindSettings:
+    # Sizes of a change over the noise of one measurement, equally probable: from a fraction of it to far beyond it.
+    sizes = (0.5, 2.5, 12.0, 60.0)
+    # A change of everything is seldom what happened if a change of one part explains the pairs as well.
+    other_share = 0.001
+    # Maximum number of pairs, evenly spread. They are not weighted up for the others: their noise would look like a
+    # change of everything.
+    most_pairs = 400
+    steps = 6
 
 
 def log_ratios(information: FloatArray, score: FloatArray, sizes: FloatArray) -> FloatArray:
@@ -45,8 +53,6 @@ def log_ratios(information: FloatArray, score: FloatArray, sizes: FloatArray) ->
 
 
 TOOL, CAMERA, JOINT, OTHER = "tool", "camera", "joint", "other"
-# A change of everything is seldom what happened if a change of one part explains the pairs as well.
-_OTHER_SHARE = 0.001
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,13 +96,7 @@ def change_kinds(parameters: ChainParameters, distance_m: float) -> tuple[Change
 def any_change(parameters: ChainParameters) -> ChangeKind:
     """Return the change of everything at once, for a change that no single part explains."""
     units = np.where(parameters.turning, 1.0 / parameters.reach, 1.0) / math.sqrt(parameters.size / 3.0)
-    return ChangeKind(OTHER, None, np.arange(parameters.size), units, _OTHER_SHARE)
-
-
-# Maximum number of pairs, evenly spread. They are not weighted up for the others: their noise would look like a change
-# of everything.
-MOST_PAIRS = 400
-_STEPS = 6
+    return ChangeKind(OTHER, None, np.arange(parameters.size), units, KindSettings.other_share)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,9 +132,9 @@ def explanations(
         noise_m: 1-sigma of a coordinate [m].
         shared: number of neighbours that carry as much information as one independent pair.
     """
-    chosen = evenly_spread(len(q), MOST_PAIRS)
+    chosen = evenly_spread(len(q), KindSettings.most_pairs)
     q, x, counted = q[chosen], x[chosen], 1.0 / shared
-    sizes = noise_m * np.array(SIZES)
+    sizes = noise_m * np.array(KindSettings.sizes)
     fits = [_fit(before, kind, q, x, noise_m, counted, float(sizes[-1])) for kind in kinds]
     # A barely visible change of everything is indistinguishable from the prior uncertainty, so small sizes are left
     # out.
@@ -181,14 +181,14 @@ def _fit(
     to_change[kind.columns, known + np.arange(size)] = kind.units
     prior = np.r_[np.ones(known), np.full(size, widest**-2.0)]
     numbers = np.zeros(known + size)
-    limit = OUTLIER_SIGMAS
-    for step in range(_STEPS):
+    limit = RobustSettings.outlier_sigmas
+    for step in range(KindSettings.steps):
         predicted, jacobian = before.parameters.linearised(before.mean + to_change @ numbers, q)
         design = (jacobian @ to_change) / noise_m
         off = (x - predicted) / noise_m
         far = np.linalg.norm(off, axis=1)
         # The limit starts wide, since nothing is fitted yet, and ends as a hard cut.
-        wide = limit if step >= _STEPS // 2 else max(limit, 3.0 * float(np.median(far)))
+        wide = limit if step >= KindSettings.steps // 2 else max(limit, 3.0 * float(np.median(far)))
         weights = counted * (far <= wide)
         normal = _squared(design, weights) + np.diag(prior)
         slope = (design * weights[:, None, None]).reshape(-1, len(prior)).T @ off.ravel() - prior * numbers
@@ -209,12 +209,12 @@ def _described(
     predicted, jacobian = before.parameters.linearised(before.mean + to_change @ numbers, q)
     design = (jacobian @ to_change) / noise_m
     squares = np.square((x - predicted) / noise_m).sum(axis=1)
-    weights = counted * (squares <= OUTLIER_SIGMAS**2)
+    weights = counted * (squares <= RobustSettings.outlier_sigmas**2)
     normal = _squared(design, weights)
     of_known = normal[:known, :known] + np.eye(known)
     crossed = normal[:known, known:]
     information = normal[known:, known:] - crossed.T @ cast(FloatArray, np.linalg.solve(of_known, crossed))
-    cost = 0.5 * counted * float(np.minimum(squares, OUTLIER_SIGMAS**2).sum())
+    cost = 0.5 * counted * float(np.minimum(squares, RobustSettings.outlier_sigmas**2).sum())
     cost += 0.5 * float(numbers[:known] @ numbers[:known])
     _, log_det = np.linalg.slogdet(of_known)
     unchanged = before.parameters.positions(before.mean + to_change[:, :known] @ numbers[:known], q)

@@ -12,8 +12,6 @@ from scipy.special import ndtr, stdtrit  # pyright: ignore[reportMissingTypeStub
 from kbmaps.arrays import FloatArray, frozen
 from kbmaps.variance_components import in_typical_units, most_probable_shares
 
-_FEWEST = 10  # minimum number of pairs for each estimated variance
-
 
 @dataclass(frozen=True, eq=False)
 class WhiteNoise:
@@ -59,7 +57,7 @@ class WhiteNoise:
             derivatives: of the positions by the joints (n, 3, d) [m/rad, or 1 for a prismatic joint].
         """
         joints = derivatives.shape[2]
-        if len(errors) - 1 < _FEWEST * (joints + 2):
+        if len(errors) - 1 < _Settings.fewest_a_variance * (joints + 2):
             return cls.as_claimed(joints)
         off = np.diff(errors, axis=0) * np.sqrt(0.5)
         alike = np.broadcast_to(np.eye(3), (len(errors), 1, 3, 3))
@@ -97,6 +95,7 @@ class _Settings:
     # Lower bound: residuals of 0 determine no variance, and no model is this much better than its claim.
     least: float = 1e-12
     most_taken: float = 0.8  # a fit absorbs at most this share of the error that neighbours share
+    fewest_a_variance: int = 10  # minimum number of pairs for each estimated variance
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,9 +9,6 @@ import numpy as np
 
 from kbmaps.arrays import BoolArray, FloatArray
 
-_ROUNDING_SLOPE = 1e-10
-_ROUNDS_A_JOINT = 6
-
 
 class _Settings:
     # The damping is this share of the error's square, times a factor adapted to the gain of the last steps.
@@ -28,6 +25,8 @@ class _Settings:
     settled: float = 1e-6
     least_portion: float = 1e-3
     corrections: int = 4
+    rounding_slope: float = 1e-10
+    rounds_a_joint: int = 6
 
 
 class Goal(Protocol):
@@ -169,7 +168,7 @@ def bounded_step(
     if (step == trial).all():
         return step
     free = step == trial
-    for _ in range(_ROUNDS_A_JOINT * len(preferred)):
+    for _ in range(_Settings.rounds_a_joint * len(preferred)):
         base = np.where(free, preferred, step)
         trial = _unbounded_step(jacobian, wanted, damping_square, base, scale, free)
         inside = np.clip(trial, low, high)
@@ -188,7 +187,7 @@ def bounded_step(
         slope = damping_square * (step - preferred) / scale - scale * (jacobian.T @ (wanted - jacobian @ step))
         gain = np.where(free | (low == high), 0.0, np.where(step <= low, -slope, slope))
         best = int(gain.argmax())
-        if gain[best] <= _ROUNDING_SLOPE * float(np.abs(slope).max()):
+        if gain[best] <= _Settings.rounding_slope * float(np.abs(slope).max()):
             break
         free[best] = True
     return step

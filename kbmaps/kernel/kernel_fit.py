@@ -18,10 +18,10 @@ from kbmaps.arrays import FloatArray
 from kbmaps.errors import SettingError
 from kbmaps.maps.basis import JointBasis
 from kbmaps.maps.evidence import LinearEvidence, most_evident
-from kbmaps.maps.exact import SEARCH_LIMITS
+from kbmaps.maps.exact import ExactSettings
 from kbmaps.maps.factor import ShiftedGram
 from kbmaps.maps.stack import BasisStack
-from kbmaps.robust import VARIANCE_FLOOR
+from kbmaps.robust import RobustSettings
 
 
 class ProductKernel:
@@ -113,7 +113,7 @@ class KernelFit:
             return
         if isinstance(precision, str):
             mean = self._gram.trace / len(observations.scale)
-            low, high = (limit * mean for limit in SEARCH_LIMITS)
+            low, high = (limit * mean for limit in ExactSettings.search_limits)
             # With few pairs, the evidence may be flat towards τ = 0, a prior mean that is right everywhere. A density
             # of τ that is flat there (Gelman 2006) keeps τ, and so the predicted uncertainty, at the value that the
             # pairs support.
@@ -216,7 +216,7 @@ class KernelFit:
         self.precision, self.noise_variance, self.log_evidence = 0.0, 0.0, None
         # At λ = 0 the evidence is greatest at this variance of the coefficients.
         square = float(np.vdot(errors, self._multipliers)) / (3.0 * self._seen.count)
-        self.prior_variance = max(square, VARIANCE_FLOOR)
+        self.prior_variance = max(square, RobustSettings.variance_floor)
 
 
 def _parts(weights: FloatArray) -> list[FloatArray]:

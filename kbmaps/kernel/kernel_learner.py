@@ -160,7 +160,13 @@ def _last(old: FloatArray, new: FloatArray, kept: int) -> FloatArray:
 
 
 _KIND = "kernel learner, 1"
-_ROUNDING = 1e-11  # rounding of positions, relative to the largest coordinate
+
+
+class _Settings:
+    rounding = 1e-11  # rounding of positions, relative to the largest coordinate
+    # Step of slopes [rad, m]: large enough that rounding costs only two digits, small enough for a map that is not
+    # exactly of this form.
+    slope_step = 1e-2
 
 
 _THIRD_OF_A_TURN = 2.0 * math.pi / 3.0
@@ -200,10 +206,6 @@ def _nodes(basis: JointBasis) -> FloatArray:
     return centre + min(reach, _THIRD_OF_A_TURN) * np.array([-1.0, 0.0, 1.0])
 
 
-# Large enough that rounding costs only two digits, small enough for a map that is not exactly of this form.
-_STEP = 1e-2
-
-
 def slopes(model: Predictor, q: ArrayLike, bases: Sequence[JointBasis]) -> FloatArray:
     """Return the derivative (3, d) [m/rad, or m/m] of a model's positions at q (d,), or (n, 3, d) at q (n, d).
 
@@ -211,10 +213,12 @@ def slopes(model: Predictor, q: ArrayLike, bases: Sequence[JointBasis]) -> Float
     form; likewise with 2 h for a prismatic joint.
     """
     angles = rows_or_vector("q", q, len(bases))
-    steps = _STEP * np.eye(len(bases))
+    steps = _Settings.slope_step * np.eye(len(bases))
     flat = angles.reshape(-1, 1, len(bases))
     ahead, behind = (model.predict((flat + way * steps).reshape(-1, len(bases))) for way in (1.0, -1.0))
-    lengths = np.array([2.0 * (_STEP if basis.is_prismatic else math.sin(_STEP)) for basis in bases])
+    lengths = np.array(
+        [2.0 * (_Settings.slope_step if basis.is_prismatic else math.sin(_Settings.slope_step)) for basis in bases]
+    )
     columns = (ahead - behind).reshape(len(flat), len(bases), 3) / lengths[:, None]
     return columns.swapaxes(1, 2).reshape(*angles.shape[:-1], 3, len(bases))
 
@@ -406,7 +410,7 @@ class KernelLearner(Model):
 
 def _same(x: FloatArray, other: FloatArray) -> bool:
     """Return True if positions (n, 3) are the same up to the rounding of other batches."""
-    return bool((np.abs(x - other) <= _ROUNDING * np.abs(other).max(initial=0.0)).all())
+    return bool((np.abs(x - other) <= _Settings.rounding * np.abs(other).max(initial=0.0)).all())
 
 
 def _parse_precision(value: Any) -> Precision:

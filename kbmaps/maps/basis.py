@@ -32,10 +32,14 @@ PARAMETER_NAMES: Mapping[BasisKind, tuple[str, ...]] = {
     "prismatic_orthonormal": ("low", "high", "scale"),
 }
 
-SINGULAR_ALPHA = (math.radians(80.0), math.radians(100.0))
+
+class BasisSettings:
+    singular_alpha_rad = (math.radians(80.0), math.radians(100.0))
+    scale = 0.7
+
+
 # Rounding of degrees to radians must not let 80 or 100 degrees through.
 _ANGLE_ROUNDING = math.ulp(math.pi)
-DEFAULT_SCALE = 0.7
 
 
 class Terms(NamedTuple):
@@ -52,7 +56,11 @@ class Terms(NamedTuple):
 def _bernstein(alpha: float, centre: float) -> Terms:
     if not 0.0 < alpha < math.pi:
         raise BasisError(f"alpha must lie between 0 and 180 deg, got {math.degrees(alpha):.6g} deg")
-    if SINGULAR_ALPHA[0] - _ANGLE_ROUNDING <= alpha <= SINGULAR_ALPHA[1] + _ANGLE_ROUNDING:
+    if (
+        BasisSettings.singular_alpha_rad[0] - _ANGLE_ROUNDING
+        <= alpha
+        <= BasisSettings.singular_alpha_rad[1] + _ANGLE_ROUNDING
+    ):
         raise SingularAlphaError(math.degrees(alpha))
     # u = sin((θ−α)/2)/sin α and v = sin((θ+α)/2)/sin α give w = (u², −2 cos α·u·v, v²), which equals the
     # normalised weights of Ulbrich et al. 2009, eqs. (9)-(10) with γ = cos α.
@@ -166,7 +174,7 @@ class JointBasis:
         return cls("trigonometric", ())
 
     @classmethod
-    def orthonormal(cls, low: float, high: float, scale: float = DEFAULT_SCALE) -> JointBasis:
+    def orthonormal(cls, low: float, high: float, scale: float = BasisSettings.scale) -> JointBasis:
         """Return a basis of the constant 1 and two functions of RMS `scale`, orthogonal on [low, high] [rad].
 
         Orthogonal for θ uniform on the range. A scale below one makes a learner that changes the coefficients as little
@@ -180,7 +188,7 @@ class JointBasis:
         return cls("prismatic", (float(low), float(high)))
 
     @classmethod
-    def prismatic_orthonormal(cls, low: float, high: float, scale: float = DEFAULT_SCALE) -> JointBasis:
+    def prismatic_orthonormal(cls, low: float, high: float, scale: float = BasisSettings.scale) -> JointBasis:
         """Return a basis of the constant 1 and a linear function of RMS `scale`, orthogonal on [low, high] [m].
 
         Orthogonal for q uniform on the range.
@@ -259,7 +267,7 @@ class JointBasis:
 
 
 def learning_bases(
-    low: ArrayLike, high: ArrayLike, prismatic: Sequence[bool] | None = None, scale: float = DEFAULT_SCALE
+    low: ArrayLike, high: ArrayLike, prismatic: Sequence[bool] | None = None, scale: float = BasisSettings.scale
 ) -> tuple[JointBasis, ...]:
     """Return the scaled orthonormal bases recommended for learners, one per joint, for the joints' ranges.
 

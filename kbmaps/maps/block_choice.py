@@ -18,7 +18,7 @@ from kbmaps.maps.kbmap import KBMap
 from kbmaps.maps.stack import BasisStack
 
 
-class _Settings:
+class BlockSettings:
     most_blocks: int = 20
     first_precision: float = 1e-3  # precision used while there are too few pairs for blocks
     # Neighbours on a path are nearly the same configuration: they share this much of their prior variance. In bases
@@ -26,12 +26,10 @@ class _Settings:
     # shares 0.95.
     path_correlation: float = 0.995
     smallest_eigenvalue: float = 1e-15  # Relative to the largest eigenvalue of the kernel: smaller ones are rounding
-
-
-FEWEST_BLOCKS = 4
-BLOCK_PAIRS = 30  # along a guided path, pairs this far apart share little of their errors
-# Candidate precisions, relative to the kernel's mean diagonal: from almost no prior to hardly any learning.
-PRECISIONS = 10.0 ** np.arange(-13.0, 3.25, 0.5)
+    fewest_blocks: int = 4
+    block_pairs: int = 30  # along a guided path, pairs this far apart share little of their errors
+    # Candidate precisions, relative to the kernel's mean diagonal: from almost no prior to hardly any learning.
+    precisions = 10.0 ** np.arange(-13.0, 3.25, 0.5)
 
 
 def follow_a_path(prior: KBMap, q: ArrayLike) -> bool:
@@ -39,13 +37,15 @@ def follow_a_path(prior: KBMap, q: ArrayLike) -> bool:
     left, right = BasisStack(prior.bases).halves(rows("q", q, len(prior.bases)))
     square = (left * left).sum(axis=1) * (right * right).sum(axis=1)
     inner = (left[:-1] * left[1:]).sum(axis=1) * (right[:-1] * right[1:]).sum(axis=1)
-    return bool(len(inner)) and bool(np.median(inner / np.sqrt(square[:-1] * square[1:])) > _Settings.path_correlation)
+    return bool(len(inner)) and bool(
+        np.median(inner / np.sqrt(square[:-1] * square[1:])) > BlockSettings.path_correlation
+    )
 
 
 def blockwise_precision(prior: KBMap, q: ArrayLike, x: ArrayLike) -> float:
     """Return the precision λ of the prior for `ExactLearner.solve` with the best predictions of left-out blocks.
 
-    The pairs are cut into runs of neighbours, and those of each run, at most `BLOCK_PAIRS`, are predicted from all
+    The pairs are cut into runs of neighbours, and those of each run, at most `block_pairs`, are predicted from all
     other runs. Of the precisions that do this equally well, to one standard error, the largest is taken: the data do
     not require a more flexible map (Breiman et al., Classification and Regression Trees, 1984, section 3.4.3).
 
@@ -54,21 +54,21 @@ def blockwise_precision(prior: KBMap, q: ArrayLike, x: ArrayLike) -> float:
         q, x: pairs in the order of recording, (n, d) [rad, m] and (n, 3) [m].
 
     Returns:
-        λ as in `ExactLearner.solve`; with too few pairs for `FEWEST_BLOCKS`, one that trusts the prior.
+        λ as in `ExactLearner.solve`; with too few pairs for `BlockSettings.fewest_blocks`, one that trusts the prior.
     """
     angles, positions = matching_rows(q, x, len(prior.bases))
-    count = min(len(angles) // BLOCK_PAIRS, _Settings.most_blocks)
-    if count < FEWEST_BLOCKS:
+    count = min(len(angles) // BlockSettings.block_pairs, BlockSettings.most_blocks)
+    if count < BlockSettings.fewest_blocks:
         return (
-            _Settings.first_precision * float(np.diag(_kernel(prior, angles)).mean())
+            BlockSettings.first_precision * float(np.diag(_kernel(prior, angles)).mean())
             if len(angles)
-            else _Settings.first_precision
+            else BlockSettings.first_precision
         )
-    runs = [run[:BLOCK_PAIRS] for run in np.array_split(np.arange(len(angles)), count)]
+    runs = [run[: BlockSettings.block_pairs] for run in np.array_split(np.arange(len(angles)), count)]
     chosen = np.concatenate(runs)
     kernel = _kernel(prior, angles[chosen])
     errors = positions[chosen] - prior.predict(angles[chosen])
-    precisions = PRECISIONS * float(np.diag(kernel).mean())
+    precisions = BlockSettings.precisions * float(np.diag(kernel).mean())
     left_out = _left_out_errors(kernel, errors, count, precisions)
     means = left_out.mean(axis=1)
     best = int(means.argmin())
@@ -93,7 +93,7 @@ def _left_out_errors(kernel: FloatArray, errors: FloatArray, blocks: int, precis
     components = directions.T @ errors
     means = np.full((len(precisions), blocks), math.inf)
     for row, precision in enumerate(precisions):
-        if variances[0] + precision <= _Settings.smallest_eigenvalue * variances[-1]:
+        if variances[0] + precision <= BlockSettings.smallest_eigenvalue * variances[-1]:
             continue
         inverses = 1.0 / (variances + precision)
         multipliers = parts @ (inverses[:, None] * components)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kbmaps.arrays import FloatArray
-from kbmaps.robust import VARIANCE_FLOOR
+from kbmaps.robust import RobustSettings
 
 
 class _Settings:
@@ -62,9 +62,13 @@ class LinearEvidence:
         """Return the variance of the greatest evidence, found on ever finer grids of its logarithm."""
         mean = (self.unreached + float(np.square(self.along).sum())) / self.count
         if not len(self.eigenvalues):
-            return max(mean, VARIANCE_FLOOR)
-        middle, low, high = max(mean, VARIANCE_FLOOR), _Settings.least_share * mean, _Settings.greatest_share * mean
-        low, high = max(low, VARIANCE_FLOOR), max(high, VARIANCE_FLOOR)
+            return max(mean, RobustSettings.variance_floor)
+        middle, low, high = (
+            max(mean, RobustSettings.variance_floor),
+            _Settings.least_share * mean,
+            _Settings.greatest_share * mean,
+        )
+        low, high = max(low, RobustSettings.variance_floor), max(high, RobustSettings.variance_floor)
         for _ in range(_Settings.rounds):
             grid = np.geomspace(low, high, _Settings.points)
             best = int(self.at(grid).argmax())

@@ -20,10 +20,10 @@ from kbmaps.maps.factor import ShiftedGram
 from kbmaps.maps.kbmap import POSE_OUTPUTS, POSITION_OUTPUTS, KBMap, pose_targets
 from kbmaps.memory import Memory
 from kbmaps.pairs import checked_pairs
-from kbmaps.robust import VARIANCE_FLOOR
+from kbmaps.robust import RobustSettings
 
 
-class _Settings:
+class ExactSettings:
     # Below this reciprocal condition number a triangular solve would return rounding errors.
     smallest_rcond: float = 1e-13
     # The same for a Gram matrix, of which the refinement through the pairs needs only the first digits.
@@ -34,6 +34,8 @@ class _Settings:
     vanishing_ridge: float = 1e-13
     refinements: int = 30
     first_precision: float = 1e-2
+    # Limits of the evidence's search for lambda, relative to the mean diagonal of the Gram matrix.
+    search_limits = (1e-12, 1e6)
 
 
 def nearest_solution(design: Design, errors: FloatArray) -> FloatArray:
@@ -43,7 +45,7 @@ def nearest_solution(design: Design, errors: FloatArray) -> FloatArray:
     factorisation (corrected seminormal equations, Björck 1987), at a tenth of its cost.
     """
     gram = ShiftedGram(design.gram())
-    if gram.factorise(0.0) and gram.rcond > _Settings.smallest_gram_rcond:
+    if gram.factorise(0.0) and gram.rcond > ExactSettings.smallest_gram_rcond:
         change = _refined(design, gram, errors)
         if change is not None:
             return change
@@ -63,10 +65,10 @@ def _refined(design: Design, gram: ShiftedGram, errors: FloatArray) -> FloatArra
     left = float(np.linalg.norm(change))
     if left == 0.0:
         return change
-    for done in range(_Settings.refinements):
+    for done in range(ExactSettings.refinements):
         correction = step(errors - design.times(change))
         size = float(np.linalg.norm(correction))
-        if not size * _Settings.least_gain < left:
+        if not size * ExactSettings.least_gain < left:
             return change if done else None
         change, left = change + correction, size
     return change
@@ -77,10 +79,10 @@ def _by_rows(design: Design, errors: FloatArray) -> FloatArray:
     if design.overdetermined:
         factor = design.factor(errors)
         rows, targets = factor.rows, factor.targets
-        change = lapack.triangular_solve(rows, targets, _Settings.smallest_rcond)
+        change = lapack.triangular_solve(rows, targets, ExactSettings.smallest_rcond)
     else:
         rows, targets = design.rows(), errors
-        change = lapack.smallest_solution(rows, targets, _Settings.smallest_rcond)
+        change = lapack.smallest_solution(rows, targets, ExactSettings.smallest_rcond)
     return _nearest(rows, targets) if change is None else change
 
 
@@ -91,12 +93,12 @@ def _nearest(rows: FloatArray, errors: FloatArray) -> FloatArray:
     corrects the rounding of the pass before. Directions with σ² far below λ stay at the prior.
     """
     gram = ShiftedGram((rows @ rows.T).T)
-    ridge = _Settings.vanishing_ridge * gram.trace
+    ridge = ExactSettings.vanishing_ridge * gram.trace
     while not gram.factorise(ridge):
         ridge *= 10.0
     change = rows.T @ gram.solve(errors)
     left = float("inf")
-    for _ in range(_Settings.refinements):
+    for _ in range(ExactSettings.refinements):
         remaining = errors - rows @ change
         size = float(np.linalg.norm(remaining))
         if not size < 0.5 * left:
@@ -104,10 +106,6 @@ def _nearest(rows: FloatArray, errors: FloatArray) -> FloatArray:
         left = size
         change = change + rows.T @ gram.solve(remaining)
     return change
-
-
-# Limits of the evidence's search for lambda, relative to the mean diagonal of the Gram matrix.
-SEARCH_LIMITS = (1e-12, 1e6)
 
 
 @dataclass(frozen=True)
@@ -198,7 +196,7 @@ class ExactLearner:
         self._pairs = 0
         # Original weights of the kept pairs; the design holds them after forgetting.
         self._told = np.empty(0)
-        self._last_precision = _Settings.first_precision
+        self._last_precision = ExactSettings.first_precision
         self.rebase(prior)
 
     @property
@@ -314,7 +312,9 @@ class ExactLearner:
         else:
             squares = precision * np.einsum("ko,ko->o", errors, solution)
         spread = gram.log_determinant - gram.size * math.log(precision)
-        variances = [max(float(squares[part].mean()) / self._count, VARIANCE_FLOOR) for part in self._parts]
+        variances = [
+            max(float(squares[part].mean()) / self._count, RobustSettings.variance_floor) for part in self._parts
+        ]
         log_evidence = 0.0
         for part, variance in zip(self._parts, variances, strict=True):
             outputs = part.stop - part.start
@@ -340,7 +340,7 @@ class ExactLearner:
     def _most_evident(self, gram: ShiftedGram, errors: FloatArray, rhs: FloatArray) -> _Fit:
         """Return the fit at λ of the greatest evidence, searched from the last λ on."""
         mean = gram.trace / gram.size
-        low, high = (limit * mean for limit in SEARCH_LIMITS)
+        low, high = (limit * mean for limit in ExactSettings.search_limits)
         fits: dict[float, _Fit] = {}
 
         def log_evidence(precision: float) -> float:

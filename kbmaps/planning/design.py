@@ -17,7 +17,7 @@ from kbmaps.chains.parameters import ChainParameters
 from kbmaps.chains.rigid_learner import RigidLearner
 from kbmaps.chains.rigid_recursive import RecursiveRigidLearner
 from kbmaps.errors import DegenerateDataError, SettingError, ShapeError
-from kbmaps.robust import VARIANCE_FLOOR
+from kbmaps.robust import RobustSettings
 
 
 class Posterior(Protocol):
@@ -127,9 +127,12 @@ class ChainPosterior:
 
 
 _EYE = np.eye(3)
-_EXCHANGE_VALUES = 9  # values tried per joint when a chosen pose is improved within its limits
-# Rounds in which each pose of a plan is improved in the presence of the others; a third gains 2 % at most.
-_PLAN_ROUNDS = 2
+
+
+class _Settings:
+    exchange_values = 9  # values tried per joint when a chosen pose is improved within its limits
+    # Rounds in which each pose of a plan is improved in the presence of the others; a third gains 2 % at most.
+    plan_rounds = 2
 
 
 class ExperimentDesign:
@@ -179,7 +182,7 @@ class ExperimentDesign:
         self._factor = self._with(roots)
         self._left = self._reduced(self._region)
         variances: FloatArray = np.einsum("tip,tip->t", self._left, self._left) + 3.0 * self._floor_square
-        weights = 0.5 / np.sqrt(np.maximum(variances, VARIANCE_FLOOR)) / len(variances)
+        weights = 0.5 / np.sqrt(np.maximum(variances, RobustSettings.variance_floor)) / len(variances)
         flat = (self._left * np.sqrt(weights)[:, None, None]).reshape(-1, self._left.shape[2])
         self._moment = flat.T @ flat
 
@@ -215,13 +218,13 @@ class _Exchange:
     def __init__(self, design: ExperimentDesign, posterior: Posterior, lower: ArrayLike, upper: ArrayLike) -> None:
         self._design, self._posterior = design, posterior
         low, high = vector("lower limits", lower, posterior.joints), vector("upper limits", upper, posterior.joints)
-        self._values = np.linspace(low, high, _EXCHANGE_VALUES)
+        self._values = np.linspace(low, high, _Settings.exchange_values)
 
     def improved(self, pose: FloatArray) -> FloatArray:
         """Return the pose (d,) after one round in which each joint moves to the best of a few values, or stays."""
         best = pose
         for joint in range(len(pose)):
-            tried = np.tile(best, (_EXCHANGE_VALUES + 1, 1))
+            tried = np.tile(best, (_Settings.exchange_values + 1, 1))
             tried[:-1, joint] = self._values[:, joint]
             best = tried[int(self._design.gains(self._posterior.roots(tried)).argmax())]
         return best
@@ -275,7 +278,7 @@ def next_poses(
         left = np.delete(left, best)
         design.add(posterior.roots(chosen[k : k + 1]))
     if exchange is not None and count > 1:
-        for k in list(range(count)) * _PLAN_ROUNDS:
+        for k in list(range(count)) * _Settings.plan_rounds:
             design.begin_with(posterior.roots(np.delete(chosen, k, axis=0)))
             chosen[k] = exchange.improved(chosen[k])
     return chosen
@@ -289,7 +292,7 @@ def mean_distances(covariances: FloatArray) -> FloatArray:
     """
     traces = np.einsum("nii->n", covariances)
     squares = np.einsum("nij,nij->n", covariances, covariances)
-    shape = np.square(traces) / (2.0 * np.maximum(squares, VARIANCE_FLOOR**2))
+    shape = np.square(traces) / (2.0 * np.maximum(squares, RobustSettings.variance_floor**2))
     shape = np.maximum(shape, 0.5)
     ratio = np.exp(gammaln(shape + 0.5) - gammaln(shape))
     return cast(FloatArray, np.sqrt(traces / shape) * ratio)

@@ -15,8 +15,6 @@ from kbmaps.arrays import FloatArray, rows, vector
 from kbmaps.errors import SettingError
 from kbmaps.planning.design import ExperimentDesign, Posterior
 
-# Random designs per motion, averaged: a single one depends on chance where the pairs are few.
-_DESIGNS = 6
 SAME, ALL = "as so far", "all joints"
 
 
@@ -147,7 +145,8 @@ def candidate_motions(
 def _errors(
     design: ExperimentDesign, pool: FloatArray, counts: tuple[int, ...], rng: np.random.Generator
 ) -> tuple[float, ...]:
-    drawn = rng.integers(0, len(pool), (_DESIGNS, counts[-1]))
+    # Six random designs per motion, averaged: a single one depends on chance where the pairs are few.
+    drawn = rng.integers(0, len(pool), (6, counts[-1]))
     errors: list[float] = []
     for count in counts:
         # A pose that occurs k times is worth one pair there with the noise over √k.

@@ -12,14 +12,10 @@ import numpy as np
 
 from kbmaps.arrays import FloatArray, IntArray
 from kbmaps.lapack import lower_inverse
-from kbmaps.robust import VARIANCE_FLOOR
-
-# Candidate variances of a group, relative to the variance at which its best determined direction is barely visible.
-_TRIED = 10.0 ** np.arange(0.0, 7.0, 0.5)
-PRICE = 2.0  # Prior odds against a group [nats]. Its variance is optimised, which inflates the likelihood.
+from kbmaps.robust import RobustSettings
 
 
-class _Settings:
+class GroupSettings:
     """Settings of the choice of groups.
 
     Sensitivity: each at 0.3 and 3 times changes error and sigma of a bent arm's models at 150 pairs by less than 1 %,
@@ -32,6 +28,10 @@ class _Settings:
     swap_window: float = 8.0
     rounds: int = 40
     settled: float = 0.02
+    # Candidate variances of a group, relative to the variance at which its best determined direction is barely visible.
+    tried_variances = 10.0 ** np.arange(0.0, 7.0, 0.5)
+    # Prior odds against a group [nats]. Its variance is optimised, which inflates the likelihood.
+    price_nats: float = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +166,7 @@ class GroupedModel:
         return np.array([column for span in spans for column in range(span.start, span.stop)], dtype=np.intp)
 
     def select(self, candidates: tuple[str, ...]) -> None:
-        """Add groups while the evidence gains by more than `PRICE`, then drop those that it does not need."""
+        """Add groups while the evidence gains by more than their price, then drop those that it does not need."""
         self.settle()
         refused: set[str] = set()
         while True:
@@ -177,7 +177,7 @@ class GroupedModel:
                 if g not in self.variances and g not in refused
             }
             best = max(gains, key=lambda g: gains[g][0], default=None)
-            if best is None or gains[best][0] < PRICE:
+            if best is None or gains[best][0] < GroupSettings.price_nats:
                 break
             self._try(best, gains[best][1])
             refused.add(best)
@@ -191,7 +191,7 @@ class GroupedModel:
     def average(self, candidates: Sequence[str]) -> Average:
         """Return the average over the active groups and all sets that differ by one group less, more, or exchanged.
 
-        Weighted by evidence and prior odds of e^−PRICE per group. Hoeting et al., "Bayesian model averaging",
+        Weighted by evidence and prior odds of e^−price per group. Hoeting et al., "Bayesian model averaging",
         Statistical Science 14, 1999; improbable models are left out (Occam's window there).
         """
         whole = self.posterior()
@@ -201,17 +201,17 @@ class GroupedModel:
             rest = {group: value for group, value in self.variances.items() if group != name}
             posterior = self.posterior(active=rest)
             models.append((rest, posterior))
-            log_odds.append(posterior.log_evidence - whole.log_evidence + PRICE)
+            log_odds.append(posterior.log_evidence - whole.log_evidence + GroupSettings.price_nats)
             bases.append((rest, posterior, log_odds[-1]))
         for active, posterior, odds in bases:
-            for name in candidates if odds > -_Settings.swap_window else ():
+            for name in candidates if odds > -GroupSettings.swap_window else ():
                 gain, variance = (0.0, 0.0) if name in self.variances else self._gain(name, active, posterior)
-                if gain > _Settings.least_gain and odds + gain - PRICE > -_Settings.window:
+                if gain > GroupSettings.least_gain and odds + gain - GroupSettings.price_nats > -GroupSettings.window:
                     more = {**active, name: variance}
                     models.append((more, self.posterior(active=more)))
-                    log_odds.append(odds + gain - PRICE)
+                    log_odds.append(odds + gain - GroupSettings.price_nats)
         best = max(log_odds)
-        kept = [k for k, odds in enumerate(log_odds) if odds > best - _Settings.window]
+        kept = [k for k, odds in enumerate(log_odds) if odds > best - GroupSettings.window]
         shares = np.exp(np.array([log_odds[k] for k in kept]) - best)
         return self._mixture([models[k] for k in kept], shares / shares.sum())
 
@@ -229,7 +229,7 @@ class GroupedModel:
         rows = np.concatenate([rows, roots[:, None] * (means - mean)])
         return Average(groups, mean, cast(FloatArray, np.linalg.qr(rows, mode="r")).T)
 
-    def settle(self, rounds: int = _Settings.rounds) -> None:
+    def settle(self, rounds: int = GroupSettings.rounds) -> None:
         """Set the noise and the groups' variances that make the data most probable, by MacKay's fixed point."""
         for _ in range(rounds):
             posterior = self.posterior()
@@ -242,10 +242,10 @@ class GroupedModel:
                 width = self._columns[name].stop - self._columns[name].start
                 weights = posterior.mean[start : start + width]
                 start += width
-                new = max(float(weights @ weights) / max(posterior.used[name], 1e-9), VARIANCE_FLOOR)
+                new = max(float(weights @ weights) / max(posterior.used[name], 1e-9), RobustSettings.variance_floor)
                 change = max(change, 0.5 * abs(math.log(new / old)))
                 self.variances[name] = new
-            if change < _Settings.settled:
+            if change < GroupSettings.settled:
                 return
 
     def _noise_variance(self, square: float, used: float) -> float:
@@ -281,7 +281,7 @@ class GroupedModel:
             rest = {group: value for group, value in self.variances.items() if group != name}
             losses[name] = whole - self.posterior(active=rest).log_evidence
         least = min(losses, key=lambda name: losses[name])
-        if losses[least] >= PRICE:
+        if losses[least] >= GroupSettings.price_nats:
             return False
         del self.variances[least]
         return True
@@ -304,7 +304,7 @@ class GroupedModel:
         if values[-1] <= 0.0:
             return -math.inf, 1.0
         squares = np.square(directions.T @ slope)
-        tried = (_TRIED / values[-1])[:, None]
+        tried = (GroupSettings.tried_variances / values[-1])[:, None]
         gains = 0.5 * (tried * squares / (1.0 + tried * values) - np.log1p(tried * values)).sum(axis=1)
         best = int(gains.argmax())
         return float(gains[best]), float(tried[best, 0])

@@ -12,12 +12,12 @@ import numpy as np
 
 from kbmaps.arrays import BoolArray, FloatArray, IntArray
 from kbmaps.chains.belief import squared
-from kbmaps.maps.block_choice import BLOCK_PAIRS, FEWEST_BLOCKS
+from kbmaps.maps.block_choice import BlockSettings
 from kbmaps.pairs import Pairs
-from kbmaps.residual.evidence import PRICE, Average, GroupedModel, Moments
+from kbmaps.residual.evidence import Average, GroupedModel, GroupSettings, Moments
 from kbmaps.residual.features import SMOOTH_GROUPS
 from kbmaps.residual.model import ResidualModel
-from kbmaps.robust import MEDIAN_NORM, OUTLIER_SIGMAS, ROUNDING_M
+from kbmaps.robust import MEDIAN_NORM, RobustSettings
 
 
 class _Settings:
@@ -71,7 +71,7 @@ def most_probable(evidence: Callable[[float], float], present: float) -> float:
     while True:
         best = max((place, min(place + 1, last), max(place - 1, 0)), key=at)
         if best == place:
-            return _Settings.correlations[place] if at(place) > at(0) + PRICE else 0.0
+            return _Settings.correlations[place] if at(place) > at(0) + GroupSettings.price_nats else 0.0
         place = best
 
 
@@ -100,7 +100,7 @@ class _Fitter:
         self._known = tuple(prior.weights)
         self._free, self._root = squared(prior.root)
         self._unit = math.sqrt(float(np.square(pairs.unit).mean()))
-        self._least_noise = 1.0 if pairs.known else ROUNDING_M / float(pairs.unit.min())
+        self._least_noise = 1.0 if pairs.known else RobustSettings.rounding_m / float(pairs.unit.min())
         self._on_path = self._features.follow_a_path(pairs.q)
         self._present = np.concatenate([change, *prior.weights.values()])
         self._fresh: dict[str, FloatArray] = {}
@@ -176,7 +176,7 @@ class _Fitter:
         norms = np.linalg.norm(residuals, axis=1)
         typical = max(float(np.median(norms)) / MEDIAN_NORM, self._least_noise)
         bound = typical if math.isinf(self.noise) else max(typical, self.noise)
-        self.inliers = norms <= OUTLIER_SIGMAS * bound
+        self.inliers = norms <= RobustSettings.outlier_sigmas * bound
         if math.isinf(self.noise):
             self.noise = typical
 
@@ -187,7 +187,9 @@ class _Fitter:
         self._judge_pairs(residuals)
         rows = np.flatnonzero(self.inliers)
         if self._on_path:
-            parts = min(max(len(rows) // BLOCK_PAIRS, FEWEST_BLOCKS), _Settings.blocks, len(rows))
+            parts = min(
+                max(len(rows) // BlockSettings.block_pairs, BlockSettings.fewest_blocks), _Settings.blocks, len(rows)
+            )
         else:
             parts = max(len(rows) // _Settings.rows_at_once, 1)
         runs = np.array_split(rows, parts)

@@ -24,9 +24,15 @@ from kbmaps.residual.features import ResidualFeatures, ResidualScaling
 _KIND = "rigid chain with residual, fitted, 2"
 _SCALING = ("middle", "half", "centre", "load")
 _GROUP = "group "
-_LAW_ERROR = 0.03  # lumped loads on linear springs are accurate to a few per cent of the deflection that they explain
-# Fourth-order differences [rad, m]: truncation and rounding errors are both about 1e-13 of the derivative.
-_STEP = 1e-3
+
+
+class _Settings:
+    # lumped loads on linear springs are accurate to a few per cent of the deflection that they explain
+    law_error = 0.03
+    # Fourth-order differences [rad, m]: truncation and rounding errors are both about 1e-13 of the derivative.
+    slope_step = 1e-3
+
+
 _STENCIL = np.array([-2.0, -1.0, 1.0, 2.0])
 _SLOPES = np.array([1.0, -8.0, 8.0, -1.0]) / 12.0
 
@@ -122,10 +128,13 @@ class ResidualModel:
         angles = rows_or_vector("q", q, self.joints)
         if not self.weights:
             return self.chain.jacobian(angles)
-        around = np.atleast_2d(angles)[:, None, None] + _STEP * _STENCIL[:, None] * np.eye(self.joints)[:, None]
+        around = (
+            np.atleast_2d(angles)[:, None, None]
+            + _Settings.slope_step * _STENCIL[:, None] * np.eye(self.joints)[:, None]
+        )
         x = self.features.positions(self.chain, self.weights, around.reshape(-1, self.joints))
         x = x.reshape(*around.shape[:3], 3)
-        slopes = np.einsum("njsi,s->nij", x, _SLOPES / _STEP)
+        slopes = np.einsum("njsi,s->nij", x, _SLOPES / _Settings.slope_step)
         return slopes[0] if angles.ndim == 1 else slopes
 
     def predict_with_variance(self, q: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -138,7 +147,7 @@ class ResidualModel:
             x[part], variance[part] = point.x, np.square(design @ self.root).sum(axis=2)
             for group in self.features.approximate(self.weights):
                 move = point.groups[group] @ self.weights[group]
-                variance[part] += _LAW_ERROR**2 / 3.0 * np.square(move).sum(axis=1, keepdims=True)
+                variance[part] += _Settings.law_error**2 / 3.0 * np.square(move).sum(axis=1, keepdims=True)
         return x, variance
 
     def effects(self, q: ArrayLike) -> dict[str, float]:

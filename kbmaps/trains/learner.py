@@ -22,13 +22,8 @@ from kbmaps.pairs import checked_pairs, stored_pairs
 from kbmaps.trains.core_prior import CORE_NUMBERS, CoreFamily, CorePrior
 from kbmaps.trains.fit import TensorProblem, whitened_jacobian
 from kbmaps.trains.posterior import TensorPosterior, misfit_sizes
-from kbmaps.trains.search import PLAUSIBLE, Fit, Pairs, information, refine, search
+from kbmaps.trains.search import Fit, Pairs, SearchSettings, information, refine, search
 from kbmaps.trains.train import TensorSettings, TensorTrain, parse_settings
-
-# Candidates, and the centre of the prior over them: a few parts in a thousand, within about a decade.
-ELLIPSE_STDS = tuple(float(std) for std in np.geomspace(1e-4, 3e-2, 11))
-USUAL_ELLIPSE_STD = 0.003
-_DECADE = math.log(10.0)
 
 
 def core_equations(problem: TensorProblem, z: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -44,7 +39,7 @@ def core_equations(problem: TensorProblem, z: FloatArray) -> tuple[FloatArray, F
 
 
 def likely_ellipse_std(family: CoreFamily, jacobian: FloatArray, positions: FloatArray) -> float:
-    """Return the most probable of `ELLIPSE_STDS`, for pairs linearised at a fit to them.
+    """Return the most probable of `_Settings.ellipse_stds`, for pairs linearised at a fit to them.
 
     With c = m + S z, z ~ N(0, I), y - J m = r and z marginalised,
 
@@ -62,14 +57,14 @@ def likely_ellipse_std(family: CoreFamily, jacobian: FloatArray, positions: Floa
     few = len(jacobian) < jacobian.shape[1]
     evidences = _by_coordinates(family, jacobian, residuals) if few else _by_cores(family, jacobian, residuals)
     scores = [
-        evidence - 0.5 * (math.log(std / USUAL_ELLIPSE_STD) / _DECADE) ** 2
-        for std, evidence in zip(ELLIPSE_STDS, evidences, strict=True)
+        evidence - 0.5 * (math.log(std / _Settings.usual_ellipse_std) / math.log(10.0)) ** 2
+        for std, evidence in zip(_Settings.ellipse_stds, evidences, strict=True)
     ]
-    return ELLIPSE_STDS[int(np.argmax(scores))]
+    return _Settings.ellipse_stds[int(np.argmax(scores))]
 
 
 def _by_coordinates(family: CoreFamily, jacobian: FloatArray, residuals: FloatArray) -> list[float]:
-    """Return the log evidence of each of `ELLIPSE_STDS`, from matrices of the size of the coordinates.
+    """Return the log evidence of each of `_Settings.ellipse_stds`, from matrices of the size of the coordinates.
 
     S Sᵀ is the rigid part plus the square of each standard deviation times the rest.
     """
@@ -79,7 +74,7 @@ def _by_coordinates(family: CoreFamily, jacobian: FloatArray, residuals: FloatAr
     own = jacobian * np.tile(family.sizes, joints)
     rigid, rest = np.eye(len(jacobian)) + moved @ moved.T, own @ own.T
     evidences: list[float] = []
-    for std in ELLIPSE_STDS:
+    for std in _Settings.ellipse_stds:
         square, log_determinant = _inverse_square(rigid + std**2 * rest, residuals)
         evidences.append(-0.5 * (square + log_determinant))
     return evidences
@@ -90,7 +85,7 @@ def _by_cores(family: CoreFamily, jacobian: FloatArray, residuals: FloatArray) -
     blocks = (jacobian.T @ jacobian).reshape(joints, CORE_NUMBERS, joints, CORE_NUMBERS)
     slope = (jacobian.T @ residuals).reshape(joints, CORE_NUMBERS, 1)
     evidences: list[float] = []
-    for std in ELLIPSE_STDS:
+    for std in _Settings.ellipse_stds:
         spread = family.prior(std).spread
         whitened = np.einsum("aij,aibk,bkl->ajbl", spread, blocks, spread, optimize=True).reshape(size, size)
         pull = (spread.swapaxes(1, 2) @ slope).ravel()
@@ -120,6 +115,9 @@ class _Settings:
     # Multiples of the minimum number of pairs for a train: to start a search, and to stop repeating it.
     pairs_to_search: float = 1.5
     searches_until: float = 1.5
+    # Candidates, and the centre of the prior over them: a few parts in a thousand, within about a decade.
+    ellipse_stds = tuple(float(std) for std in np.geomspace(1e-4, 3e-2, 11))
+    usual_ellipse_std: float = 0.003
 
 
 class TensorLearner(Model):
@@ -171,7 +169,7 @@ class TensorLearner(Model):
         self._posterior: TensorPosterior | None = None
         self._family: CoreFamily | None = None
         if isinstance(prior, CoreFamily):
-            self.rebase(prior.prior(USUAL_ELLIPSE_STD))
+            self.rebase(prior.prior(_Settings.usual_ellipse_std))
             self._family = prior
         elif prior is not None:
             self.rebase(prior)
@@ -453,7 +451,10 @@ class TensorLearner(Model):
         if before is None or (self._searches and self.kept < _Settings.searches_until * self.pairs_needed):
             return search(data, self._prior, self.bases, rng, self.settings.starts, robust=robust)
         fit = refine(data, self._prior, before.z, before.noise, robust=robust)
-        lost = fit.noise > _Settings.lost * max(before.noise, data.noise_floor) or fit.noise > PLAUSIBLE * data.size
+        lost = (
+            fit.noise > _Settings.lost * max(before.noise, data.noise_floor)
+            or fit.noise > SearchSettings.plausible * data.size
+        )
         if self._searches and lost:
             again = search(data, self._prior, self.bases, rng, self.settings.starts, robust=robust)
             fit = min(fit, again, key=lambda candidate: candidate.noise)

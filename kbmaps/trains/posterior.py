@@ -16,9 +16,6 @@ from kbmaps.trains.core_prior import CORE_NUMBERS, CorePrior
 from kbmaps.trains.fit import whitened_jacobian
 from kbmaps.trains.train import TensorTrain
 
-# Candidate standard deviations: of a joint's errors [rad], or in prismatic joints and 1 m away [m].
-_STDS = np.geomspace(1e-5, 1e-1, 17)
-
 
 class _Settings:
     sweeps: int = 2
@@ -27,6 +24,8 @@ class _Settings:
     telling: float = 2.0
     batch_rows: int = 512
     frame_error: float = 0.05  # assumed error of the last frame's axes, as a share of a marker's displacement
+    # Candidate standard deviations: of a joint's errors [rad], or in prismatic joints and 1 m away [m].
+    stds = np.geomspace(1e-5, 1e-1, 17)
 
 
 def misfit_directions(train: TensorTrain, q: FloatArray) -> FloatArray:
@@ -78,8 +77,8 @@ def likely_misfit(
     stds = np.zeros(len(sizes))
     for _ in range(_Settings.sweeps):
         for group in range(len(sizes)):
-            trials = np.tile(stds, (len(_STDS) + 1, 1))
-            trials[:, group] = 0.0, *_STDS
+            trials = np.tile(stds, (len(_Settings.stds) + 1, 1))
+            trials[:, group] = 0.0, *_Settings.stds
             gains = np.array([_gain(matrix, pull, np.repeat(trial, sizes)) for trial in trials])
             gains[0] += _Settings.telling
             stds = trials[int(gains.argmax())]

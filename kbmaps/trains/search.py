@@ -18,7 +18,7 @@ from kbmaps.trains.fit import LevenbergMarquardt, TensorProblem, alternate
 from kbmaps.trains.train import TensorTrain
 
 
-class _Settings:
+class SearchSettings:
     noise_floor: float = 1e-13  # Relative to the spread of the positions: smaller residuals are rounding
     # With residuals below this share of the positions' spread, no further start is needed.
     explained: float = 1e-4
@@ -34,9 +34,7 @@ class _Settings:
     same_lengths: float = 0.05  # reweighting ends when no residual moves by more than this many standard deviations
     search_pairs: int = 40  # random starts use at most this many pairs per joint
     least_freedom: float = 0.2  # with fewer degrees of freedom per pair, residuals cannot separate noise from outliers
-
-
-PLAUSIBLE = 0.1  # failed starts leave a tenth or more of the spread, and may agree on it by chance
+    plausible: float = 0.1  # failed starts leave a tenth or more of the spread, and may agree on it by chance
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +59,7 @@ class Pairs:
     @property
     def noise_floor(self) -> float:
         """Size below which residuals are rounding [m]."""
-        return _Settings.noise_floor * self.size
+        return SearchSettings.noise_floor * self.size
 
     def chosen(self, mask: BoolArray) -> Pairs:
         return Pairs(self.weights[mask], self.x[mask], self.sigma[mask])
@@ -115,17 +113,17 @@ def search(
     Ends early when one explains the pairs, or two agree.
     """
     some = pairs
-    if len(pairs.x) > _Settings.search_pairs * len(bases):
+    if len(pairs.x) > SearchSettings.search_pairs * len(bases):
         mask = np.zeros(len(pairs.x), dtype=np.bool_)
-        mask[rng.permutation(len(pairs.x))[: _Settings.search_pairs * len(bases)]] = True
+        mask[rng.permutation(len(pairs.x))[: SearchSettings.search_pairs * len(bases)]] = True
         some = pairs.chosen(mask)
     best = _from_a_random_chain(some, prior, bases, rng)
     for _ in range(starts - 1):
-        if best.noise < _Settings.explained * pairs.size:
+        if best.noise < SearchSettings.explained * pairs.size:
             break
         fit = _from_a_random_chain(some, prior, bases, rng)
-        plausible = best.noise < PLAUSIBLE * pairs.size
-        agrees = plausible and abs(fit.noise / best.noise - 1.0) < _Settings.same_noise
+        plausible = best.noise < SearchSettings.plausible * pairs.size
+        agrees = plausible and abs(fit.noise / best.noise - 1.0) < SearchSettings.same_noise
         best = min(best, fit, key=lambda candidate: candidate.noise)
         if agrees:
             break
@@ -133,14 +131,14 @@ def search(
 
 
 def _from_a_random_chain(pairs: Pairs, prior: CorePrior, bases: Sequence[JointBasis], rng: np.random.Generator) -> Fit:
-    noise = _Settings.first_noise * pairs.size
+    noise = SearchSettings.first_noise * pairs.size
     chain = random_chain(bases, pairs.size / math.sqrt(len(bases)), rng)
     # A small given sigma would make the objective of the first steps rugged.
     problem = TensorProblem(pairs.weights, pairs.x, np.full(len(pairs.x), noise), prior)
-    z = alternate(problem, prior.whitened(TensorTrain.from_chain(chain, bases).cores), _Settings.sweeps)
-    z, _ = LevenbergMarquardt().run(problem, z, _Settings.first_steps)
+    z = alternate(problem, prior.whitened(TensorTrain.from_chain(chain, bases).cores), SearchSettings.sweeps)
+    z, _ = LevenbergMarquardt().run(problem, z, SearchSettings.first_steps)
     left = math.sqrt(float(np.square(problem.residuals(z)).mean()))
-    if left > PLAUSIBLE * pairs.size:
+    if left > SearchSettings.plausible * pairs.size:
         # Most failed starts show by now; settling them would take longer than the next start.
         return Fit(z, left, np.ones(len(pairs.x), dtype=np.bool_))
     blind = Pairs(pairs.weights, pairs.x, np.full(len(pairs.x), np.nan))
@@ -194,9 +192,9 @@ def _settle(pairs: Pairs, prior: CorePrior, z: FloatArray, noise: float) -> Fit:
     """
     optimiser = LevenbergMarquardt()
     used = np.ones(len(pairs.x), dtype=np.bool_)
-    for _ in range(_Settings.rounds):
+    for _ in range(SearchSettings.rounds):
         problem = pairs.problem(prior, noise)
-        z, _ = optimiser.run(problem, z, _Settings.round_steps)
+        z, _ = optimiser.run(problem, z, SearchSettings.round_steps)
         if not pairs.unknown.any():
             noise = math.sqrt(float(np.square(pairs.sigma).mean()))
             if optimiser.converged:
@@ -205,7 +203,7 @@ def _settle(pairs: Pairs, prior: CorePrior, z: FloatArray, noise: float) -> Fit:
         freedom = 1.0 - effective_parameters(problem, z) / (3.0 * len(pairs.x))
         mean_square = float(np.square(problem.residuals(z))[pairs.unknown].mean())
         found = max(math.sqrt(mean_square / max(freedom, 1e-9)), pairs.noise_floor)
-        steady = abs(found / noise - 1.0) < _Settings.same_noise
+        steady = abs(found / noise - 1.0) < SearchSettings.same_noise
         noise = found
         if (optimiser.converged and steady) or found == pairs.noise_floor:
             break
@@ -220,28 +218,28 @@ def _distances(pairs: Pairs, prior: CorePrior, fit: Fit) -> tuple[FloatArray, bo
     problem = pairs.problem(prior, fit.noise)
     freedom = 1.0 - effective_parameters(problem, fit.z) / (3.0 * len(pairs.x))
     lengths = np.linalg.norm(problem.residuals(fit.z), axis=1) / problem.std
-    unit = float(np.median(lengths)) / (MEDIAN_NORM * math.sqrt(max(freedom, _Settings.least_freedom)))
+    unit = float(np.median(lengths)) / (MEDIAN_NORM * math.sqrt(max(freedom, SearchSettings.least_freedom)))
     rounding = fit.noise <= 2.0 * pairs.noise_floor
     least = pairs.noise_floor / fit.noise if pairs.unknown.any() else 1.0
-    return lengths / max(unit, least), freedom >= _Settings.least_freedom and not rounding
+    return lengths / max(unit, least), freedom >= SearchSettings.least_freedom and not rounding
 
 
 def _good(pairs: Pairs, prior: CorePrior, fit: Fit) -> BoolArray:
     """Return True for each pair (n,) whose distance from the fit is within the noise."""
     lengths, telling = _distances(pairs, prior, fit)
-    return lengths <= _Settings.outlier_distance if telling else np.ones(len(lengths), dtype=np.bool_)
+    return lengths <= SearchSettings.outlier_distance if telling else np.ones(len(lengths), dtype=np.bool_)
 
 
 def _reweighted(pairs: Pairs, prior: CorePrior, fit: Fit) -> Fit:
     """Return an iteratively reweighted fit with Geman and McClure's weights (1 + r²)⁻²."""
     optimiser = LevenbergMarquardt()
     z = fit.z
-    for _ in range(_Settings.rounds):
+    for _ in range(SearchSettings.rounds):
         lengths, _ = _distances(pairs, prior, replace(fit, z=z))
-        trust = 1.0 / np.square(1.0 + np.square(lengths / _Settings.weight_scale))
+        trust = 1.0 / np.square(1.0 + np.square(lengths / SearchSettings.weight_scale))
         problem = pairs.problem(prior, fit.noise, trust)
-        z, _ = optimiser.run(problem, z, _Settings.round_steps)
+        z, _ = optimiser.run(problem, z, SearchSettings.round_steps)
         moved = float(np.abs(_distances(pairs, prior, replace(fit, z=z))[0] - lengths).max())
-        if optimiser.converged and moved < _Settings.same_lengths:
+        if optimiser.converged and moved < SearchSettings.same_lengths:
             break
     return replace(fit, z=z)

@@ -11,12 +11,8 @@ from numpy.typing import NDArray
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.changes.monitor import DetectedChange
 from bodyschema.learning.solvers.solver import fitted_belief
-from bodyschema.learning.status import NAMED, TOOL
+from bodyschema.learning.status import TOOL, NamingSettings
 from kbmaps import ChainBelief, ChainTolerances, ChangeKind, Explanation, KBMap, ResidualModel, any_change, explanations
-
-# 1-sigma of each coordinate [m] of the marker's displacement by another tool, and of an unknown marker position about
-# the nominal one.
-OTHER_TOOL_M = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +34,8 @@ class KnownArm:
 
     def with_other_tool(self) -> KnownArm:
         """Return the same arm with a marker elsewhere on the hand."""
-        residual = None if self.residual is None else self.residual.with_other_tool(OTHER_TOOL_M)
-        return KnownArm(self.chain.with_other_tool(OTHER_TOOL_M), self.tolerances, residual)
+        residual = None if self.residual is None else self.residual.with_other_tool(ArmSettings.other_tool_m)
+        return KnownArm(self.chain.with_other_tool(ArmSettings.other_tool_m), self.tolerances, residual)
 
     def widened(self, columns: NDArray[np.intp], std: FloatArray) -> KnownArm:
         """Return the same arm with the uncertainty of some chain parameters increased.
@@ -52,7 +48,7 @@ class KnownArm:
         return KnownArm(self.chain.widened(columns, std), self.tolerances, residual)
 
 
-class _Settings:
+class ArmSettings:
     improbable: float = 0.02  # an unnamed change widens every kind at least this probable
     # 1-sigma of the changed part: this multiple of its most probable change, and at least this many noises.
     wider: float = 3.0
@@ -60,6 +56,9 @@ class _Settings:
     folds: int = 4  # number of runs of neighbours left out in turn to compare the new model with the old one
     clipped: float = 5.0  # pairs farther from a prediction than this many sigmas are clipped
     fewest_before: int = 10  # minimum number of pairs before the change that update the previous posterior
+    # 1-sigma of each coordinate [m] of the marker's displacement by another tool, and of an unknown marker position
+    # about the nominal one.
+    other_tool_m: float = 0.25
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +83,7 @@ class Origin:
         quiet = [k for k in range(min(noticed.earliest, noticed.first)) if noticed.kept[k]]
         q, x, cov = noticed.q[quiet], noticed.x[quiet], noticed.cov[quiet]
         wide = self._reference.wide
-        if len(quiet) >= _Settings.fewest_before:
+        if len(quiet) >= ArmSettings.fewest_before:
             wide = fitted_belief(wide, q, self._of_chain(q, x), cov)
         self._before = arm.updated(wide, self._reference.residual)
 
@@ -123,10 +122,10 @@ class Origin:
         Runs of q (n, d) [rad] and x (n, 3) [m], n at least 2, are left out in turn.
         """
         arm, y = self._forgetful(found), self._of_chain(q, x)
-        limit = _Settings.clipped * self._noticed.noise_m
+        limit = ArmSettings.clipped * self._noticed.noise_m
         old = np.minimum(np.linalg.norm(y - self._reference.belief.predict(q), axis=1), limit)
         new = np.empty(len(q))
-        for left_out in np.array_split(np.arange(len(q)), min(_Settings.folds, len(q))):
+        for left_out in np.array_split(np.arange(len(q)), min(ArmSettings.folds, len(q))):
             others = np.setdiff1d(np.arange(len(q)), left_out)
             belief = fitted_belief(arm.chain, q[others], y[others], None if cov is None else cov[others])
             new[left_out] = np.minimum(np.linalg.norm(y[left_out] - belief.predict(q[left_out]), axis=1), limit)
@@ -138,9 +137,8 @@ class Origin:
 
     def _forgetful(self, found: Sequence[Explanation]) -> KnownArm:
         arm = self._before
-        kinds = (
-            found[:1] if found[0].probability >= NAMED else [e for e in found if e.probability >= _Settings.improbable]
-        )
+        named = found[0].probability >= NamingSettings.named_probability
+        kinds = found[:1] if named else [e for e in found if e.probability >= ArmSettings.improbable]
         for each in kinds:
             if each.kind.name == TOOL:
                 arm = arm.with_other_tool()
@@ -150,5 +148,5 @@ class Origin:
 
     def _widths(self, kind: ChangeKind, change: FloatArray) -> FloatArray:
         moves = change / kind.units
-        size = _Settings.wider * float(np.sqrt(np.square(moves).mean()))
-        return kind.units * min(max(size, _Settings.least_noises * self._noticed.noise_m), OTHER_TOOL_M)
+        size = ArmSettings.wider * float(np.sqrt(np.square(moves).mean()))
+        return kind.units * min(max(size, ArmSettings.least_noises * self._noticed.noise_m), ArmSettings.other_tool_m)

@@ -14,11 +14,11 @@ from bodyschema.interfaces.records import FloatArray, Pair
 from bodyschema.learning.model_bank import LearntModel
 from bodyschema.learning.uncertainty import PredictiveUncertainty
 from kbmaps import ChainBelief, ChangeDetector, ChangeKind, ChangeScore, KBMap, ResidualModel, SharedNoise, WhiteNoise
-from kbmaps.changes.detector import MOST_SURPRISES
+from kbmaps.changes.detector import DetectorSettings
 from kbmaps.variance_components import inverse_roots
 
 
-class _Settings:
+class MonitorSettings:
     fewest_known: int = 100  # Minimum number of pairs of a reference model: with fewer it may be too far off
     # A newer model replaces the reference after half as many pairs as it knows, within these limits. It would absorb a
     # change that took longer to show.
@@ -26,13 +26,11 @@ class _Settings:
     longest_trial: int = 1000
     alone: float = 0.1  # a model counts as the chain alone if it is this near to it, over the noise of a pair
     smallest_m: float = 1e-6  # lower bound of a measurement's noise, whatever it claims [m]
-
-
-MOST_WATCHED = 5000  # if no newer model comes, the older half of this many pairs is dropped
-LOOKED_BACK = 1000  # number of the model's own pairs that show its noise
-# An alarm that a bent arm explains is evaluated again when the pairs since the change have grown by this factor, or the
-# alarm's log odds by this much.
-LOOK_AGAIN, GROWN_ODDS = 1.25, 4.0
+    most_watched: int = 5000  # if no newer model comes, the older half of this many pairs is dropped
+    looked_back: int = 1000  # number of the model's own pairs that show its noise
+    # An alarm that a bent arm explains is evaluated again when the pairs since the change have grown by this factor, or
+    # the alarm's log odds by this much.
+    look_again, grown_odds = 1.25, 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +70,7 @@ class Reference:
         """
         more = np.maximum((white - claimed).diagonal(axis1=1, axis2=2), 0.0)
         missed = np.maximum(self.claim.beyond_chain(q) - more, 0.0)
-        return white + np.eye(3) * np.maximum(missed, _Settings.smallest_m**2)[:, None, :]
+        return white + np.eye(3) * np.maximum(missed, MonitorSettings.smallest_m**2)[:, None, :]
 
     def noise(self, covariances: FloatArray, white: FloatArray) -> SharedNoise:
         """Return the noise of the reference's whitened errors at pairs that it was fitted to.
@@ -128,7 +126,7 @@ class _Shown:
     def with_newer(self, other: _Shown) -> _Shown:
         return _Shown(
             *(
-                np.concatenate([getattr(self, name), getattr(other, name)])[-MOST_SURPRISES:]
+                np.concatenate([getattr(self, name), getattr(other, name)])[-DetectorSettings.most_surprises :]
                 for name in ("q", "claimed", "off")
             )
         )
@@ -146,7 +144,7 @@ class ChangeMonitor:
         self._next: Reference | None = None
         self._next_at = self._asked_at = 0
         self._pairs: list[_Watched] = []
-        self._earlier: deque[_Watched] = deque(maxlen=LOOKED_BACK)
+        self._earlier: deque[_Watched] = deque(maxlen=MonitorSettings.looked_back)
         # Compares the pairs with the current reference; None before there is one.
         self.detector: ChangeDetector | None = None
         self._white = WhiteNoise.as_claimed(0)
@@ -162,7 +160,7 @@ class ChangeMonitor:
 
     @property
     def held(self) -> int:
-        """Number of kept pairs, at most `MOST_WATCHED` except for those since an alarm."""
+        """Number of kept pairs, at most `MonitorSettings.most_watched` except for those since an alarm."""
         return len(self._pairs)
 
     @property
@@ -183,7 +181,7 @@ class ChangeMonitor:
 
     def offer(self, reference: Reference) -> None:
         """Offer a model of the pairs up to the last `asked`."""
-        if reference.known < _Settings.fewest_known or not self.wants_reference:
+        if reference.known < MonitorSettings.fewest_known or not self.wants_reference:
             return
         self._next, self._next_at = reference, self._asked_at
 
@@ -191,7 +189,7 @@ class ChangeMonitor:
         """Add one or several pairs, learnt or, if not `kept` (n,), outliers."""
         if self._reference is None:
             self._renew()  # not in `offer`: that runs in the background, and this takes a while
-        if len(self._pairs) + len(pairs) > MOST_WATCHED and not self.alarmed:
+        if len(self._pairs) + len(pairs) > MonitorSettings.most_watched and not self.alarmed:
             gone = len(self._pairs) // 2
             self._drop(gone)
             self._asked_at, self._next_at = max(self._asked_at - gone, 0), max(self._next_at - gone, 0)
@@ -217,13 +215,13 @@ class ChangeMonitor:
     def refute(self) -> None:
         """Reject the suspected change, until the pairs give more evidence."""
         since = 0 if self._change is None else len(self._pairs) - self._change.onset
-        self._change, self._look_at = None, len(self._pairs) + int((LOOK_AGAIN - 1.0) * since) + 1
+        self._change, self._look_at = None, len(self._pairs) + int((MonitorSettings.look_again - 1.0) * since) + 1
         self._refuted_odds = self._odds
 
     def _suspect(self, detector: ChangeDetector) -> None:
         suspicion = detector.suspicion()
         self._odds = suspicion.log_odds
-        due = len(self._pairs) >= self._look_at or self._odds > self._refuted_odds + GROWN_ODDS
+        due = len(self._pairs) >= self._look_at or self._odds > self._refuted_odds + MonitorSettings.grown_odds
         if suspicion.alarm and self._change is None and due:
             self._change = detector.suspicion_if_it_bends()
             if not self._change.alarm:
@@ -283,7 +281,7 @@ class ChangeMonitor:
 
     def _hold(self, reference: Reference) -> None:
         """Compare all pairs with this reference, with the measured noise."""
-        known = [each for each in (*self._earlier, *self._pairs) if each.kept][-LOOKED_BACK:]
+        known = [each for each in (*self._earlier, *self._pairs) if each.kept][-MonitorSettings.looked_back :]
         self._white = WhiteNoise.as_claimed(reference.q.shape[1])
         if known:
             q, x, claimed = _stacked(known)
@@ -299,7 +297,7 @@ class ChangeMonitor:
         noise_m = float(np.sqrt(noise.single * _traces(covariances).mean() / 3.0))
         distance_m = float(np.linalg.norm(reference.x, axis=1).mean())
         self.detector = ChangeDetector(reference.belief, noise, noise_m, distance_m)
-        if float(np.square(reference.beyond_chain(q)).mean()) < (_Settings.alone * noise_m) ** 2:
+        if float(np.square(reference.beyond_chain(q)).mean()) < (MonitorSettings.alone * noise_m) ** 2:
             # Terms that another model learnt from these pairs would hide the arm's bends.
             self.detector.recall(q, reference.x - reference.belief.predict(q), covariances)
         self._change, self._look_at = None, 0
@@ -336,4 +334,4 @@ def _traces(covariances: FloatArray) -> FloatArray:
 
 
 def _trial(known: int) -> int:
-    return min(max(known // 2, _Settings.shortest_trial), _Settings.longest_trial)
+    return min(max(known // 2, MonitorSettings.shortest_trial), MonitorSettings.longest_trial)

@@ -10,13 +10,17 @@ from numpy.typing import NDArray
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.replay_memory import PairMemory
 
-DOUBT = 5.0  # a pair is an outlier if it is this many times farther from the prediction than expected
+
+class OutlierSettings:
+    times_farther = 5.0  # a pair is an outlier if it is this many times farther from the prediction than expected
+    smallest_m = 1e-3  # no robot is this exact: an expected distance is never taken to be smaller [m]
+    change_pairs = 6  # this many consecutive outliers prove a change
+    explained_change_pairs = 3  # this many are enough if one other position of the marker explains them
+    # An explanation leaves at most this multiple of the expected distance.
+    explained_multiple = 2.0
+
+
 MEDIAN_TO_SIGMA = 0.6501  # 1-sigma of errors per axis by their median length, three equal axes: 1 / sqrt(2.366)
-SMALLEST_M = 1e-3  # no robot is this exact: an expected distance is never taken to be smaller [m]
-CHANGE = 6  # this many consecutive outliers prove a change
-FEWEST_FOR_CHANGE = 3  # this many are enough if one other position of the marker explains them
-# An explanation leaves at most this multiple of the expected distance.
-TOGETHER = 2.0
 
 
 class OutlierGate:
@@ -26,18 +30,18 @@ class OutlierGate:
     """
 
     def __init__(self, joints: int) -> None:
-        self._memory = PairMemory(joints, CHANGE)
+        self._memory = PairMemory(joints, OutlierSettings.change_pairs)
         self.in_a_row = 0
 
     @property
     def changed(self) -> bool:
         """True if the run of outliers is long enough to prove a change."""
-        return self.in_a_row >= CHANGE
+        return self.in_a_row >= OutlierSettings.change_pairs
 
     @property
     def perhaps_changed(self) -> bool:
         """True if the run of outliers is long enough for a change, provided that one explanation fits them."""
-        return self.in_a_row >= FEWEST_FOR_CHANGE
+        return self.in_a_row >= OutlierSettings.explained_change_pairs
 
     def doubt(self, q: FloatArray, x: FloatArray, distance_m: float, limit_m: float) -> bool:
         """Return True if the pair at q (d,), x (3,), `distance_m` from its prediction, is an outlier."""
@@ -67,13 +71,15 @@ def sound(distances_m: FloatArray, noise_m: float) -> NDArray[np.bool_]:
         noise_m: RMS distance between measurement and truth.
     """
     rms = math.sqrt(3.0) * MEDIAN_TO_SIGMA * float(np.median(distances_m))
-    return np.asarray(distances_m <= DOUBT * max(math.hypot(rms, noise_m), SMALLEST_M))
+    return np.asarray(
+        distances_m <= OutlierSettings.times_farther * max(math.hypot(rms, noise_m), OutlierSettings.smallest_m)
+    )
 
 
 def explained(before_m: FloatArray, after_m: FloatArray, expected_m: float) -> bool:
     """Return True if reducing a run's distances from `before_m` (n,) [m] to `after_m` (n,) [m] is enough."""
     before, after = (float(np.sqrt(np.square(distances).mean())) for distances in (before_m, after_m))
-    return after <= min(TOGETHER * expected_m, before / DOUBT)
+    return after <= min(OutlierSettings.explained_multiple * expected_m, before / OutlierSettings.times_farther)
 
 
 def limits_m(inside_m: FloatArray, open_m: FloatArray) -> FloatArray:
@@ -83,4 +89,4 @@ def limits_m(inside_m: FloatArray, open_m: FloatArray) -> FloatArray:
         inside_m: RMS distance of recent pairs from their predictions (n,).
         open_m: RMS uncertainty of the predictions at the pairs' poses, from what the data do not determine yet (n,).
     """
-    return DOUBT * np.maximum(np.hypot(inside_m, open_m), SMALLEST_M)
+    return OutlierSettings.times_farther * np.maximum(np.hypot(inside_m, open_m), OutlierSettings.smallest_m)

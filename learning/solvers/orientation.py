@@ -22,15 +22,19 @@ from kbmaps import (
 )
 from kbmaps.arrays import evenly_spread
 
-# Number of the newest pairs that exact maps are fitted to, which bounds time and memory. Measured where a chain misses
-# 10 mm (docs/results/learning.md).
-WINDOW = 20_000
-# Number of the newest pairs kept as pairs, and of those that a chain is fitted to, evenly spread.
-KEPT, FITTED = 4000, 1000
-# Growth of the number of pairs before the next solution, with a new search for the maps' precision; the chain with
-# residual waits for it too, since it takes up to a second.
-GROWTH = 1.15
-FEWEST_FOR_MAP = 30  # Minimum number of orientations for a map: with fewer, the chain suffices
+
+class BatchSettings:
+    # Number of the newest pairs that exact maps are fitted to, which bounds time and memory. Measured where a chain
+    # misses 10 mm (docs/results/learning.md).
+    window = 20_000
+    # Number of the newest pairs kept as pairs, and of those that a chain is fitted to, evenly spread.
+    kept, fitted = 4000, 1000
+    # Growth of the number of pairs before the next solution, with a new search for the maps' precision; the chain with
+    # residual waits for it too, since it takes up to a second.
+    growth = 1.15
+    fewest_for_map = 30  # Minimum number of orientations for a map: with fewer, the chain suffices
+
+
 # An entry of a rotation matrix errs by this much of a small turn's 1-sigma about one axis: √(2/3).
 ENTRY_OF_TURN = 0.8165
 
@@ -61,7 +65,7 @@ class OrientationSolver:
     @property
     def due(self) -> bool:
         """True if there are enough new orientations for another solution."""
-        return self._pairs > 0 and self._pairs >= GROWTH * self._solved_at
+        return self._pairs > 0 and self._pairs >= BatchSettings.growth * self._solved_at
 
     def learn(self, q: FloatArray, x: FloatArray, turns: FloatArray) -> None:
         """Add pairs q (n, d), x (n, 3) and quaternions (n, 4), NaN where a pair has none."""
@@ -71,18 +75,22 @@ class OrientationSolver:
         self._turns = np.vstack([self._turns, turns[told]])
         if self._exact is not None:
             self._feed(self._exact)
-        self._q, self._x, self._turns = self._q[-KEPT:], self._x[-KEPT:], self._turns[-KEPT:]
+        self._q, self._x, self._turns = (
+            self._q[-BatchSettings.kept :],
+            self._x[-BatchSettings.kept :],
+            self._turns[-BatchSettings.kept :],
+        )
 
     def solve(self, belief: ChainBelief) -> OrientationSolution:
         """Return the solution around the posterior of the chain; at least one orientation is required."""
         self._solved_at = self._pairs
-        chosen = evenly_spread(len(self._q), FITTED)
+        chosen = evenly_spread(len(self._q), BatchSettings.fitted)
         chain = fitted_orientation(belief, self._q[chosen], self._turns[chosen])
-        if not self._with_map or self._pairs < FEWEST_FOR_MAP:
+        if not self._with_map or self._pairs < BatchSettings.fewest_for_map:
             return OrientationSolution(self._pairs, chain)
         prior = chain.chain.to_kbmap(self._bases, orientation=True)
         if self._exact is None:
-            self._exact = ExactLearner(prior, memory=Memory(window=WINDOW))
+            self._exact = ExactLearner(prior, memory=Memory(window=BatchSettings.window))
             self._fed = self._pairs - len(self._q)
             self._feed(self._exact)
         self._exact.rebase(prior)

@@ -12,7 +12,7 @@ import numpy as np
 
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.learning.model_bank import EXACT, RESIDUAL, RIGID, LearntModel
-from bodyschema.learning.solvers.orientation import GROWTH, KEPT, WINDOW, OrientationSolution, OrientationSolver
+from bodyschema.learning.solvers.orientation import BatchSettings, OrientationSolution, OrientationSolver
 from bodyschema.learning.solvers.tolerance_selection import Tolerances, best_tolerances, workmanship
 from kbmaps import (
     ChainBelief,
@@ -33,10 +33,8 @@ from kbmaps.arrays import evenly_spread
 
 log = logging.getLogger(__name__)
 
-LARGEST_NET = 2187  # Memory and time grow with the square and the cube of the control points: 3^7 take 77 MB and 0.2 s
 
-
-class _Settings:
+class SolverSettings:
     retune: float = 1.25  # growth of the number of pairs before the next search for the prior's precision
     fitted: int = 2000  # number of pairs that a chain is fitted to, evenly spread
     # With this growth of the number of pairs, this share of them is solved for first, if it is at least this many.
@@ -45,10 +43,12 @@ class _Settings:
     fewest_first: int = 5
     shared: float = 1.5  # minimum number of neighbours counting as one at which their correlation is not chance
     growth: float = 0.1  # while pairs are few, a solution is cheap, and renewed after this growth of their number
+    # Memory and time grow with the square and the cube of the control points: 3^7 take 77 MB and 0.2 s
+    largest_net: int = 2187
 
 
 # The information about the chain of pairs older than those kept is folded into its prior, this many at a time.
-FOLDED = _Settings.fitted
+FOLDED = SolverSettings.fitted
 
 
 @dataclass(frozen=True)
@@ -116,8 +116,8 @@ class DirectSolver:
         """Forget all pairs and begin a new task."""
         self._solved_at = 0
         self._task, self._folded, self._folded_residual = task, task.belief, task.residual or task.belief
-        within = Memory(window=WINDOW)
-        small = task.prior.size <= LARGEST_NET
+        within = Memory(window=BatchSettings.window)
+        small = task.prior.size <= SolverSettings.largest_net
         self._exact = ExactLearner(task.prior, memory=within) if small else None
         self._orientations = OrientationSolver(task.prior.bases, with_map=small)
         self._precision, self._tuned_at, self._residual_at, self._pairs, self._solved = None, 0, 0, 0, []
@@ -133,7 +133,7 @@ class DirectSolver:
         self._pairs += len(q)
         self._q, self._x = np.vstack([self._q, q]), np.vstack([self._x, x])
         self._cov = np.concatenate([self._cov, np.full((len(q), 3, 3), np.nan) if cov is None else cov])
-        while len(self._q) > KEPT:
+        while len(self._q) > BatchSettings.kept:
             oldest, before = self._first(FOLDED), self._residual_before
             self._folded = fitted_belief(self._before, *oldest)
             self._folded_residual = fitted_residual(before, *oldest) or before
@@ -150,12 +150,12 @@ class DirectSolver:
         if self._task is None:
             raise RuntimeError("start a task first")
         task = self._task
-        if self._pairs >= _Settings.first_growth * self._solved_at:
+        if self._pairs >= SolverSettings.first_growth * self._solved_at:
             yield from self._solved_of_some(task)
         self._solved_at = self._pairs
         wide = fitted_belief(self._before, self._q, self._x, self._cov)
         made = _ways_made(wide, task, self._q)
-        residual_due = self._pairs >= GROWTH * self._residual_at
+        residual_due = self._pairs >= BatchSettings.growth * self._residual_at
         turns = self._orientations if self._orientations is not None and self._orientations.due else None
         rigid = _solved_chain(task, self._pairs, wide, made)
         yield replace(rigid, last=self._exact is None and not residual_due and turns is None)
@@ -175,8 +175,8 @@ class DirectSolver:
 
     def _solved_of_some(self, task: Task) -> Iterator[Solved]:
         """Yield the chain fitted to the first pairs only, so that the remaining pairs can test it."""
-        some = int(len(self._q) * _Settings.first_share)
-        if some >= _Settings.fewest_first:
+        some = int(len(self._q) * SolverSettings.first_share)
+        if some >= SolverSettings.fewest_first:
             wide = fitted_belief(self._before, *self._first(some))
             pairs = self._pairs - len(self._q) + some
             yield replace(_solved_chain(task, pairs, wide, _ways_made(wide, task, self._q[:some])), last=False)
@@ -187,7 +187,7 @@ class DirectSolver:
         The evidence finds the prior's precision if pairs are apart. On a guided path, neighbours share their errors,
         which the evidence would take for shape: there, left-out blocks choose it.
         """
-        retune = self._precision is None or learner.pairs >= _Settings.retune * self._tuned_at
+        retune = self._precision is None or learner.pairs >= SolverSettings.retune * self._tuned_at
         try:
             solution = learner.solve(self._sought_precision(learner.prior) if retune else self._precision)
         except SettingError:
@@ -244,7 +244,7 @@ def fitted_belief(prior: ChainBelief, q: FloatArray, x: FloatArray, cov: FloatAr
         x: positions (n, 3) [m].
         cov: their covariances (n, 3, 3) [m²], NaN where a pair has none; None where no pair has any.
     """
-    chosen = evenly_spread(len(q), _Settings.fitted)
+    chosen = evenly_spread(len(q), SolverSettings.fitted)
     q, x = q[chosen], x[chosen]
     learner = RigidLearner(prior.parameters.reference, ChainTolerances(), prior)
     learner.learn(q, x)
@@ -252,7 +252,7 @@ def fitted_belief(prior: ChainBelief, q: FloatArray, x: FloatArray, cov: FloatAr
         learner.weigh(cov[chosen])
     inliers, data = learner.inliers, learner.data
     shared = shared_by(data.whitened(x - learner.predict(q))[inliers])
-    if shared < _Settings.shared:
+    if shared < SolverSettings.shared:
         return learner.belief
     again = RigidLearner(prior.parameters.reference, ChainTolerances(), prior)
     noise = learner.scatter.noise * math.sqrt(shared)
@@ -270,7 +270,7 @@ def fitted_residual(
 
     None if it was lost in rounding: the other models keep answering.
     """
-    chosen = evenly_spread(len(q), _Settings.fitted)
+    chosen = evenly_spread(len(q), SolverSettings.fitted)
     parameters = prior.parameters if isinstance(prior, ChainBelief) else prior.features.parameters
     learner = ResidualLearner(parameters.reference, ChainTolerances(), prior)
     learner.learn(q[chosen], x[chosen])
@@ -301,7 +301,7 @@ class SolverClient:
     @property
     def due(self) -> bool:
         """True if it is time to ask."""
-        enough = min(self._every, max(_Settings.growth * self._solved_at, 1.0))
+        enough = min(self._every, max(SolverSettings.growth * self._solved_at, 1.0))
         return self.fed > 0 and (self._soon or self.fed - self._solved_at >= enough)
 
     def works_on(self, task: int) -> bool:

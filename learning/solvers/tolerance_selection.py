@@ -12,13 +12,16 @@ from numpy.typing import NDArray
 from bodyschema.interfaces.records import FloatArray
 from kbmaps import ChainBelief, ChainTolerances
 from kbmaps.arrays import evenly_spread
-from kbmaps.robust import ROUNDING_M
+from kbmaps.robust import RobustSettings
 
-# Candidate tilts of an axis [rad] and shifts [m], 1-sigma, from a milled arm to a kit.
-WORKMANSHIP = ((0.0003, 0.0001), (0.001, 0.0005), (0.003, 0.001), (0.01, 0.003), (0.03, 0.01), (0.06, 0.03))
-FOLLOWED = 100  # pairs at which candidates are compared with the posterior, evenly spread
-LEAST_SHARE = 0.01  # less probable tolerances are not considered
-LIKELY = 1.0 / 3.0  # narrower tolerances are kept unless wider ones are more probable by more than the inverse of this
+
+class ToleranceSettings:
+    # Candidate tilts of an axis [rad] and shifts [m], 1-sigma, from a milled arm to a kit.
+    workmanship = ((0.0003, 0.0001), (0.001, 0.0005), (0.003, 0.001), (0.01, 0.003), (0.03, 0.01), (0.06, 0.03))
+    compared_pairs = 100  # pairs at which candidates are compared with the posterior, evenly spread
+    least_share = 0.01  # less probable tolerances are not considered
+    # narrower tolerances are kept unless wider ones are more probable by more than the inverse of this
+    likely = 1.0 / 3.0
 
 
 @dataclass(frozen=True)
@@ -44,8 +47,11 @@ def workmanship(belief: ChainBelief, tolerances: ChainTolerances, q: FloatArray)
     Returns:
         The probable candidates, the narrowest last.
     """
-    q = q[evenly_spread(len(q), FOLLOWED)]
-    candidates = [tolerances, *(each for made in reversed(WORKMANSHIP) for each in _narrower(tolerances, *made))]
+    q = q[evenly_spread(len(q), ToleranceSettings.compared_pairs)]
+    candidates = [
+        tolerances,
+        *(each for made in reversed(ToleranceSettings.workmanship) for each in _narrower(tolerances, *made)),
+    ]
     narrowed = [belief.tightened(tolerances, each) for each in candidates]
     lost = _lost_in_the_curve(belief, [found for found, _ in narrowed], q)
     kept, shares = probable(np.array([evidence for _, evidence in narrowed]) - lost)
@@ -63,7 +69,7 @@ def _lost_in_the_curve(belief: ChainBelief, narrowed: Sequence[ChainBelief], q: 
     """
     x, jacobian = belief.parameters.linearised(belief.mean, q)
     spread = jacobian @ belief.root
-    roots = np.linalg.cholesky(spread @ spread.mT + ROUNDING_M**2 * np.eye(3))
+    roots = np.linalg.cholesky(spread @ spread.mT + RobustSettings.rounding_m**2 * np.eye(3))
 
     def square(columns: FloatArray) -> float:
         return float(np.square(np.linalg.solve(roots, columns)).sum(axis=2).mean())
@@ -84,7 +90,7 @@ def probable(evidence: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
     """
     shares = np.exp(evidence - evidence.max())
     shares /= shares.sum()
-    kept = np.array([k for k in np.argsort(-shares) if shares[k] > LEAST_SHARE], dtype=np.intp)
+    kept = np.array([k for k in np.argsort(-shares) if shares[k] > ToleranceSettings.least_share], dtype=np.intp)
     return kept, shares[kept] / shares[kept].sum()
 
 
@@ -101,7 +107,7 @@ def best_tolerances(belief: ChainBelief, tolerances: ChainTolerances, made: Sequ
     """
     beliefs = [belief.tightened(tolerances, each.tolerances)[0] for each in made]
     likely = max(each.share for each in made)
-    best = max(k for k, each in enumerate(made) if each.share > LIKELY * likely)
+    best = max(k for k, each in enumerate(made) if each.share > ToleranceSettings.likely * likely)
     return beliefs[best].among(beliefs, [each.share for each in made])
 
 

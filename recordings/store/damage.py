@@ -20,15 +20,18 @@ from . import schema as store_schema
 from .file import is_damage
 from .rows import COLUMNS, DamagedRow, decoded, require_sound, sealed
 
-# After this many unreadable numbers in a row, the search for the next readable one takes growing steps: a damaged page
-# holds some ten pairs, one above it some thousand. A larger value takes longer, a smaller one skips more.
-PATIENCE = 64
-# Lower bound for a row of `pairs`. Pages linked in a circle yield more rows than fit into the file.
-SMALLEST_ROW_BYTES = 20
-# Numbers left free after the newest readable pair where SQLite lost the end of the store, because they may have been
-# used. A page of 4096 bytes holds at most 37 pairs.
-LEFT_FREE = 50
-SHOWN = 8  # damaged places listed in a sentence
+
+class _Settings:
+    # After this many unreadable numbers in a row, the search for the next readable one takes growing steps: a damaged
+    # page holds some ten pairs, one above it some thousand. A larger value takes longer, a smaller one skips more.
+    patience = 64
+    # Lower bound for a row of `pairs`. Pages linked in a circle yield more rows than fit into the file.
+    smallest_row_bytes = 20
+    # Numbers left free after the newest readable pair where SQLite lost the end of the store, because they may have
+    # been used. A page of 4096 bytes holds at most 37 pairs.
+    left_free = 50
+    shown = 8  # damaged places listed in a sentence
+
 
 Made = TypeVar("Made")
 Make = Callable[[tuple[Any, ...]], Made]
@@ -73,8 +76,8 @@ class Damage:
         return Damage(tuple((max(first, oldest), last) for first, last in self.ranges if last >= oldest))
 
     def __str__(self) -> str:
-        shown = [str(a) if a == b else f"{a} to {b}" for a, b in self.ranges[:SHOWN]]
-        more = len(self.ranges) - SHOWN
+        shown = [str(a) if a == b else f"{a} to {b}" for a, b in self.ranges[: _Settings.shown]]
+        more = len(self.ranges) - _Settings.shown
         return ", ".join(shown) + (f" and at {more} other places" if more > 0 else "")
 
 
@@ -101,7 +104,7 @@ def scan(connection: sqlite3.Connection, columns: str, make: Make[Made], first: 
             if not is_damage(error):
                 raise
         failed_at = position if failed_at is None else failed_at
-        position += 1 + (position - failed_at) // PATIENCE
+        position += 1 + (position - failed_at) // _Settings.patience
 
 
 def scan_back(connection: sqlite3.Connection, columns: str, make: Make[Made]) -> Iterator[Made | None]:
@@ -229,7 +232,7 @@ def _copy(source: sqlite3.Connection, target: sqlite3.Connection, fresh: dict[st
             sound = (row for row in records(source, table) if row is not None)
             target.executemany(store_schema.INSERT[table], map(_written, sound))
         newest = target.execute("SELECT coalesce(max(seq), 0) FROM pairs").fetchone()[0]
-        given = max(store_schema.given_up_to(contents), newest + (LEFT_FREE if behind is None else behind))
+        given = max(store_schema.given_up_to(contents), newest + (_Settings.left_free if behind is None else behind))
         store_schema.write_meta(target, {**contents, store_schema.GIVEN_UP_TO: str(given)})
 
 
@@ -261,4 +264,4 @@ def _rows(connection: sqlite3.Connection, statement: str, start: int) -> Iterato
 
 def _most_rows(connection: sqlite3.Connection) -> int:
     pages, size = (connection.execute(f"PRAGMA {name}").fetchone()[0] for name in ("page_count", "page_size"))
-    return pages * size // SMALLEST_ROW_BYTES
+    return pages * size // _Settings.smallest_row_bytes

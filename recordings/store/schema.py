@@ -21,9 +21,14 @@ WITH_DEVICES, WITH_ORIENTATION, WITH_CHECKSUMS = 2, 3, 5
 CHECKSUM = "checksum"  # a column of each table, and a key of `meta`
 GIVEN_UP_TO = "given_up_to"  # a key of `meta`: pairs up to this number may have been numbered, and are lost
 NUMBERS = ("seq", "id", "session", "segment", "t", "from_seq")  # columns that are not texts
-LONGEST_IDENTITY = 100  # characters; a UUID has 36
-LARGEST_VALUE_BYTES = 2**26  # of one row; URDF and robot.toml of a session are the largest
-STEPS_UNTIL_TOLD = 100_000  # of SQLite's machine; it does some millions in a second
+
+
+class _Settings:
+    longest_identity = 100  # characters; a UUID has 36
+    largest_value_bytes = 2**26  # of one row; URDF and robot.toml of a session are the largest
+    steps_until_told = 100_000  # of SQLite's machine; it does some millions in a second
+
+
 APPLICATION_ID = 0x42534348  # "BSCH": how `file` and we tell a pair store from another SQLite file
 
 _TABLES = """
@@ -76,7 +81,7 @@ def connect(file: Path, *, readonly: bool = False) -> sqlite3.Connection:
     uri = f"{file.absolute().as_uri()}?mode={'ro' if readonly else 'rwc'}"
     connection = sqlite3.connect(uri, uri=True, isolation_level=None, check_same_thread=False)
     connection.text_factory = bytes  # a text that is not UTF-8 then affects its own row only
-    connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_VALUE_BYTES)
+    connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _Settings.largest_value_bytes)
     connection.execute("PRAGMA trusted_schema = OFF")
     return connection
 
@@ -84,7 +89,7 @@ def connect(file: Path, *, readonly: bool = False) -> sqlite3.Connection:
 @contextmanager
 def told_while_working(connection: sqlite3.Connection, working: Callable[[], None]) -> Iterator[None]:
     """Call `working` repeatedly while SQLite runs statements on this connection."""
-    connection.set_progress_handler(working, STEPS_UNTIL_TOLD)
+    connection.set_progress_handler(working, _Settings.steps_until_told)
     try:
         yield
     finally:
@@ -171,7 +176,7 @@ def meta(connection: sqlite3.Connection) -> dict[str, str]:
     try:
         found = {key.decode(): value.decode() for key, value in rows}
         sealed = version(connection) < WITH_CHECKSUMS or found.pop(CHECKSUM) == str(_checksum_of(found))
-        if not (sealed and found["store"].isprintable() and 0 < len(found["store"]) <= LONGEST_IDENTITY):
+        if not (sealed and found["store"].isprintable() and 0 < len(found["store"]) <= _Settings.longest_identity):
             raise ValueError
         joints_of(found)
         given_up_to(found)

@@ -12,7 +12,6 @@ import pytest
 from fitted_once import fitted_once as fitted_once
 from scipy.spatial.transform import Rotation
 
-from bodyschema.calibration.chain_figures import HALF_WIDTH_95
 from bodyschema.calibration.plausibility.verdict import Plausibility
 from bodyschema.calibration.report import CalibrationReport
 from bodyschema.calibration.rigid_chain import Calibration
@@ -22,6 +21,7 @@ from bodyschema.recordings.recording import Recording
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.hand_eye import HandEye, write_launch_file
 from kbmaps import ChainParameters, ChainTolerances
+from kbmaps.robust import HALF_WIDTH_95
 
 DESK_ARM = Path(__file__).parents[2] / "examples" / "desk_arm"
 SIGMA_M = 5e-4

@@ -11,7 +11,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.optimize import minimize_scalar
 
 from benchmarks.tables import Column, Table
-from bodyschema.calibration.latency import EARLIEST_S, LATEST_S, STEP_S, Latency, LatencyError, Wiggle, latency_of
+from bodyschema.calibration.latency import Latency, LatencyError, LatencySettings, Wiggle, latency_of
 from bodyschema.cli.hardware.wiggling import read_wiggle, wiggle_of, write_wiggle
 from bodyschema.interfaces.errors import RecordingError
 from bodyschema.robot.description import RobotDescription
@@ -46,7 +46,7 @@ def latency_by_speed(wiggle: Wiggle, chain: RigidChain) -> float:
 
     For comparison: the nominal arm's speed is not the real one's, and noise is differentiated.
     """
-    t = wiggle.t_marker[(wiggle.t_marker - LATEST_S >= wiggle.t_joints[0])]
+    t = wiggle.t_marker[(wiggle.t_marker - LatencySettings.latest_s >= wiggle.t_joints[0])]
     x = wiggle.x[-len(t) :]
     middle, half = 0.5 * (t[1:] + t[:-1]), 0.5 * float(np.median(np.diff(t)))
     seen = np.linalg.norm(np.diff(x, axis=0), axis=1) / np.diff(t)
@@ -55,9 +55,10 @@ def latency_by_speed(wiggle: Wiggle, chain: RigidChain) -> float:
         ends = [chain.positions(wiggle.angles(middle - lag + side)) for side in (half, -half)]
         return -float(np.corrcoef(np.linalg.norm(ends[0] - ends[1], axis=1), seen)[0, 1])
 
-    grid = np.arange(EARLIEST_S, LATEST_S, STEP_S)
+    grid = np.arange(LatencySettings.earliest_s, LatencySettings.latest_s, LatencySettings.step_s)
     best = grid[int(np.argmin([mismatch(lag) for lag in grid]))]
-    found = minimize_scalar(mismatch, bounds=(best - STEP_S, best + STEP_S), method="bounded")
+    step_s = LatencySettings.step_s
+    found = minimize_scalar(mismatch, bounds=(best - step_s, best + step_s), method="bounded")
     return float(found.x)  # pyright: ignore[reportAttributeAccessIssue]
 
 

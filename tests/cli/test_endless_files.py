@@ -161,7 +161,7 @@ def test_blocks_of_a_recording_are_one_recording(tmp_path: Path, monkeypatch: py
     rows = np.random.default_rng(0).normal(size=(60, 5))
     text = HEADER.decode() + "".join(",".join(map(repr, row)) + "\r\n" for row in rows.tolist())
     (tmp_path / "a.csv").write_bytes(text.encode())
-    monkeypatch.setattr(recording_csv, "BLOCK_BYTES", 500)
+    monkeypatch.setattr(recording_csv._Settings, "block_bytes", 500)
     recording = Recording.read(tmp_path / "a.csv", JOINTS)
     np.testing.assert_array_equal(np.hstack([recording.q, recording.x]), rows)
     for wrong, said in (
@@ -175,8 +175,8 @@ def test_blocks_of_a_recording_are_one_recording(tmp_path: Path, monkeypatch: py
 
 
 def test_more_numbers_than_fit_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recording_csv, "MOST_NUMBERS", 50)
-    monkeypatch.setattr(recording_csv, "BLOCK_BYTES", 50)
+    monkeypatch.setattr(recording_csv.ColumnLimits, "most_numbers", 50)
+    monkeypatch.setattr(recording_csv._Settings, "block_bytes", 50)
     (tmp_path / "a.csv").write_bytes(HEADER + b"0,0,1,2,3\n" * 11)
     with pytest.raises(RecordingError, match="there are more than 10 rows of these columns"):
         Recording.read(tmp_path / "a.csv", JOINTS)

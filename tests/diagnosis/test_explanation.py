@@ -15,7 +15,7 @@ from bodyschema.diagnosis.assess.explanation import Explanation, explain, useful
 from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.observations import Observations
-from bodyschema.diagnosis.fit.worth import NAMED
+from bodyschema.diagnosis.fit.worth import WorthSettings
 from bodyschema.diagnosis.search.held_out import Blocks
 from bodyschema.diagnosis.search.search import Search
 from bodyschema.diagnosis.unnamed.families import families
@@ -57,7 +57,7 @@ def fits_on_the_way() -> list[Fit]:
 
 def test_marginally_better_extra_cause_is_not_added(monkeypatch) -> None:
     fits = fits_on_the_way()
-    assert explained_beside(fits, [100.0, 101.0 + NAMED, 0.0], monkeypatch).fit is fits[0]
+    assert explained_beside(fits, [100.0, 101.0 + WorthSettings.named_nats, 0.0], monkeypatch).fit is fits[0]
 
 
 def test_clearly_better_extra_cause_is_added(monkeypatch) -> None:

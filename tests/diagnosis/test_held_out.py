@@ -97,7 +97,7 @@ def test_held_out_errors_exceed_errors_on_fitted_rows(small) -> None:
 @pytest.mark.parametrize("folds", [2, 15])
 def test_held_out_error_hardly_depends_on_fold_count(small, monkeypatch, folds) -> None:
     usual = np.linalg.norm(held_out_errors(small, Blocks.cut(60)))
-    monkeypatch.setattr("bodyschema.diagnosis.search.held_out._Settings.folds", folds)
+    monkeypatch.setattr("bodyschema.diagnosis.search.held_out.HeldOutSettings.folds", folds)
     assert np.linalg.norm(held_out_errors(small, Blocks.cut(60))) == pytest.approx(usual, rel=0.05)
 
 

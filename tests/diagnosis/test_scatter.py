@@ -14,7 +14,7 @@ from bodyschema.diagnosis.fit.alignment import aligned
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.fit.scatter import instruments
-from bodyschema.diagnosis.fit.worth import NAMED, nats
+from bodyschema.diagnosis.fit.worth import WorthSettings, nats
 from bodyschema.diagnosis.search.held_out import Blocks, block_p_value
 from bodyschema.diagnosis.search.search import Search
 from bodyschema.effects import Effect, Motion, Simulation
@@ -119,7 +119,7 @@ def with_false_play(robot: RobotDescription, seed: int) -> tuple[Fit, Search]:
     """Return a fit with a backlash that the joint does not have; noisy readings make the likelihood favour it."""
     fit, search = fit_of(robot, seed), Search([Effect.at(robot, "backlash", ELBOW)], lambda _: None)
     false = fit.with_causes([Effect.at(robot, "backlash", ELBOW, values=[0.3 * SCATTER_RAD])])
-    assert nats(2.0 * (false.log_likelihood - fit.log_likelihood), 1) > NAMED
+    assert nats(2.0 * (false.log_likelihood - fit.log_likelihood), 1) > WorthSettings.named_nats
     return false, search
 
 

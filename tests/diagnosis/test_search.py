@@ -10,7 +10,7 @@ from planted_cases import BASE, ELBOW, INTERVAL_S, SHOULDER, WRIST, at_rest, des
 
 from bodyschema.diagnosis.assess.rivals import standings
 from bodyschema.diagnosis.fit.fit import Fit
-from bodyschema.diagnosis.fit.worth import NAMED, nats, rise_for
+from bodyschema.diagnosis.fit.worth import WorthSettings, nats, rise_for
 from bodyschema.diagnosis.search.held_out import Blocks
 from bodyschema.diagnosis.search.scan import Candidate, Scan
 from bodyschema.diagnosis.search.search import Search, contains, simplicity
@@ -200,7 +200,7 @@ def test_required_evidence_rises_with_hypothesis_count(robot) -> None:
     offset = Effect.at(robot, "joint_offset", ELBOW)
     few, many = Search([offset], lambda _: None), Search([offset] * 100, lambda _: None)
     (candidate,) = few.shortlist(Scan(start), [offset])
-    assert many.doubt(candidate) > few.doubt(candidate) + NAMED
+    assert many.doubt(candidate) > few.doubt(candidate) + WorthSettings.named_nats
 
 
 class Undecided(Search):

@@ -12,7 +12,7 @@ from bodyschema.diagnosis.assess.residual_structure import ResidualStructure
 from bodyschema.diagnosis.assess.stored import _Elsewhere, stored
 from bodyschema.diagnosis.diagnosis import _stored
 from bodyschema.diagnosis.fit.alignment import aligned
-from bodyschema.diagnosis.fit.background import MOST, Scales
+from bodyschema.diagnosis.fit.background import BackgroundSettings, Scales
 from bodyschema.diagnosis.fit.fit import Fit
 from bodyschema.diagnosis.fit.observations import Observations
 from bodyschema.diagnosis.search.held_out import Blocks, is_marker
@@ -46,7 +46,7 @@ def test_a_joint_offset_is_stored(robot) -> None:
 
 def test_tolerances_fitted_to_drift_are_not_stored(robot) -> None:
     start = placed(robot, 0.05 * np.sin(np.linspace(0.0, 30.0, ROWS)))
-    large = start.tolerating(Scales(MOST, MOST, MOST))
+    large = start.tolerating(Scales(*[BackgroundSettings.largest_scale] * 3))
     assert np.square(large.residuals).sum() < np.square(start.residuals).sum()
     assert stored([start, large], is_marker(large)) is start
 

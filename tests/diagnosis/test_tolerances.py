@@ -131,7 +131,7 @@ def test_interval_includes_uncertainty_of_the_tolerances(robot: RobotDescription
     fit = _with_small_tolerances(robot)
     (place,) = fit.places(fit.causes[0])
     integrated = fit.covariance[place, place]
-    monkeypatch.setattr("bodyschema.diagnosis.fit.fit._Settings.nodes", np.zeros(1))
+    monkeypatch.setattr("bodyschema.diagnosis.fit.fit.FitSettings.nodes", np.zeros(1))
     assert integrated > 1.2 * replace(fit).covariance[place, place]
 
 
@@ -140,7 +140,7 @@ def test_interval_hardly_depends_on_quadrature_node_count(robot: RobotDescriptio
     fit = _with_small_tolerances(robot)
     (place,) = fit.places(fit.causes[0])
     before = fit.covariance[place, place]
-    monkeypatch.setattr("bodyschema.diagnosis.fit.fit._Settings.nodes", np.linspace(-3.0, 3.0, count))
+    monkeypatch.setattr("bodyschema.diagnosis.fit.fit.FitSettings.nodes", np.linspace(-3.0, 3.0, count))
     assert np.sqrt(replace(fit).covariance[place, place] / before) == pytest.approx(1.0, abs=0.05)
 
 

@@ -11,7 +11,7 @@ from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.errors import SourceEnded, SourceError
 from bodyschema.interfaces.protocols import JointSource, MarkerSource
 from bodyschema.interfaces.records import JointReading, MarkerFix
-from bodyschema.recordings.recording import RESET_GAP_S, Recording
+from bodyschema.recordings.recording import Recording, RecordingSettings
 
 STEREO = StereoCalibration(
     focal_px=700.0, principal_point_px=(320.0, 240.0), baseline_m=0.2, image_size_px=(640, 480), pixel_sigma=0.2
@@ -88,7 +88,7 @@ def test_times_are_made_up_for_rows_without() -> None:
 
 def test_times_go_on_where_the_clock_was_reset() -> None:
     t = Replay(recording(4, t=[5.0, 6.0, 1.0, 3.0], segment=[1, 1, 2, 2])).t
-    assert np.diff(t).tolist() == [1.0, RESET_GAP_S, 2.0]
+    assert np.diff(t).tolist() == [1.0, RecordingSettings.reset_gap_s, 2.0]
 
 
 def test_both_sides_report_the_end() -> None:

@@ -157,7 +157,7 @@ def test_a_long_description_of_a_bag_is_refused(tmp_path) -> None:
 
 def test_chunk_unpacking_beyond_memory_is_rejected(tmp_path, monkeypatch) -> None:
     zstd = pytest.importorskip("backports.zstd")
-    monkeypatch.setattr(recording_bag, "MOST_MEMORY_BYTES", 2**26)
+    monkeypatch.setattr(recording_bag.FileLimits, "memory_bytes", 2**26)
     unpacked = 2**28
 
     def text(value: bytes) -> bytes:

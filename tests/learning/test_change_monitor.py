@@ -9,18 +9,18 @@ import pytest
 from guided_arm import NOW_AND_THEN, built_chain, measured, new_learning, path, teach
 
 from bodyschema.interfaces.records import Pair, frozen_array
-from bodyschema.learning.changes.monitor import MOST_WATCHED, ChangeMonitor
+from bodyschema.learning.changes.monitor import ChangeMonitor, MonitorSettings
 
 COARSE_RAD = np.radians(1.0)
 
 
 def test_monitor_keeps_bounded_pairs_without_a_model() -> None:
     watch, cov = ChangeMonitor(), frozen_array(np.eye(3))
-    for seq in range(1, MOST_WATCHED + 200):
+    for seq in range(1, MonitorSettings.most_watched + 200):
         watch.add(
             Pair("simulated", seq, 1, 0.0, "", frozen_array(np.zeros(2)), frozen_array(np.zeros(3)), cov), kept=True
         )
-    assert 0 < watch.held <= MOST_WATCHED
+    assert 0 < watch.held <= MonitorSettings.most_watched
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from bodyschema.learning.changes.known_arm import KnownArm
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.model_bank import INSTANT
 from bodyschema.learning.nominal import NominalModel
-from bodyschema.learning.online_learner import MOST_TOGETHER, OnlineLearner
+from bodyschema.learning.online_learner import OnlineLearner, OnlineSettings
 from bodyschema.learning.regime import Regime
 from bodyschema.learning.solvers.solver import DirectSolver
 from bodyschema.learning.uncertainty import ErrorMemory, UncertaintyTracker
@@ -102,7 +102,7 @@ def test_change_is_detected_within_one_batch(moved_m: float) -> None:
     noticed = [taught(pairs, seconds).change for seconds in (0.0, TOGETHER_S)]
     at_once, together = (0 if change is None else change.noticed_seq for change in noticed)
     assert before < at_once
-    assert before < together <= at_once + MOST_TOGETHER
+    assert before < together <= at_once + OnlineSettings.most_together
 
 
 def test_pairs_after_a_change_join_the_new_regime() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 from guided_arm import Scene, nominal_model
 
 from bodyschema.learning.changes.known_arm import KnownArm
-from bodyschema.learning.changes.outlier_gate import CHANGE, OutlierGate
+from bodyschema.learning.changes.outlier_gate import OutlierGate, OutlierSettings
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.regime import Regime
 from bodyschema.learning.uncertainty import UncertaintyTracker
@@ -51,9 +51,9 @@ def test_a_restored_run_goes_on() -> None:
 
 def test_run_is_limited_to_newest_change_pairs() -> None:
     doubts = OutlierGate(1)
-    for number in range(CHANGE + 2):
+    for number in range(OutlierSettings.change_pairs + 2):
         meet(doubts, number, FAR)
-    assert run(doubts) == [float(number) for number in range(2, CHANGE + 2)]
+    assert run(doubts) == [float(number) for number in range(2, OutlierSettings.change_pairs + 2)]
 
 
 def test_initial_pairs_contradicting_fitted_tool_join_no_run() -> None:

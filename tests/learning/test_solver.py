@@ -44,7 +44,7 @@ def after_a_long_rest(arm: RigidChain, seen_first: FloatArray) -> dict[str, Lear
     q = np.vstack([seen_first, seen_first[-1] + rng.normal(0.0, 0.02, (KEPT + 1 - FOLDED, NOMINAL.joints))])
     solver.start(TASK)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(solver_module, "KEPT", KEPT)
+        patch.setattr(solver_module.BatchSettings, "kept", KEPT)
         patch.setattr(solver_module, "FOLDED", FOLDED)
         solver.learn(q, arm.positions(q) + SIGMA_M * rng.normal(size=(len(q), 3)))
         return {solved.name: solved.model for solved in solver.solutions() if solved.model is not None}
@@ -61,7 +61,7 @@ def test_knowledge_from_discarded_pairs_is_not_forgotten(
 
 def test_pairs_outside_window_do_not_affect_exact_map(arm: RigidChain, monkeypatch) -> None:
     window, older = 200, 300
-    monkeypatch.setattr(solver_module, "WINDOW", window)
+    monkeypatch.setattr(solver_module.BatchSettings, "window", window)
     q, solver = path(np.random.default_rng(5), older + window), DirectSolver()
     x = arm.positions(q)
     x[:older] += 0.1

@@ -22,7 +22,8 @@ from bodyschema.interfaces.errors import RecordingError, StoreError
 from bodyschema.interfaces.records import MarkerFix, frozen_array
 from bodyschema.recordings.files import from_store
 from bodyschema.recordings.store import schema as store_schema
-from bodyschema.recordings.store.damage import LEFT_FREE, Damage
+from bodyschema.recordings.store.damage import Damage
+from bodyschema.recordings.store.damage import _Settings as DamageSettings
 from bodyschema.recordings.store.retention import Keep
 from bodyschema.recordings.store.rows import COLUMNS, checksum
 from bodyschema.recordings.store.store import PairReader, PairStore, Session, commits, leave_out_damage
@@ -206,7 +207,7 @@ def test_numbers_of_lost_pages_are_not_reused(long) -> None:
     with PairStore(long, SESSION) as store:
         newest = numbers(store)[-1]
         add(store, 1)
-        assert numbers(store)[-1] == newest + LEFT_FREE + 1 > LONG + 1
+        assert numbers(store)[-1] == newest + DamageSettings.left_free + 1 > LONG + 1
 
 
 @pytest.mark.parametrize("place", [0, -1])

@@ -245,7 +245,7 @@ def closed(file: Path) -> Path:
 
 
 def test_opening_a_store_reports_progress(closed, monkeypatch) -> None:
-    monkeypatch.setattr("bodyschema.recordings.store.schema.STEPS_UNTIL_TOLD", 100)
+    monkeypatch.setattr("bodyschema.recordings.store.schema._Settings.steps_until_told", 100)
     told: list[int] = []
     with PairStore(closed, SESSION, working=lambda: told.append(1)) as store:
         opened = len(told)

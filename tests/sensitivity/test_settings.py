@@ -14,22 +14,22 @@ from figures import Figures
 # By scene and class: the settings, and how far half or twice of each may move a figure of the scene.
 LIMITS: dict[tuple[Callable[[], Figures], str], dict[str, float]] = {
     (figures.learner, "kbmaps.chains.rigid_fit._Settings"): {"scales_per_sigma": 0.01, "least_share": 0.01},
-    (figures.learner, "kbmaps.contest._Settings"): {"worse": 0.01, "lately": 0.01, "cap": 0.01},
-    (figures.learner, "kbmaps.maps.block_choice._Settings"): {"first_precision": 0.01},
-    (figures.learner, "bodyschema.learning.changes.monitor._Settings"): {"fewest_known": 0.01},
-    (figures.learner, "bodyschema.learning.regime._Settings"): {
+    (figures.learner, "kbmaps.contest.ContestSettings"): {"worse": 0.01, "lately": 0.01, "cap": 0.01},
+    (figures.learner, "kbmaps.maps.block_choice.BlockSettings"): {"first_precision": 0.01},
+    (figures.learner, "bodyschema.learning.changes.monitor.MonitorSettings"): {"fewest_known": 0.01},
+    (figures.learner, "bodyschema.learning.regime.RegimeSettings"): {
         "recent": 0.01,
         "judged_late": 0.01,
         "judged_anew": 0.01,
     },
-    (figures.learner, "bodyschema.learning.solvers.solver._Settings"): {
+    (figures.learner, "bodyschema.learning.solvers.solver.SolverSettings"): {
         "shared": 0.02,
         "growth": 0.01,
         "first_growth": 0.01,
         "retune": 0.01,
     },
     (figures.models, "kbmaps.chains.rigid_fit._Settings"): {"misfit_chance": 0.01},
-    (figures.models, "kbmaps.residual.evidence._Settings"): {"window": 0.01, "least_gain": 0.05, "settled": 0.01},
+    (figures.models, "kbmaps.residual.evidence.GroupSettings"): {"window": 0.01, "least_gain": 0.05, "settled": 0.01},
     (figures.models, "kbmaps.residual.features._Settings"): {"path_correlation": 0.01},
     (figures.models, "kbmaps.residual.fit._Settings"): {"misfit_sigmas": 0.01},
     (figures.ball, "bodyschema.vision.ball.settings.OutlineSettings"): {
@@ -66,9 +66,9 @@ LIMITS: dict[tuple[Callable[[], Figures], str], dict[str, float]] = {
         "smoothed_waves": 0.02,
     },
     (figures.diagnosis, "bodyschema.diagnosis.assess.explanation._Settings"): {"margin": 0.01},
-    (figures.diagnosis, "bodyschema.diagnosis.fit.fit._Settings"): {"slack": 0.01, "untold": 0.01},
-    (figures.diagnosis, "bodyschema.diagnosis.fit.noise._Settings"): {"noise_alike": 0.01},
-    (figures.diagnosis, "bodyschema.diagnosis.search.scan._Settings"): {"between": 0.01},
+    (figures.diagnosis, "bodyschema.diagnosis.fit.fit.FitSettings"): {"slack": 0.01, "untold": 0.01},
+    (figures.diagnosis, "bodyschema.diagnosis.fit.noise.NoiseSettings"): {"noise_alike": 0.01},
+    (figures.diagnosis, "bodyschema.diagnosis.search.scan.ScanSettings"): {"between": 0.01},
     (figures.diagnosis, "bodyschema.diagnosis.search.search._Settings"): {
         "clearly": 0.01,
         "equal": 0.01,

@@ -114,7 +114,7 @@ def test_malformed_files_are_told_apart(tmp_path, name) -> None:
 
 
 def test_files_beyond_the_limit_are_not_read(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(meshes, "LARGEST_MESH_BYTES", 1 << 20)
+    monkeypatch.setattr(meshes.MeshLimits, "mesh_bytes", 1 << 20)
     (tmp_path / "endless.stl").symlink_to("/dev/zero")
     (tmp_path / "large.stl").write_bytes(bytes(2 << 20))
     for name, why in (("endless.stl", "a device"), ("large.stl", "larger than 1 MiB")):
@@ -123,7 +123,7 @@ def test_files_beyond_the_limit_are_not_read(tmp_path, monkeypatch) -> None:
 
 
 def test_too_many_triangles_are_refused(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(meshes, "MOST_TRIANGLES", 1)
+    monkeypatch.setattr(meshes.MeshLimits, "triangles", 1)
     for name, data in (("a.stl", stl(WEDGE)), ("a.obj", obj(np.tile(WEDGE, (3, 1, 1)))), ("a.dae", collada())):
         (tmp_path / name).write_bytes(data)
         with pytest.raises(MeshError, match=r"more than 1 triangles|too long"):
@@ -131,7 +131,7 @@ def test_too_many_triangles_are_refused(tmp_path, monkeypatch) -> None:
 
 
 def test_meshes_are_limited_together(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(meshes, "_MOST_BYTES", 200)
+    monkeypatch.setattr(meshes.MeshLimits, "all_bytes", 200)
     for name in ("a.stl", "b.stl"):
         (tmp_path / name).write_bytes(stl(WEDGE))
     known = Meshes(tmp_path / "robot.urdf")
@@ -149,7 +149,7 @@ def ball(count):
 
 
 def triangles_of(data):
-    return np.frombuffer(data, dtype=meshes._STL_TRIANGLE, offset=84)["corners"]
+    return np.frombuffer(data, dtype=meshes.STL_TRIANGLE, offset=84)["corners"]
 
 
 def test_heavy_meshes_keep_their_shape(tmp_path) -> None:

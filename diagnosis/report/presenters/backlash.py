@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bodyschema.diagnosis.report.panels import Panel
-from bodyschema.diagnosis.report.residuals import POINTS, Residuals, binned
+from bodyschema.diagnosis.report.residuals import Residuals, ResidualSettings, binned
 from bodyschema.diagnosis.report.svg_plot import Layout, Plot, span
 from bodyschema.effects import Effect
 
@@ -46,7 +46,7 @@ class Backlash(Presenter):
             moving = rows[residuals.direction[rows, k] == way]
             if not len(moving):
                 continue
-            some, bins = residuals.some(POINTS // 2, moving), binned(x[moving], y[moving])
+            some, bins = residuals.some(ResidualSettings.points // 2, moving), binned(x[moving], y[moving])
             marks.append(plot.dots(x[some], y[some], f"pale {look}"))
             marks.append(plot.line(ends, np.full(2, -way * half), f"fit {look}"))
             marks.append(plot.bars(bins.x, bins.y, bins.half, look))

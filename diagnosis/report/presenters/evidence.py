@@ -6,15 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bodyschema.diagnosis.report.panels import Panel
-from bodyschema.diagnosis.report.residuals import POINTS, Residuals, binned
+from bodyschema.diagnosis.report.residuals import Residuals, ResidualSettings, binned
 from bodyschema.diagnosis.report.svg_plot import Layout, Plot, span
 from bodyschema.effects import Effect, Motion
 from bodyschema.effects.encoder import EncoderEffect
 from bodyschema.effects.moments import after
 from bodyschema.interfaces.records import FloatArray
 
-_FINE = 500
-_MANY_CYCLES = 4.0  # a ripple with more cycles is plotted over its phase
+
+class _Settings:
+    fine_points = 500
+    many_cycles = 4.0  # a ripple with more cycles is plotted over its phase
 
 
 def attributed(residuals: Residuals, effect: Effect) -> tuple[FloatArray, FloatArray]:
@@ -32,7 +34,7 @@ def scatter_plot(
     axes: tuple[str, str],
 ) -> Panel:
     x, y = points
-    some = residuals.some(POINTS, rows)
+    some = residuals.some(ResidualSettings.points, rows)
     bins = binned(x[rows], y[rows])
     low, high = np.quantile(y[rows], [Layout.cut, 1.0 - Layout.cut])
     plot = Plot(*axes, span(x[rows]), span(np.array([low, high]), curve[1]))
@@ -51,16 +53,17 @@ def over_reading(residuals: Residuals, effect: Effect) -> Panel:
     over = k if place.source is None else place.source
     partial, _ = attributed(residuals, effect)
     rows, factor = residuals.telling(k), residuals.unit(k)[0]
-    q = np.zeros((_FINE, len(residuals.robot.joints)))
-    q[:, over] = np.linspace(*_ends(residuals.motion.q[rows, over]), _FINE)
+    q = np.zeros((_Settings.fine_points, len(residuals.robot.joints)))
+    q[:, over] = np.linspace(*_ends(residuals.motion.q[rows, over]), _Settings.fine_points)
     assert isinstance(effect.kind, EncoderEffect)
-    fitted = factor * effect.kind.correction(Motion(q, None, np.zeros(_FINE, np.int64)), place, effect.values)
+    motion = Motion(q, None, np.zeros(len(q), np.int64))
+    fitted = factor * effect.kind.correction(motion, place, effect.values)
     x, fine = residuals.angles(over), q[:, over] * residuals.unit(over)[0]
     label = f"{residuals.robot.joints[over]} [{residuals.unit(over)[1]}]"
     curve = (fine, fitted)
-    if (cycles := _cycles(effect)) is not None and cycles * float(np.ptp(q[:, over])) > _MANY_CYCLES:
+    if (cycles := _cycles(effect)) is not None and cycles * float(np.ptp(q[:, over])) > _Settings.many_cycles:
         x = np.degrees(cycles * residuals.motion.q[:, over] * 2.0 * np.pi) % 360.0
-        phase = np.linspace(0.0, 2.0 * np.pi, _FINE)
+        phase = np.linspace(0.0, 2.0 * np.pi, _Settings.fine_points)
         curve = (np.degrees(phase), factor * (effect.values[0] * np.sin(phase) + effect.values[1] * np.cos(phase)))
         label = f"phase of the ripple at {effect.where} [°]"
     title = f"How far {effect.where} is from its reading"

@@ -9,9 +9,6 @@ from bodyschema.robot.rpy import rpy_of
 
 from .presenter import FoundCause, Presenter, Workshop, pose, short
 
-# Share of the largest amount below which one is left out: it changes the size of all by less than 2 %.
-_SMALL_PART = 0.2
-
 
 class LinkGeometry(Presenter):
     """Present a link that differs from the URDF."""
@@ -34,7 +31,8 @@ class LinkGeometry(Presenter):
 
 def _axes(how: str, amounts: Mapping[str, float]) -> str:
     """Return along or about which axes of its frame a link is off; empty for all three."""
-    least = _SMALL_PART * max(map(abs, amounts.values()))
+    # A smaller one is left out: it changes the size of all by less than 2 %.
+    least = 0.2 * max(map(abs, amounts.values()))
     axes = [axis for axis, amount in amounts.items() if abs(amount) >= least]
     if len(axes) == len("xyz"):
         return ""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from bodyschema.diagnosis.report.panels import Panel
-from bodyschema.diagnosis.report.residuals import POINTS, Residuals
+from bodyschema.diagnosis.report.residuals import Residuals, ResidualSettings
 from bodyschema.diagnosis.report.svg_plot import Plot, span
 
 from .presenter import FoundCause, Presenter, Workshop
@@ -36,6 +36,7 @@ def outlier_panel(residuals: Residuals) -> Panel:
     length = 1e3 * np.linalg.norm(residuals.after, axis=1)
     away = np.flatnonzero(~residuals.diagnosis.markers)
     plot = Plot(residuals.clock_label, "error [mm]", span(residuals.clock), (0.0, 1.05 * float(length.max())))
-    parts = [(residuals.some(POINTS), "pale after"), (residuals.some(POINTS, away), "away")]
+    most = ResidualSettings.points
+    parts = [(residuals.some(most), "pale after"), (residuals.some(most, away), "away")]
     marks = [plot.dots(residuals.clock[rows], length[rows], look) for rows, look in parts]
     return Panel("Fixes that are not the marker, beside those that are", plot.svg(*marks))

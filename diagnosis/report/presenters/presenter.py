@@ -23,10 +23,13 @@ from bodyschema.robot.rpy import rpy_of
 from .evidence import measured_against_predicted
 
 DEG = math.degrees(1.0)
-# The number of ticks a turn is stated if it is a whole number to within this share.
-_WHOLE_TURN = 0.01
-# A step whose log10 is a whole number to within this is a decimal place of the file, not an encoder tick.
-_DECIMAL = 1e-3
+
+
+class _Settings:
+    # The number of ticks a turn is stated if it is a whole number to within this share.
+    whole_turn = 0.01
+    # A step whose log10 is a whole number to within this is a decimal place of the file, not an encoder tick.
+    decimal = 1e-3
 
 
 @dataclass(frozen=True)
@@ -121,12 +124,12 @@ class Workshop:
         if step <= 0.0:
             return ""
         decimals = np.log10([step, math.degrees(step)])
-        if np.abs(decimals - np.round(decimals)).min() < _DECIMAL:
+        if np.abs(decimals - np.round(decimals)).min() < _Settings.decimal:
             return ""
         count = round(amount / step)
         per_turn = 2.0 * math.pi / step
         of = ""
-        if not self.slides(found) and abs(per_turn - round(per_turn)) < _WHOLE_TURN * per_turn:
+        if not self.slides(found) and abs(per_turn - round(per_turn)) < _Settings.whole_turn * per_turn:
             of = f" of {round(per_turn)} a turn"
         return f" ({count:+d} tick{'' if abs(count) == 1 else 's'}{of})"
 

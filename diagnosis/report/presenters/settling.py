@@ -11,8 +11,6 @@ from bodyschema.effects import Effect
 from .evidence import over_quantity, remembered
 from .presenter import FoundCause, Presenter, Workshop
 
-_ENDED = 0.001  # remaining share at which a move has ended
-
 
 class Settling(Presenter):
     """Present a joint that was read before it came to rest."""
@@ -25,11 +23,11 @@ class Settling(Presenter):
         return f"{found.at} was read before it came to rest: {missing} of each move was missing"
 
     def remedy(self, workshop: Workshop, found: FoundCause) -> str:
-        fraction = found.numbers["fraction"]
-        longer = math.log(_ENDED) / math.log(fraction) if 0.0 < fraction < 1.0 else 2.0
+        fraction, ended = found.numbers["fraction"], 0.001  # `ended`: remaining share at which a move has ended
+        longer = math.log(ended) / math.log(fraction) if 0.0 < fraction < 1.0 else 2.0
         wait = f"{longer:.2g} times as long" if longer > 1.0 else "longer"
         return (
-            f"Wait {wait} before {found.where} is read, which leaves {100 * _ENDED:g} % of a move; or raise the gain "
+            f"Wait {wait} before {found.where} is read, which leaves {100 * ended:g} % of a move; or raise the gain "
             "of its controller."
         )
 

@@ -13,8 +13,6 @@ from bodyschema.effects import Effect
 from .evidence import attributed, scatter_plot
 from .presenter import FoundCause, Presenter, Workshop
 
-_OVER = 0.05  # remaining share at which a drift is over
-
 
 class ThermalDrift(Presenter):
     """Present a slow drift of what is measured."""
@@ -27,9 +25,10 @@ class ThermalDrift(Presenter):
         return f"what is measured drifts by {found.shift} with a time constant of {constant}"
 
     def remedy(self, workshop: Workshop, found: FoundCause) -> str:
-        wait = -math.log(_OVER) * found.numbers["time_constant_s"]
+        over = 0.05  # remaining share at which a drift is over
+        wait = -math.log(over) * found.numbers["time_constant_s"]
         return (
-            f"Let camera and arm warm up for {_duration(wait)} before recording: {100 * _OVER:.0f} % of the drift is "
+            f"Let camera and arm warm up for {_duration(wait)} before recording: {100 * over:.0f} % of the drift is "
             "left then."
         )
 
