@@ -1,10 +1,12 @@
-"""What it gains that the online learner weighs each direction of a position by its covariance.
+"""Benefit of weighting each direction of a position by its covariance in the online learner.
 
 Run `python -m benchmarks.directions [--arms N] [--pairs N,N] [--joints 4|6] [--eyes 1|2] [--encoder DEG] [--alike]`.
-The desk arm and the camera of `benchmarks.one_camera`, or an arm of six joints. One eye: covariances of the corners of
-a tag, 0.05 px each, with a depth that is taken to be 2.5 times surer than these alone leave it, as the edges have it:
-10 times less sure than across. Two eyes: a baseline of 250 mm, 0.1 px. The camera's pose and the marker's place are
-unknown. `--alike` states the same variance in all directions.
+The arm is the desk arm of `benchmarks.one_camera` or one of six joints, seen by that benchmark's camera. The camera's
+pose and the marker's position are unknown. `--alike` states the same variance in all directions.
+
+One eye: covariances from the corners of a tag, 0.05 px each. The depth is taken to be 2.5 times more certain than the
+corners alone determine it, which is what the tag's edges achieve: a tenth of the certainty across the line of sight.
+Two eyes: a baseline of 250 mm, 0.1 px.
 """
 
 from __future__ import annotations
@@ -38,7 +40,7 @@ LIMITS_DEG = (150.0, 90.0, 130.0, 120.0, 170.0, 120.0)
 
 
 class SixJoints(Arm):
-    """An arm of six joints before the camera of the desk arm, with the same errors of its nominal model."""
+    """An arm of six joints in front of the desk arm's camera, with the same errors of its nominal model."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         fixed = np.tile(np.eye(4), (7, 1, 1))
@@ -55,7 +57,7 @@ class SixJoints(Arm):
 
 
 def one_eye(arm: Arm, q: FloatArray) -> FloatArray:
-    """Return covariances (n, 3, 3) [m²] of a tag's place."""
+    """Return covariances (n, 3, 3) [m²] of a tag's position."""
     found = np.empty((len(q), 3, 3))
     for row, pose in enumerate(arm.true.poses(q)):
         rotation = pose[:3, :3] @ arm.turn
@@ -70,7 +72,7 @@ def one_eye(arm: Arm, q: FloatArray) -> FloatArray:
 
 
 def two_eyes(arm: Arm, q: FloatArray) -> FloatArray:
-    """Return covariances (n, 3, 3) [m²] of a ball's place."""
+    """Return covariances (n, 3, 3) [m²] of a ball's position."""
     x = arm.true.positions(q)
     sight = x / np.linalg.norm(x, axis=1)[:, None]
     along = sight[:, :, None] * sight[:, None, :]
@@ -80,7 +82,7 @@ def two_eyes(arm: Arm, q: FloatArray) -> FloatArray:
 
 
 def snapshots(arm: Arm, q: FloatArray, x: FloatArray, cov: FloatArray, counts: list[int]) -> list[Snapshot]:
-    """Return the learner's answers after so many pairs."""
+    """Learn the pairs in order; return the learner's snapshot after each number of pairs in `counts`."""
     nominal = NominalModel(arm.nominal, arm.lower, arm.upper, pose_known=False, marker_known=False)
     settings = LearnerConfig(replays_per_pair=1.0, solve_every=SOLVE_EVERY)
     learner, found = OnlineLearner(nominal, settings, DirectSolver()), list[Snapshot]()

@@ -15,7 +15,7 @@ HEADER = "| what | goal | measured | bound | seeds | |\n| --- | --- | --- | --- 
 
 
 def overview(rows: Iterable[Row], results: Mapping[str, Sequence[Values]]) -> str:
-    """Format the totals, and one line for each row: how many of its figures are met, and the verdict."""
+    """Format the totals, and one line for each row: the number of figures that meet their goal, and the verdict."""
     judgements = [(row, [judged(figure, results) for figure in row.figures]) for row in rows]
     met, goals = sum(_met(cells) for _, cells in judgements), len(judgements)
     reached = sum(_standing(cells) == Verdict.MET.value for _, cells in judgements)
