@@ -31,7 +31,7 @@ class Check:
 
 
 def warned(subject: str, said: str, fix: str, *, when: bool) -> Check:
-    """Return a check that is a warning with a remedy `when` something degrades the arm, else in order."""
+    """Return a check that is a warning with a remedy if `when` is true, and passed otherwise."""
     return Check(subject, "warning", said, fix) if when else Check(subject, "ok", said)
 
 

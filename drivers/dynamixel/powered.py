@@ -175,7 +175,7 @@ class PoweredJoints(ABC):
         return f"{self.name} is off, the torque of {', '.join(self._joints)} verified off"
 
     def _end(self) -> tuple[str, ...]:
-        """Switch torque off on request; return the joints that could not be verified off."""
+        """Switch torque off on request; return the joints whose torque could not be verified off."""
         unsure = self._let_go()
         self.state, self._why = "off", ""
         if not unsure:
@@ -231,7 +231,7 @@ class PoweredJoints(ABC):
         log.error("%s", "; ".join(self.complaints))
 
     def _let_go(self) -> tuple[str, ...]:
-        """Switch torque off: all servos at once, then verify each. Return the joints that could not be verified."""
+        """Switch torque off on all servos at once, then verify each; return the joints that could not be verified."""
         # A failure of one servo must not keep the others from being switched off.
         with suppress(Exception):
             self._write_all("torque", dict.fromkeys(self._joints, 0))

@@ -73,7 +73,7 @@ class SourceTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
     @property
     def endpoint(self) -> str:
-        """Where it listens or connects to, as protocol/host:port."""
+        """The endpoint it listens on or connects to, as protocol/host:port."""
         raise NotImplementedError
 
     def mistakes(self) -> Iterator[Mistake]:
@@ -169,10 +169,10 @@ KINDS: Mapping[str, type[AnySource]] = {
 
 
 def source_tables(raw: object, file: Path, text: str) -> tuple[AnySource, ...]:
-    """Return the sources of the value `raw` of marker_source.
+    """Return the sources in the value `raw` of marker_source.
 
     Raises:
-        ConfigError: a kind is unknown, a key unknown or wrong, or two sources have the same name.
+        ConfigError: a kind or key is unknown, a value is wrong, or two sources have the same name.
     """
     entries = raw if isinstance(raw, list) else [raw]
     found: list[AnySource] = []
@@ -205,7 +205,7 @@ def _source(entry: object, file: Path, text: str) -> AnySource:
 
 
 def _entry_alone(text: str, place: int) -> str:
-    """Return the text with all other entries of the array of tables blank, so that lines keep their numbers."""
+    """Return the text with all other entries of the array of tables blanked, so that line numbers stay the same."""
     lines = text.splitlines()
     begin = (line_in_entry(text, TABLE, place) or 1) - 1
     end = next((k for k in range(begin + 1, len(lines)) if lines[k].lstrip().startswith("[")), len(lines))

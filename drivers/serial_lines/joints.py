@@ -268,7 +268,7 @@ class SerialLineJoints:
             raise SourceLost(f"the encoders cannot be read: {self._why}", retry_s=RETRY_S)
 
     def _raw(self, timed: Timed) -> list[int] | None:
-        """Return the raw positions of the joints; None when an encoder has none."""
+        """Return the raw positions of the joints; None if an encoder has no value."""
         ticks = [timed.reading.ticks[encoder.place] for encoder in self.encoders]
         self._note_failing({e.joint for e, tick in zip(self.encoders, ticks, strict=True) if tick is None})
         raw = [tick for tick in ticks if tick is not None]
@@ -279,7 +279,7 @@ class SerialLineJoints:
         if raw is None:
             return None
         if not self._is_sure(timed):
-            self._believed_s = self._clock.now()  # the encoders are all there
+            self._believed_s = self._clock.now()  # no encoder is missing
             return None
         counts = self._turns.continued(raw)
         refused = self._gate.offer(timed.t, counts)

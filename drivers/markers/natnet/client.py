@@ -24,7 +24,7 @@ GONE_AFTER_S = 4.0
 
 
 class NatnetReceiver:
-    """The stream of a NatNet server, by multicast or to this client alone, as the server is set up."""
+    """The stream of a NatNet server, by multicast or unicast, depending on the server's settings."""
 
     def __init__(self, table: NatnetTable, clock: Clock) -> None:
         self._table, self._clock = table, clock
@@ -47,7 +47,7 @@ class NatnetReceiver:
             self._commands = listening("0.0.0.0", 0)
             self._await_server()
             self._join()
-            until = self._clock.now() + ANSWER_S  # without an answer the bodies' IDs are used
+            until = self._clock.now() + ANSWER_S  # without an answer, bodies are identified by ID only
             while not self.names and self._clock.now() < until:
                 self._ask(packets.packet(Message.REQUEST_MODEL), lambda: bool(self.names))
         except BaseException:
@@ -128,10 +128,10 @@ class NatnetReceiver:
             )
 
     def _ask(self, question: bytes, is_answered: Callable[[], bool]) -> None:
-        """Send a question and take what comes until it is answered, for `ASK_EVERY_S` at most."""
+        """Send a question and process received packets until it is answered, for `ASK_EVERY_S` at most."""
         self._send(question)
         until = self._clock.now() + ASK_EVERY_S
-        # Frames may come all the time, so the time is looked at, too.
+        # Frames may arrive without a pause, so check the time too.
         while not is_answered() and self._commands is not None and self._clock.now() < until:
             if await_any([self._commands], until, self._clock):
                 got = received(self._commands, self._clock)
@@ -155,7 +155,7 @@ class NatnetReceiver:
             ) from error
 
     def _send(self, data: bytes) -> None:
-        """Send a command; a server that is not there shows by its silence."""
+        """Send a command; an absent server is detected by its silence."""
         self._asked = self._clock.now()
         if self._commands is None:
             return
@@ -170,12 +170,12 @@ class NatnetReceiver:
         if now - self._heard > GONE_AFTER_S:
             raise SourceLost(f"the NatNet server {self._table.server} has fallen silent", retry_s=RETRY_S)
         if now - self._asked > ALIVE_EVERY_S:
-            # CONNECT is answered, so that a server without frames still shows that it lives.
+            # CONNECT is answered, so a server without frames still shows that it is alive.
             self._send(packets.packet(Message.KEEP_ALIVE))
             self._send(packets.connect())
 
     def _sorted(self, data: bytes, sender: tuple[str, int], arrived: float) -> Packet | None:
-        """Return a packet's frame; take notice of what else it may be."""
+        """Return the frame in a packet; process packets of any other kind and return None."""
         if sender[0] != self._table.server:
             return None
         self._heard = arrived
@@ -188,6 +188,6 @@ class NatnetReceiver:
             elif message == Message.FRAME:
                 return Packet(contents, self._table.server, arrived)
         except Unusable:
-            # Let the stream count it: as a frame, it is refused with its reason.
+            # Let the stream count it: treated as a frame, it is rejected with a reason.
             return Packet(data[packets.HEADER.size :][:8], self._table.server, arrived)
         return None
