@@ -32,7 +32,7 @@ class PluginConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     network: bool = False  # True if it uses the network; the service grants access only then
 
     def check(self, _: Sequence[str], file: Path, text: str) -> None:
-        """Raise ConfigError when no installed package has such a driver."""
+        """Raise ConfigError if no installed package has such a driver."""
         try:
             _entry("bodyschema.drivers", self.name)
         except ConfigError as error:
