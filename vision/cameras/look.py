@@ -19,7 +19,7 @@ STEP_PX = 8  # between the pixels that are looked at
 
 
 def of_image(image: ImageArray, name: str) -> str | None:
-    """Return what is wrong with the light in an image, or None."""
+    """Return the fault of the light in an image, or None."""
     levels = image[::STEP_PX, ::STEP_PX]
     if is_black(levels):
         return f"the {name}'s image is black: is the lens cap on? Else more light, or a longer exposure_s"
@@ -53,7 +53,7 @@ class Look:
     def _rate(self) -> float | None:
         """Return the frame rate [1/s] from the median interval; None if there are too few frames.
 
-        Single lost frames do not change the median, but a camera that loses every second one is slow.
+        Single lost frames do not change the median; a camera that loses every second frame counts as slow.
         """
         if len(self._times) < FEWEST:
             return None

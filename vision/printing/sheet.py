@@ -1,4 +1,4 @@
-"""A sheet of paper, in millimetres: black rectangles, and two rulers to check the print against."""
+"""A sheet of paper, in millimetres: black rectangles, and two rulers to check the print."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Text:
 
 @dataclass(frozen=True)
 class Page:
-    """A sheet with what is black on it."""
+    """A sheet with its black rectangles and texts."""
 
     size_mm: tuple[float, float]  # width and height of the sheet
     drawing_mm: tuple[float, float]  # where the drawing's upper left corner is
@@ -84,7 +84,7 @@ def page(
         rectangles, texts: the drawing, from its upper left corner.
 
     Raises:
-        ConfigError: there is no such paper.
+        ConfigError: the paper is unknown.
     """
     width, height = size_mm
     fitting = [each for each in sheets(paper) if each[0] >= width + AROUND_MM and each[1] >= height + AROUND_MM]
