@@ -11,7 +11,7 @@ import numpy as np
 class OutlineSettings:
     """Settings of the outline by coverage.
 
-    Sensitive: the narrow ring and its limits (24 to 137 other outcomes), `uneven_px` (27), `background_px` (14),
+    What matters: the narrow ring and its limits (24 to 137 other outcomes), `uneven_px` (27), `background_px` (14),
     `least_level` (11), and `inner` beyond the ball. The others change at most 8 outcomes, and half of the positions by
     less than 0.1 sigma.
     """
@@ -42,9 +42,9 @@ class OutlineSettings:
 
 
 class LimbSettings:
-    """Settings of the limb: filters across the edge, the ellipse through it, and the waves in its residuals.
+    """Settings of the limb: filters across the edge, the ellipse through it, and the waves that it leaves.
 
-    Sensitive: `aliased_px` (20 of 181 other outcomes), `worst_sigma_blurs` (as 0.5 px), `farthest_px` at 0.3 times
+    What matters: `aliased_px` (20 of 181 other outcomes), `worst_sigma_blurs` (as 0.5 px), `farthest_px` at 0.3 times
     (22, 20), `looks` at 1 (15), `wave_radius_px` at 1 (13), `smoothing_px` at 3 (115), `best_sigma_px` at 3 times
     (sigma + 50 %). The four densities change sigma by - 10 to + 30 % and no outcome. The others change at most 9
     outcomes, and half of the positions by less than 0.7 sigma.
@@ -100,7 +100,7 @@ class LimbSettings:
 class PatchSettings:
     """Settings of patches of the ball's colour.
 
-    Sensitive: `most_uneven` at 0.3 times (20 of 181 other outcomes), `whole_disc_fill` (10) and `strong_shares` (8).
+    What matters: `most_uneven` at 0.3 times (20 of 181 other outcomes), `whole_disc_fill` (10) and `strong_shares` (8).
     The others change at most 6 outcomes; `least_fill` only saves time.
     """
 
@@ -126,8 +126,8 @@ class PatchSettings:
 class ColourSettings:
     """Settings of the ball's colour: how it is learnt from images, and followed.
 
-    `followed`, `farthest` and `room` change no outcome. The others were not measured: they affect learning, whose
-    result is a range that users see and can change.
+    `followed`, `farthest` and `room` change no outcome. The others, with which it is learnt, were not measured: what is
+    learnt is a range, which people see and can change.
     """
 
     # Share of the way to the ball's present colour that the band moves at a fix; limit of its shift (half-widths).
@@ -146,7 +146,7 @@ class ColourSettings:
 class TrackSettings:
     """Settings of the two eyes' match, of the ball's size, and of its track.
 
-    Sensitive: `longest_memory_s` at 3 times (25 of 181 other outcomes), `mirrored_light` (10), `most_unrest` at 0.3
+    What matters: `longest_memory_s` at 3 times (25 of 181 other outcomes), `mirrored_light` (10), `most_unrest` at 0.3
     times (6), `fastest_m_s` at 3 times (7), `alike_levels` (4). The others change at most 3 outcomes; sigmas of size
     change single sigmas by 15 to 200 %.
     """

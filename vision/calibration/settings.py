@@ -32,7 +32,7 @@ class FitSettings:
 
 
 class ViewSettings:
-    """Settings of the requirements on views, and of the advice on the next one.
+    """Settings of what views have to show, and of the advice on the next one.
 
     They refuse a calibration or ask for more views, and change no result. Of six sets of the tests, `least_cells` and
     `least_tilted` at 3 times refuse four or five more, `tilted_deg` two; at 0.3 times none changes more than one.

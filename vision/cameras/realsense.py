@@ -236,7 +236,7 @@ class RealsenseCamera:
         return StereoCalibration(focal, (eyes[0].ppx, eyes[0].ppy), baseline_m, self.image_size_px)
 
     def _apply(self, rs: Any, sensor: Any) -> None:
-        """Write the settings. The projector is off: its dots would be taken for texture of the marker."""
+        """Write the settings. The projector is off by default: its dots would be taken for texture of the marker."""
         wanted: dict[Any, float] = {rs.option.emitter_enabled: float(self._settings.emitter)}
         wanted[rs.option.global_time_enabled] = 1.0
         if self._settings.exposure_s is not None:

@@ -7,7 +7,7 @@ class EdgeSettings:
     """Settings of a tag's edges.
 
     Sensitivity, each at 0.3 and 3 times over the 57 frames of the tests: all outcomes stay, half of the positions move
-    by less than 0.8 sigma and half of the sigmas change by less than 7 %. Sensitive: the lengths of the lines,
+    by less than 0.8 sigma and half of the sigmas change by less than 7 %. What matters: the lengths of the lines,
     `clear_blurs`, `clear_share`, `corner_blurs` and `longest_reach_px` (0.4 to 2.2 sigma, sigma + 4 to + 32 %), and
     `sharpest_px` at 3 times.
     """
@@ -42,7 +42,7 @@ class TagSettings:
     """Settings of a tag's corners, of its pose, and of the search for it.
 
     Sensitivity, as above: all outcomes stay, half of the positions move by less than 0.3 sigma and half of the sigmas
-    change by less than 5 %. Sensitive: `apart_share` at 0.3 times (3 outcomes), `rounds` at 1 (0.4 sigma), `chance`
+    change by less than 5 %. What matters: `apart_share` at 0.3 times (3 outcomes), `rounds` at 1 (0.4 sigma), `chance`
     at 0.3 times (sigma + 32 %). The numbers of search and pose change nothing there. Of the limits, in 189 frames:
     `least_side_px` at 3 times (47 outcomes) and `most_reprojection` at 0.3 times (12); the others change none.
     """
