@@ -102,7 +102,7 @@ def _standing(
         rival = beside.exchanged(candidate, fit.log_likelihood - _Settings.hopeless)
         doubt = float(np.log(max(candidate.trials / max(itself.trials, 1), 1e-3)))
         if can_be_measured(cause, candidate.effect) and _difference(fit, rival) < SAME:
-            # That one number of a link among many does what a scale does is no chance.
+            # It is not by chance that one number of a link among many equals a scale's effect.
             doubt = 0.0
         more = rival.log_likelihood - fit.log_likelihood - beside.cost_of(candidate) - doubt
         more += search.for_zero(fit, itself, candidate)
@@ -116,7 +116,7 @@ def _standing(
         if (alternative := UnnamedAlternative.in_place_of(cause, fit, aparts, unnamed, search)) is not None:
             others.append((alternative, alternative))
             behind.append(alternative.behind)
-    # What a cause is worth allows for blocks already.
+    # The worth of a cause accounts for blocks already.
     rows = [np.zeros(len(fit.left)), *(_at_rows(fit, other, cause, itself) for other, itself in others)]
     probable = bagged([-worth, *behind], rows, blocks, seed)
     wide = widened(fit, range(fit.observations.motion.q.shape[1]), uneven=_Settings.uneven)
@@ -135,18 +135,18 @@ def _standing(
 
 
 def can_be_measured(cause: Effect, rival: Effect | UnnamedAlternative) -> bool:
-    """Return True if a rule tells a cause from its rival: a wrong scale of all from a wrong length of the arm."""
+    """Return True if a ruler separates a cause from its rival: a wrong scale of everything from a wrong arm length."""
     return isinstance(rival, Effect) and cause.kind.scales_all != rival.kind.scales_all
 
 
 def resembles_sag(kind: EffectType) -> bool:
-    """Return True for an error of a joint that depends on angles alone, as sag nearly does."""
+    """Return True for a joint error that depends on angles alone, as sag nearly does."""
     lasts = not (kind.depends_on_path or kind.changes_with_time)
     return isinstance(kind, EncoderEffect) and lasts and not kind.is_zero
 
 
 def is_like_sag(without: Fit, cause: Effect, least: float) -> bool:
-    """Return True if a spring at one joint explains what a cause does, although its weight is assumed or not borne.
+    """Return True if a spring at one joint explains a cause, and the weight is assumed or not borne by the joints.
 
     Args:
         without: the fit without the cause.
@@ -159,7 +159,7 @@ def is_like_sag(without: Fit, cause: Effect, least: float) -> bool:
     beside = beside_fit(without, columns).reshape(without.left.size, -1)
     left = without.evident.ravel()
     toward, squares = beside.T @ left, np.square(beside).sum(axis=0)
-    # The share of a column that the fit's own parameters leave may be rounding alone.
+    # The share of a column beyond the fit's own parameters may be rounding alone.
     told = (toward > 0.0) & (squares > TOLD_APART * np.square(columns).sum(axis=(0, 1)))
     explained = np.square(toward[told]) / squares[told]
     rows = 3.0 * float(without.noise.weights.sum())
@@ -170,11 +170,12 @@ def is_like_sag(without: Fit, cause: Effect, least: float) -> bool:
 def bagged(behind: Sequence[float], rows: Sequence[FloatArray], blocks: Blocks, seed: int) -> FloatArray:
     """Return the probability of a cause and of each alternative to it (1 + m,), as the mean over block resamplings.
 
-    No model is exact, so evidence that a few blocks decide is not sure (Huggins and Miller 2023, bagged posteriors).
+    No model is exact, so evidence that depends on a few blocks is uncertain (Huggins and Miller 2023, bagged
+    posteriors).
 
     Args:
         behind: log-evidence of each alternative over the cause [nats].
-        rows: the part of it that each row holds (n,).
+        rows: contribution of each row to it (n,).
     """
     even = np.full(blocks.count, 1.0 / blocks.count)
     drawn = np.random.default_rng(seed).multinomial(blocks.count, even, _Settings.bagged) - 1
@@ -196,7 +197,7 @@ def _at_rows(
 
 
 def _is_no_more(other: Fit | UnnamedAlternative, fit: Fit, without: Fit, wide: Motion) -> bool:
-    """Return True if the cause, refitted, covers all that a rival can do on any motion."""
+    """Return True if the refitted cause covers everything that a rival can do on any motion."""
     if not isinstance(other, Fit):
         return True
     return apart_on(other, fit, wide) < _Settings.same_share * apart_on(other, without, wide)

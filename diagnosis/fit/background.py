@@ -42,7 +42,7 @@ class Scales(NamedTuple):
 
     @property
     def several_times(self) -> float:
-        """Logarithm of the larger scale of lengths and angles, limited to 0 (a workshop's) and 1 (e times that)."""
+        """Logarithm of the larger scale of lengths and angles, clipped to 0 (a workshop's) and 1 (e times that)."""
         return float(np.clip(np.log(self[:2]), 0.0, 1.0).max())
 
     @property
@@ -54,13 +54,13 @@ class Scales(NamedTuple):
 
 
 class Background:
-    """Small errors throughout a simulated run, to first order about those that the simulation already has.
+    """Small errors throughout a simulated run, linearised about those that the simulation already has.
 
     Args:
         run: run of a simulation, whose background may be empty.
         whitening: (n, 3, 3), to units in which the stated noise has unit covariance.
         scales: scales of the tolerances; None for no background at all.
-        before: the background from which this one is derived; None where the simulation's own errors are known and the
+        before: the background from which this one is derived; None if the simulation's own errors are known and the
             tolerances are centred on them.
     """
 
@@ -147,12 +147,12 @@ class Background:
 
 
 def rows_in_part(weights: FloatArray) -> NDArray[np.intp]:
-    """Return the rows that do not count in full, of weights (n,): the only ones that weighted products visit again."""
+    """Return the rows whose weights (n,) are below 1: only these need to be visited again by weighted products."""
     return np.flatnonzero(1.0 - weights > _COUNTS_IN_FULL)
 
 
 def background_effects(simulation: Simulation, q: FloatArray) -> tuple[Effect, ...]:
-    """Return the tolerance effects, with zero amounts, of each joint that moves over q (n, d) and each link between."""
+    """Return the tolerance effects, with zero amounts, of each joint that moves over q (n, d) and the links between."""
     robot, found = simulation.robot, []
     for k, joint in enumerate(robot.joints):
         found.append(Effect.at(robot, "link_geometry", joint))

@@ -87,7 +87,7 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
 
 def _tolerances(diagnosis: Diagnosis) -> Tolerances:
     found = diagnosis.tolerated
-    # A drive errs once and twice per turn, each with a sine and a cosine, of which half the square is the mean.
+    # A drive has errors of one and two periods per turn, each with a sine and a cosine, whose mean square is one half.
     units = np.array([1e3 * LENGTH_M, np.degrees(ANGLE_RAD), np.degrees(math.sqrt(4 / 2) * DRIVE_RAD)])
     sizes, seen = units * np.asarray(found.scales)[:3], found.seen[:3]
     wide = np.exp(_HALF_WIDTH_95 * found.unsure[:3])
@@ -106,7 +106,7 @@ def _tolerances(diagnosis: Diagnosis) -> Tolerances:
 
 
 def _verdict(diagnosis: Diagnosis, causes: tuple[Cause, ...], gain_percent: float, tolerances: Tolerances) -> Verdict:
-    # A search that ends at its limit has described the error and not explained it; so have tolerances of no workshop.
+    # A search that ends at its limit has only described the error, and so have tolerances beyond a workshop's.
     if diagnosis.left.is_there or diagnosis.ended_early or is_at_limit(diagnosis.extended.background.scales):
         return "unexplained"
     if not causes:
@@ -128,7 +128,7 @@ def _mean_mm(diagnosis: Diagnosis) -> Errors:
 
 def _causes(diagnosis: Diagnosis, seen_by: str) -> tuple[Cause, ...]:
     fit, worse = diagnosis.extended, [max(diagnosis.worse_without[c.identity], 1.0) for c in diagnosis.causes]
-    # Causes that describe the error, and do not explain it, may not be there at all.
+    # Causes that only describe the error may not exist at all.
     sure, causes = EVEN if diagnosis.ended_early else 1.0, []
     parts = zip(fit.causes, diagnosis.standings, diagnosis.shares.causes, worse, strict=True)
     for cause, standing, share, squares in parts:
@@ -162,7 +162,7 @@ def _causes(diagnosis: Diagnosis, seen_by: str) -> tuple[Cause, ...]:
 
 
 def merged_ripples(fit: Fit) -> set[Identity]:
-    """Return the ripples of a joint that are so near each other that together they may describe any curve."""
+    """Return the ripples of a joint whose periods are so similar that together they may describe any curve."""
     found = set[Identity]()
     ripples = [cause for cause in fit.causes if cause.kind.search == "cycles"]
     for one, other in combinations(ripples, 2):
@@ -175,7 +175,7 @@ def merged_ripples(fit: Fit) -> set[Identity]:
 
 
 def _or_unnamed(cause: Cause, what: str) -> Cause:
-    """Return a cause that may be something without a name, or a part of it."""
+    """Return a cause that may be an unnamed one, or a part of it."""
     rival = Indistinguishable("unexplained", None, None, "this_motion", EVEN, what)
     return msgspec.structs.replace(cause, probability=min(cause.probability, EVEN), rivals=(rival, *cause.rivals))
 
@@ -298,7 +298,7 @@ def _limitations(diagnosis: Diagnosis) -> tuple[str, ...]:
 
 
 def _left_out(stored: Fit) -> str:
-    """Return a sentence on what extended.toml leaves out."""
+    """Return a sentence on the parts that extended.toml leaves out."""
     parts = ["the causes"] if stored.causes else []
     parts += ["small errors everywhere"] if stored.background.scales is not None else []
     held = " and ".join(parts) or "none of it but the parameters that robot.toml calls unknown"

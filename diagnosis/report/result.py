@@ -61,7 +61,7 @@ class Cause(msgspec.Struct, frozen=True):
 
     @property
     def weight_percent(self) -> float:
-        """The larger of its share of the gain, which others might take over, and of what is lost without it."""
+        """The larger of its share of the gain, which others might take over, and the loss without it [%]."""
         return max(self.share_of_gain_percent, self.held_out_gain_percent)
 
     @property
@@ -71,17 +71,17 @@ class Cause(msgspec.Struct, frozen=True):
 
     @property
     def leaves_open(self) -> bool:
-        """True where a rival is not much less probable, and the cause is not small."""
+        """True if a rival is not much less probable, and the cause is not small."""
         return self.probability < SURE and bool(self.rivals) and not self.is_small
 
     @property
     def is_outvoted(self) -> bool:
-        """True where a rival is more probable, in the whole percents that a report gives."""
+        """True if a rival is more probable, in the whole percents of a report."""
         return any(round(100.0 * rival.probability) > round(100.0 * self.probability) for rival in self.rivals)
 
     @property
     def is_correction(self) -> bool:
-        """True for one that makes a small difference, and is no more probable than not: its cause is not known."""
+        """True if it makes a small difference and is no more probable than not: its cause is unknown."""
         return self.is_small and self.probability <= EVEN
 
 
@@ -130,7 +130,7 @@ class Tolerances(msgspec.Struct, frozen=True):
 
     @property
     def leaves_open(self) -> bool:
-        """True where a cause may be there in their place, and they are not small."""
+        """True if a cause may exist instead of them, and they are not small."""
         return self.links_share_percent >= SMALL and any(rival.probability > 1.0 - SURE for rival in self.rivals)
 
 

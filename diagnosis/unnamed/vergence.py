@@ -16,7 +16,7 @@ def reported(x: FloatArray, calibration: StereoCalibration, turn: FloatArray) ->
     """Return the triangulated points (n, 3) [m] of true points (n, 3) [m] in the left optical frame.
 
     Args:
-        turn: of the right camera, as a rotation vector (3,) in its own optical frame [rad].
+        turn: rotation of the right camera, as a rotation vector (3,) in its own optical frame [rad].
     """
     baseline = np.array([calibration.baseline_m, 0.0, 0.0])
     # Row vectors times R apply the inverse rotation: into the rotated camera's frame.
@@ -35,6 +35,6 @@ def undone(x: FloatArray, calibration: StereoCalibration, turn: FloatArray) -> F
 
 
 def by_turn(x: FloatArray, calibration: StereoCalibration, axes: FloatArray) -> FloatArray:
-    """Return derivatives (n, 3, a) [m/rad] of `reported` at points (n, 3), for turns about axes (a, 3)."""
+    """Return derivatives (n, 3, a) [m/rad] of `reported` at points (n, 3), for rotations about axes (a, 3)."""
     ends = [(reported(x, calibration, _STEP * axis), reported(x, calibration, -_STEP * axis)) for axis in axes]
     return np.stack([(above - below) / (2.0 * _STEP) for above, below in ends], axis=2)

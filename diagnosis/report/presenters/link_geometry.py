@@ -14,7 +14,7 @@ _SMALL_PART = 0.2
 
 
 class LinkGeometry(Presenter):
-    """Present a link that differs from the URDF."""
+    """Presenter of a link that differs from the URDF."""
 
     effect = "link_geometry"
     noun = "a wrong link before joint {joint}"
@@ -33,7 +33,7 @@ class LinkGeometry(Presenter):
 
 
 def _axes(how: str, amounts: Mapping[str, float]) -> str:
-    """Return along or about which axes of its frame a link is off; empty for all three."""
+    """Return the axes of its frame along or about which a link is off; empty for all three."""
     least = _SMALL_PART * max(map(abs, amounts.values()))
     axes = [axis for axis, amount in amounts.items() if abs(amount) >= least]
     if len(axes) == len("xyz"):

@@ -15,7 +15,7 @@ _ENDED = 0.001  # remaining share at which a move has ended
 
 
 class Settling(Presenter):
-    """Present a joint that was read before it came to rest."""
+    """Presenter of a joint that was read before it came to rest."""
 
     effect = "settling"
     noun = "joint {joint} read before it rests"

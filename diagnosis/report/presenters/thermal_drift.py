@@ -1,4 +1,4 @@
-"""Present a slow drift of what is measured."""
+"""Present a slow drift of the measurements."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _OVER = 0.05  # remaining share at which a drift is over
 
 
 class ThermalDrift(Presenter):
-    """Present a slow drift of what is measured."""
+    """Presenter of a slow drift of the measurements."""
 
     effect = "thermal_drift"
     noun = "a drift that settles"
