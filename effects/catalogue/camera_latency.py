@@ -1,4 +1,4 @@
-"""Images whose time stamps are late."""
+"""Images with late timestamps."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _STEP_S = 1e-5  # step of the numerical derivative [s]
 
 
 class CameraLatency(TimeEffect):
-    """Delay of the images' time stamps against the encoders."""
+    """Delay of the images' timestamps against the encoders."""
 
     name = "camera_latency"
     rank = 0
@@ -29,7 +29,7 @@ class CameraLatency(TimeEffect):
         return float(values[0])
 
     def jacobian(self, run: SimulationRun, effect: Effect) -> FloatArray:
-        # Include the encoder errors: they too are those of the earlier moment.
+        # Include the encoder errors, which also belong to the earlier moment.
         simulation, latency = run.simulation, run.simulation.latency_s
         later, sooner = (simulation.unloaded(run.motion.earlier(latency + s)) for s in (_STEP_S, -_STEP_S))
         return np.einsum("nij,nj->ni", run.by_joint, (later - sooner) / (2.0 * _STEP_S))[:, :, None]

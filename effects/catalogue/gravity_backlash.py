@@ -1,4 +1,4 @@
-"""Play in a joint that hangs on the flank to which the weight pulls it."""
+"""Backlash in a joint that rests on the flank to which the weight pulls it."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class GravityBacklash(StructureEffect):
         return with_moment(run.by_joint[:, :, [k]] * 0.5 * side[:, None, None])
 
     def trial_shapes(self, motion: Motion) -> FloatArray:
-        """Return shares of the largest load."""
+        """Return fractions of the largest load."""
         return np.array(_HOLDS)
 
     def unknown_state(self, run: SimulationRun, effect: Effect) -> NDArray[np.bool_]:

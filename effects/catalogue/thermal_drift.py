@@ -15,7 +15,7 @@ _TIME_CONSTANTS = np.geomspace(_SHORTEST, 4.0, 24)  # time constants tried, as s
 
 
 class ThermalDrift(TimeEffect):
-    """A shift of what is measured that grows from 0 towards its amounts, with a time constant."""
+    """A shift of the measurements that grows from 0 towards its amounts, with a time constant."""
 
     name = "thermal_drift"
     rank = 1

@@ -1,4 +1,4 @@
-"""Convert the visual shapes of a URDF to MuJoCo's form. Meshes stay where they are."""
+"""Convert the visual shapes of a URDF to MuJoCo's form. Meshes stay in place."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def _primitive(shape: Shape) -> dict[str, str]:
 
 
 def rod(end: FloatArray) -> dict[str, str] | None:
-    """Return a rod from a link's origin to `end` (3,) [m] in its frame; None where it would be too short."""
+    """Return a rod from a link's origin to `end` (3,) [m] in its frame; None if it would be too short."""
     if np.linalg.norm(end) < _SHORTEST_ROD:
         return None
     return {"type": "capsule", "fromto": f"0 0 0 {texts(end)}", "size": texts(np.array([_ROD_RADIUS])), "rgba": _GREY}
