@@ -66,13 +66,13 @@ class Scatter:
 
 
 def forecast(known: LearnerEvidence, scatter: Scatter, joints: tuple[str, ...]) -> Outlook:
-    """Return the expected gain of further pairs where the arm has been, for an answering solution.
+    """Return the expected gain of further pairs in the region visited so far, for an answering solution.
 
     The current error is the predicted one there. The forecast gives the factor by which it falls.
 
     Args:
-        scatter: of the newest pairs.
-        joints: their names.
+        scatter: scatter of the newest pairs.
+        joints: names of the joints.
     """
     rng = np.random.default_rng(0)  # the same pairs have the same outlook
     nominal, claim = known.nominal, known.claim

@@ -96,7 +96,7 @@ class LearningState:
         return LearningState(header, {**self.arrays, **{BEFORE + name: each for name, each in before.arrays.items()}})
 
     def poisoned(self) -> str | None:
-        """Return the name of a net, or of an array of pairs, with impossible values; None if all is well."""
+        """Return the name of a net, or of an array of pairs, with impossible values; None if all are valid."""
         nets = dict.fromkeys((name for name in self.arrays if name.startswith(NET)), np.inf)
         limits = {**nets, "q": LARGEST_Q, "x": FARTHEST_M}
         for name, limit in limits.items():

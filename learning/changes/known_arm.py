@@ -37,7 +37,7 @@ class KnownArm:
         return KnownArm(chain or self.chain, self.tolerances, residual or self.residual)
 
     def with_other_tool(self) -> KnownArm:
-        """Return the same arm with a marker elsewhere on the hand."""
+        """Return the same arm with another marker position on the hand."""
         residual = None if self.residual is None else self.residual.with_other_tool(OTHER_TOOL_M)
         return KnownArm(self.chain.with_other_tool(OTHER_TOOL_M), self.tolerances, residual)
 
@@ -103,11 +103,11 @@ class Origin:
     def adapt(
         self, found: Sequence[Explanation], q: FloatArray, x: FloatArray, cov: FloatArray | None = None
     ) -> Adapted:
-        """Widen what may have changed, and relearn it from the pairs since, q (n, d) [rad] and x (n, 3) [m].
+        """Widen the prior of suspected parts, and relearn them from the pairs since, q (n, d) [rad] and x (n, 3) [m].
 
         Args:
             found: probability of each kind of change, the most probable first.
-            cov: as `PairMemory.append` takes them.
+            cov: as in `PairMemory.append`.
         """
         arm = self._forgetful(found)
         belief = fitted_belief(arm.chain, q, self._of_chain(q, x), cov)
@@ -133,7 +133,7 @@ class Origin:
         return float(np.square(new).sum()) < float(np.square(old).sum())
 
     def _of_chain(self, q: FloatArray, x: FloatArray) -> FloatArray:
-        """Return the part of positions x (n, 3) [m] that the chain must explain: the model's other terms are kept."""
+        """Return the part of positions x (n, 3) [m] that the chain must explain, without the model's other terms."""
         return x - self._reference.beyond_chain(q)
 
     def _forgetful(self, found: Sequence[Explanation]) -> KnownArm:
