@@ -42,8 +42,8 @@ class NextPoses:
     def of(cls, calibration: Calibration, count: int, seed: int = 0) -> NextPoses:
         """Choose `count` poses.
 
-        They are within the joint limits, the marker is in the image (where [camera] describes one), and no link is
-        lower than in the recording, so that an arm on a table stays above it.
+        They are within the joint limits, the marker is in the image (if [camera] describes one), and no link is lower
+        than in the recording, so that an arm on a table stays above it.
 
         Raises:
             RecordingError: hardly any pose is allowed.
@@ -78,7 +78,7 @@ class NextPoses:
         """Write the poses as JSON or CSV, by the ending of `file`.
 
         Raises:
-            RecordingError: the file is there already, or cannot be written.
+            RecordingError: the file exists already, or cannot be written.
         """
         check_target(file, replace=replace)
         with writing(file, RecordingError):
@@ -108,7 +108,7 @@ def check_target(file: Path, *, replace: bool) -> None:
 
 
 def allowed_poses(calibration: Calibration, rng: np.random.Generator) -> FloatArray:
-    """Draw joint readings (n, d), and return those that a next pose may have."""
+    """Sample joint readings (n, d), and return those allowed for a next pose."""
     robot, recording = calibration.robot, calibration.recording
     margin = _JOINT_MARGIN * (robot.upper - robot.lower)
     q = rng.uniform(robot.lower + margin, robot.upper - margin, (_BATCH, len(robot.joints)))

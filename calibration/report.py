@@ -45,7 +45,7 @@ class ToolJump:
 
 
 def tool_jump(learner: RigidLearner, recording: Recording) -> ToolJump | None:
-    """Return the first row at which the marker has another place on the hand; None if there seems to be one tool.
+    """Return the first row with another marker position on the hand; None if there seems to be one tool.
 
     This is a change point test (Page 1955): two marker positions instead of one, with all other chain parameters fitted
     along, to first order. The chain was fitted to both tools and is therefore distorted, so distance and row are
@@ -126,7 +126,7 @@ class Zero(msgspec.Struct, frozen=True):
 
 
 class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
-    """The answers."""
+    """Figures of a calibration, with messages."""
 
     robot: str
     source: str
@@ -203,7 +203,7 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
         drawn_error_m = _mean_error(calibration.placed.chain.positions(recording.q), recording)
         doubts = [*seen.sentences, *_computed(drawn_error_m), *_stamped_late(calibration)]
         doubts += _many_left_out(calibration, first)
-        if jump is None:  # the figures of two tools are of neither
+        if jump is None:  # figures of two tools mixed belong to neither
             doubts += [*_far_off(calibration, zeros, FAR_OFF), *made_badly]
         values, halves = named.values, named.half_widths
         figures = [
@@ -229,8 +229,8 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
             axes_deg=None if made is None else _DEG * made.axes,
             points_mm=None if made is None else 1e3 * made.points,
             shown=calibration.shown,
-            # Everett and Hsu 1988: four for each joint that turns, two for each that slides, six for the ends of the
-            # chain, less the three turns of the marker that its place does not show.
+            # Everett and Hsu 1988: four for each revolute joint, two for each prismatic one, six for the ends of the
+            # chain, minus the three rotations of the marker that its position does not determine.
             showable=4 * int((~slides).sum()) + 2 * int(slides.sum()) + 3,
             still=_still(robot, recording),
             first=first,
@@ -286,7 +286,7 @@ def _computed(drawn_error_m: float) -> list[str]:
 
 
 def _stamped_late(calibration: Calibration) -> list[str]:
-    """Return a message if the residuals follow the marker's velocity; else an empty list."""
+    """Return a message if the residuals follow the marker's velocity, otherwise an empty list."""
     recording, residuals = calibration.recording, calibration.residuals
     if recording.t is None or len(recording) < _Settings.few:
         return []
@@ -307,7 +307,7 @@ def _stamped_late(calibration: Calibration) -> list[str]:
 
 
 def _many_left_out(calibration: Calibration, first: int) -> list[str]:
-    """Return a message, if any, on more outliers than an instrument has, or on outliers in a run of rows."""
+    """Return a message, if any, on more outliers than an instrument has, or on consecutive outliers."""
     off = np.flatnonzero(~calibration.learner.inliers)
     if len(off) <= MOST_OUTLIERS * len(calibration.recording):
         return []
@@ -323,7 +323,7 @@ def _many_left_out(calibration: Calibration, first: int) -> list[str]:
 
 
 def _badly_made(calibration: Calibration) -> list[str]:
-    """Return a message if the geometric errors reach the largest that are considered; else an empty list."""
+    """Return a message if the geometric errors reach the largest that are considered, otherwise an empty list."""
     made, (axes, points) = calibration.workmanship, WORKMANSHIP[-1]
     if made is None or made.axes < axes:
         return []

@@ -1,4 +1,4 @@
-"""Result of the plausibility check, and what it takes to report something."""
+"""Result of the plausibility check, and its thresholds."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FEWEST_ROWS = 40
 
 @dataclass(frozen=True)
 class _Thresholds:
-    """What a way to read the recording has to reach to be reported."""
+    """Thresholds beyond which a way to read the recording is reported."""
 
     # Another reading is reported if the pairs fit this many times better, and mentioned from `as_good` times on. Arms
     # with tolerances of 0.5° and 1 mm, offsets of 10° and noise of 10 mm stay below 1.15 with all wrong readings.
@@ -55,7 +55,7 @@ class Plausibility:
         """Return the warnings for a recording that is fitted.
 
         Raises:
-            RecordingError: it cannot be of this robot as it is.
+            RecordingError: it cannot be of this robot in its present form.
         """
         if self.refusal is not None and not force:
             raise RecordingError(self.refusal, file=file, remedy=f"{self.remedy}. Or fit it as it is with --force")
