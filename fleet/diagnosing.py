@@ -116,7 +116,7 @@ def diagnose_all(
     """Diagnose all recordings; a failed one is reported as such, and does not end the others.
 
     Args:
-        out: a folder for each recording is written here.
+        out: folder in which a folder for each recording is written.
         cluster: a client of the scheduler; running work is cancelled if this ends early.
         told: called with a recording's name and its current step.
 
@@ -161,7 +161,7 @@ def workers(scheduler: str | None, jobs: int, count: int | None = None) -> Itera
 
     Args:
         scheduler: its address; None starts processes here.
-        count: of processes; None: one for each core, and no more than jobs.
+        count: number of processes; None for one per core, at most the number of jobs.
 
     Raises:
         ConfigError: the scheduler does not answer, or has no workers.
@@ -169,7 +169,7 @@ def workers(scheduler: str | None, jobs: int, count: int | None = None) -> Itera
     from dask import config
     from distributed import Client, LocalCluster
 
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # errors that matter are reported by the diagnoses
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # the diagnoses report the errors that matter
     with safe_children(), config.set({"distributed.scheduler.allowed-failures": WORKERS_LOST}):
         if scheduler is not None:
             with _client_of(scheduler) as client:
@@ -180,7 +180,7 @@ def workers(scheduler: str | None, jobs: int, count: int | None = None) -> Itera
                 n_workers=count or min(os.cpu_count() or 1, jobs),
                 threads_per_worker=1,
                 processes=True,
-                dashboard_address="127.0.0.1:0",  # without one it takes port 8787, and warns where that is in use
+                dashboard_address="127.0.0.1:0",  # without a port it takes 8787, and warns if that is in use
                 silence_logs=logging.CRITICAL,
             ) as local,
             Client(local) as client,
@@ -213,7 +213,7 @@ def _leave_ctrl_c() -> None:
 
 
 def _read(job: Job) -> _Read | Diagnosed:
-    """Return the recording with its robot, or why it cannot be read."""
+    """Return the recording with its robot, or the reason why it cannot be read."""
     try:
         config = Config.load(job.robot)
     except BodyschemaError as error:
@@ -227,7 +227,7 @@ def _read(job: Job) -> _Read | Diagnosed:
 def _work(read: _Read, asked: Asked, with_report: bool) -> tuple[bytes, ReportedDiagnosis | None] | str:
     """Diagnose on a worker: return diagnosis.json, and the input of the other files if they are written.
 
-    Returns the reason as text if there is none: not every exception of ours can be unpickled.
+    Returns the reason as text if there is none, since not every exception of ours can be unpickled.
     """
     from distributed import get_worker
 
