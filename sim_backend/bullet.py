@@ -40,7 +40,7 @@ class Body:
     """One robot in its own pybullet world. All angles are true angles of the named joints.
 
     Args:
-        joints: names of the joints that `set_angles` and `angles` are about.
+        joints: names of the joints of `set_angles` and `angles`.
         gravity: downward acceleration [m/s²].
         dt: length of one step [s].
     """

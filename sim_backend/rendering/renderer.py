@@ -28,7 +28,7 @@ _PARENT_CHECK_S = 1.0
 
 
 class Stick:
-    """The tool: a thin rod from the hand to the ball. It is seen, weighs nothing and touches nothing."""
+    """The tool: a thin, massless rod from the hand to the ball, visible but without collisions."""
 
     def __init__(self, body: Body, link: str) -> None:
         self._body, self._link = body, link
@@ -42,7 +42,7 @@ class Stick:
             bullet.removeBody(self._id, physicsClientId=client)
             self._id = -1
         length = float(np.linalg.norm(tip))
-        # What stands in the world, before a camera that the arm carries, is on no stick.
+        # A marker fixed in the world, in front of a camera on the arm, is on no stick.
         if length < SHORTEST_ROD_M or self._body.stands(self._link):
             return
         shape = bullet.createVisualShape(
@@ -56,7 +56,7 @@ class Stick:
         self._T_link_stick = (tip / 2, turn_of_z(tip / length))
 
     def follow(self) -> None:
-        """Move the rod to where the link is now."""
+        """Move the rod to the link's present pose."""
         if self._id < 0:
             return
         T = self._body.link_pose(self._link)
