@@ -1,7 +1,7 @@
 """The learner process of one robot. It needs a sampler for new pairs, but keeps answering without one.
 
 Threads: zenoh's (queries, from an immutable snapshot; published pairs, into a queue), one for each robot that learns
-each pair immediately, one as batch work for replay and the solver's orders, and the main thread for status and
+each pair immediately, a batch thread for replay and the requests to the solver, and the main thread for status and
 checkpoints; `bodyschema.daemon.learner.host` has the last two.
 """
 
@@ -344,14 +344,14 @@ def show_name() -> None:
 
 
 def more_rarely(robots: int) -> float:
-    """Return the factor by which states and checkpoints are rarer when `robots` robots share a process."""
+    """Return the factor by which states and checkpoints are less frequent when `robots` robots share a process."""
     return max(1.0, robots / AS_OFTEN_AS_ONE)
 
 
 def _common_variance(config: Config) -> tuple[Callable[[FloatArray], FloatArray] | None, str | None]:
-    """Return the variance that the cameras' calibration leaves in all positions, and why it is not known.
+    """Return the variance of all positions due to the cameras' calibration, and the reason if it is unknown.
 
-    Learning and predictions go on without it.
+    Learning and predictions continue without it.
     """
     if config.tables.vision.cameras is None:
         return None, None
