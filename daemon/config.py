@@ -350,7 +350,7 @@ def _override(raw: dict[str, Any], known: list[str], environment: Mapping[str, s
 
 
 def _checked(variable: str, table: str, key: str, value: Any) -> Any:
-    """Return the value. Raise ConfigError naming the environment variable if key or value is invalid in the table."""
+    """Return the value; raise ConfigError naming the environment variable if key or value is invalid in the table."""
     kind = {"robot": RobotSection, "camera": CameraSection}.get(table) or hint_at(Tables, (table,))
     fields = {field.encode_name: field.type for field in msgspec.structs.fields(kind)}
     if key not in fields:

@@ -83,7 +83,7 @@ def stored_pairs(file: Path) -> StoredPairs:
 
 
 def devices_of(store: Path) -> list[Devices]:
-    """Return the encoders that a store's joints were read with. Raise StoreError if it cannot be read."""
+    """Return the encoders that a store's joints were read with; raise StoreError if it cannot be read."""
     with PairReader(store) as reader:
         return reader.devices()
 
@@ -104,7 +104,7 @@ def opened(source: Path, joints: tuple[str, ...] | None = None) -> Recording:
 
 
 def of_robot(recording: Recording, joints: tuple[str, ...], file: Path) -> Recording:
-    """Return the recording. Raise RecordingError if its joints are not these in this order."""
+    """Return the recording; raise RecordingError if its joints are not these in this order."""
     if recording.joints != joints:
         raise RecordingError(
             f"the pairs are of other joints: {', '.join(recording.joints)}",
@@ -115,7 +115,7 @@ def of_robot(recording: Recording, joints: tuple[str, ...], file: Path) -> Recor
 
 
 def between(recording: Recording, first: int, last: int | None, file: Path) -> Recording:
-    """Return the rows `first` to `last`, counted from 1. Raise RecordingError if there are none."""
+    """Return the rows `first` to `last`, counted from 1; raise RecordingError if there are none."""
     numbers = np.arange(1, len(recording) + 1)
     chosen = (numbers >= first) & (numbers <= (last or len(recording)))
     if not chosen.any():

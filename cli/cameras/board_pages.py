@@ -12,7 +12,7 @@ _WRITERS = {".pdf": pdf, ".svg": svg}
 
 
 def write_page(page: Page, out: Path) -> tuple[float, float]:
-    """Write a page as PDF or SVG; return its horizontal and vertical ruler [mm]. Raise ConfigError if writing fails."""
+    """Write a page as PDF or SVG; return its horizontal and vertical ruler [mm]; raise ConfigError if writing fails."""
     writer = _WRITERS.get(out.suffix.lower())
     if writer is None:
         raise ConfigError(f"{out}: neither .pdf nor .svg", remedy="Name a file that ends so")

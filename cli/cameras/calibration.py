@@ -150,7 +150,7 @@ def board_of(
 
 
 def as_printed(drawn: Board, ruler_mm: float | None) -> Board:
-    """Return the board as printed: its page's longer ruler measures `ruler_mm`. Raise ConfigError if implausible."""
+    """Return the board as printed: its page's longer ruler measures `ruler_mm`; raise ConfigError if implausible."""
     if ruler_mm is None:
         return drawn
     width, height = drawn.size_m

@@ -56,7 +56,7 @@ class Tags:
 
 
 def numbers_of(ids: str) -> list[int]:
-    """Parse tag numbers as in 0-5,9. Raise ConfigError if they cannot be parsed, or one is repeated."""
+    """Parse tag numbers as in 0-5,9; raise ConfigError if they cannot be parsed, or one is repeated."""
     found: list[int] = []
     for part in ids.split(","):
         run = _RUN.fullmatch(part.strip())
@@ -71,7 +71,7 @@ def numbers_of(ids: str) -> list[int]:
 
 
 def sheet(tags: Tags, paper: str) -> Page:
-    """Lay out the page. Raise ConfigError if a tag is unknown, or they do not fit."""
+    """Lay out the page; raise ConfigError if a tag is unknown, or they do not fit."""
     if tags.shape == "board":
         if tags.ids is not None:
             raise ConfigError("the tags of a board are numbered from 0", remedy="Leave out --ids")
@@ -104,5 +104,5 @@ def tables(tags: Tags) -> str:
 
 
 def as_printed(tags: Tags, drawn_mm: float, measured_mm: float) -> Tags:
-    """Scale the tags by their page's ruler of `drawn_mm`. Raise ConfigError if the length is implausible."""
+    """Scale the tags by their page's ruler of `drawn_mm`; raise ConfigError if the length is implausible."""
     return replace(tags, side_mm=printed_scale(drawn_mm, measured_mm) * tags.side_mm)

@@ -40,7 +40,7 @@ class Watching:
 
     @classmethod
     def into(cls, folder: Path, pictures: Pictures, *, every_s: float, count: int | None) -> Self:
-        """Write pictures into files 000001.jpg and so on. Raise ConfigError if the folder cannot be created."""
+        """Write pictures into files 000001.jpg and so on; raise ConfigError if the folder cannot be created."""
         with writing(folder, what="made", remedy="Give another --out"):
             folder.mkdir(parents=True, exist_ok=True)
         numbers = itertools.count(1)

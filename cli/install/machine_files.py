@@ -50,7 +50,7 @@ class MachineFiles(ABC):
         """Return the files that `uninstall` would remove."""
 
     def install(self, texts: dict[Path, str]) -> None:
-        """Write files with their contents, and let the system read them. Raise ConfigError if one cannot be written."""
+        """Write files with their contents, and let the system read them; raise ConfigError if one cannot be written."""
         for file, text in texts.items():
             with writing(file, f"install {self.kind}"):
                 file.parent.mkdir(parents=True, exist_ok=True)
@@ -58,7 +58,7 @@ class MachineFiles(ABC):
         self._call(self.reload)
 
     def uninstall(self) -> None:
-        """Remove the files, and folders of drop-ins that become empty. Raise ConfigError if one cannot be removed."""
+        """Remove the files, and folders of drop-ins that become empty; raise ConfigError if one cannot be removed."""
         for file in self.installed():
             with writing(file, f"install {self.kind} --uninstall"):
                 file.unlink()

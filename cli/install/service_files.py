@@ -36,7 +36,7 @@ class UnitFiles(MachineFiles):
         self.before_removal = [f"To be stopped: {names}"]
 
     def uninstall(self) -> None:
-        """Stop the units, and remove their files. Raise ConfigError if one cannot be removed."""
+        """Stop the units, and remove their files; raise ConfigError if one cannot be removed."""
         self._call([("systemctl", "disable", "--now", *self.units)])
         super().uninstall()
 

@@ -50,7 +50,7 @@ class Planned:
 
 
 def assignments(texts: Sequence[str]) -> list[tuple[str, str]]:
-    """Parse `NAME=VALUE` assignments. Raise ConfigError if one is malformed."""
+    """Parse `NAME=VALUE` assignments; raise ConfigError if one is malformed."""
     found: list[tuple[str, str]] = []
     for text in texts:
         name, equals, value = text.partition("=")

@@ -135,7 +135,7 @@ class Sources:
 
 
 def find_powered(drives: Iterable[object], name: str, file: Path) -> Powered:
-    """Return the arm's drive of this name. Raise ConfigError if robot.toml, `file`, does not configure it."""
+    """Return the arm's drive of this name; raise ConfigError if robot.toml, `file`, does not configure it."""
     for drive in drives:
         if isinstance(drive, Powered) and drive.name == name:
             return drive

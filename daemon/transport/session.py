@@ -313,7 +313,7 @@ def _source(query: zenoh.Query) -> str:
 
 @contextmanager
 def client(route: str | Route, open_timeout_s: float = OPEN_TIMEOUT_S) -> Iterator[ZenohSession]:
-    """Open a short-lived session to a process. Raise BusError if it cannot be reached."""
+    """Open a short-lived session to a process; raise BusError if it cannot be reached."""
     with ZenohSession(connect=route, client=True, open_timeout_s=open_timeout_s) as bus:
         yield bus
 

@@ -48,7 +48,7 @@ class ZenohConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return tuple(name for name in named if name is not None)
 
     def identity(self, folder: Path) -> Identity | None:
-        """Return this machine's credentials; None without certificates. Raise ConfigError if its files are unusable."""
+        """Return this machine's credentials, None without certificates; raise ConfigError if its files are unusable."""
         return None if self.tls is None else Identity.of(self.tls, self.login, self.users_file, folder)
 
     def check(self, file: Path, text: str) -> None:

@@ -120,7 +120,7 @@ def settings_by_name(workbench: EepromEditor, model: Model) -> Mapping[str, Sett
 
 
 def model_called(table: str, name: str) -> Model:
-    """Return the model of a vendor. Raise ConfigError if this version does not know it."""
+    """Return the model of a vendor; raise ConfigError if this version does not know it."""
     models = EEPROM_VENDORS[table][1] if table in EEPROM_VENDORS else {}
     if name not in models:
         raise ConfigError(f"unknown model {name!r} of {table}", remedy=did_you_mean(name, models))

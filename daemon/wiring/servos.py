@@ -48,7 +48,7 @@ def servos_of(config: Config) -> Servos | None:
 
 
 def require_servos(config: Config) -> Servos:
-    """Return the servos of robot.toml. Raise ConfigError if it has none."""
+    """Return the servos of robot.toml; raise ConfigError if it has none."""
     servos = servos_of(config)
     if servos is None:
         raise ConfigError(

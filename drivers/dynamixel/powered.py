@@ -144,7 +144,7 @@ class PoweredJoints(ABC):
 
     @abstractmethod
     def _goals(self, now: float, q: FloatArray, samples: Mapping[str, Sample | None]) -> list[int]:
-        """Return the goal registers, joint by joint; q (d,) are the angles of the whole arm [rad]. Raise Drop."""
+        """Return the goal registers, joint by joint; q (d,) are the angles of the whole arm [rad]; raise Drop."""
 
     @abstractmethod
     def _said_on(self) -> str:
@@ -301,7 +301,7 @@ class PoweredJoints(ABC):
             self._buses[bus].sync_write(register, by_id)
 
     def _write(self, servo: IdentifiedServo, name: str, value: int) -> None:
-        """Write a register and read it back. Raise RequestError if the value differs."""
+        """Write a register and read it back; raise RequestError if the value differs."""
         register = servo.model.layout[name]
         found = None
         for _ in range(ATTEMPTS):
@@ -312,7 +312,7 @@ class PoweredJoints(ABC):
         raise RequestError(f"joint {servo.joint!r} (ID {servo.id}): {name} was set to {value} and is {found}")
 
     def _read(self, servo: IdentifiedServo, name: str) -> int:
-        """Return the value of a register. Raise RequestError without an answer."""
+        """Return the value of a register; raise RequestError without an answer."""
         bus, register = self._buses[servo.bus], servo.model.layout[name]
         exchange = None
         for _ in range(ATTEMPTS):

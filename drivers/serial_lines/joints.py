@@ -213,7 +213,7 @@ class SerialLineJoints:
         raise SourceLost(f"the board on {self._config.port} {what}", retry_s=RETRY_S)
 
     def _found(self, header: Header) -> list[Encoder]:
-        """Return the encoders. Raise SourceError with a table of all if one differs from robot.toml."""
+        """Return the encoders; raise SourceError with a table of all if one differs from robot.toml."""
         rows, encoders = [("joint", "encoder", "expected", "found")], list[Encoder]()
         places = list(header.encoders)
         for config in self._wanted:

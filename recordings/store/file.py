@@ -93,7 +93,7 @@ LOW_DISK_BYTES = 200 * 2**20  # below this the sampler warns, and the doctor
 
 
 def disk_free(file: Path) -> int:
-    """Return the free bytes on the store's disk. Raise StoreError if its folder is gone."""
+    """Return the free bytes on the store's disk; raise StoreError if its folder is gone."""
     try:
         return free_bytes(file)
     except OSError as error:

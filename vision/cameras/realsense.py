@@ -220,7 +220,7 @@ class RealsenseCamera:
         )
 
     def _seen_by(self, left: Any, right: Any) -> StereoCalibration:
-        """Return the calibration of a rectified pair. Raise SourceError if the device does not rectify it."""
+        """Return the calibration of a rectified pair; raise SourceError if the device does not rectify it."""
         eyes = [profile.as_video_stream_profile().get_intrinsics() for profile in (left, right)]
         pose = left.get_extrinsics_to(right)
         focal = eyes[0].fx

@@ -25,7 +25,7 @@ def cluster_tables(dictionary: Dictionary, side_m: float, tags: Sequence[PlacedT
 
 
 def chessboard_tables(columns: int, rows: int, square_m: float) -> str:
-    """Return the tables [vision] and [vision.chessboard]. Raise ConfigError if it cannot be a marker."""
+    """Return the tables [vision] and [vision.chessboard]; raise ConfigError if it cannot be a marker."""
     try:
         ChessboardConfig(columns=columns, rows=rows, square_m=square_m)
     except ValueError as error:

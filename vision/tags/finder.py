@@ -27,7 +27,7 @@ class TagFinder:
     """Detector of the tags with the given numbers."""
 
     def __init__(self, config: TagConfig, ids: Collection[int]) -> None:
-        """Prepare OpenCV's detector of the dictionary. Raise ConfigError if a tag's number is not in it."""
+        """Prepare OpenCV's detector of the dictionary; raise ConfigError if a tag's number is not in it."""
         for id in ids:
             require_tag(config.dictionary, id)
         self._config, self._ids = config, ids

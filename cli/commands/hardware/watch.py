@@ -170,7 +170,7 @@ def _line(text: str) -> None:
 
 
 def _first(watch: JointsWatch) -> Seen:
-    """Return the first complete state. Raise SourceError if there is none in time."""
+    """Return the first complete state; raise SourceError if there is none in time."""
     end = time.monotonic() + FIRST_READING_S
     while time.monotonic() < end:
         if watch.look() is not None:
@@ -182,7 +182,7 @@ def _first(watch: JointsWatch) -> Seen:
 
 
 def _begin(watch: JointsWatch, force: Powered) -> None:
-    """Switch zero-force on and print its answer. Raise RequestError if it is refused."""
+    """Switch zero-force on and print its answer; raise RequestError if it is refused."""
     answer = force.ask(True)
     while not answer.done():
         watch.look()

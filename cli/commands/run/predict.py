@@ -91,7 +91,7 @@ def _notes(config: Config, q: FloatArray, deg: bool) -> Iterator[str]:
 
 
 def _rows(values: tuple[float, ...], config: ClientConfig, deg: bool) -> list[list[float]]:
-    """Return the vectors of joint values [rad, m]. Raise RequestError if the input contains none."""
+    """Return the vectors of joint values [rad, m]; raise RequestError if the input contains none."""
     from bodyschema.daemon.transport.wire import JointsRequest, joint_angles, joint_rows
 
     if values:
