@@ -39,10 +39,10 @@ class ChainFigures:
     """Figures (9 + d,): camera xyz [m], rpy [rad] and marker xyz [m] in their links, joint offsets [rad, m]."""
 
     robot: RobotDescription  # the nominal model
-    # in its chain, or in that chain placed elsewhere; the most probable first. They change one chain.
+    # posteriors of its chain, or of that chain placed elsewhere, the most probable first; all have the same chain
     beliefs: tuple[ChainBelief, ...]
-    shares: FloatArray  # how probable each is (m,); they add up to 1
-    prior: ChainBelief  # what was believed of that chain before any pair
+    shares: FloatArray  # their probabilities (m,), which add up to 1
+    prior: ChainBelief  # prior of that chain before any pair
 
     @property
     def geometry(self) -> CalibratedGeometry:

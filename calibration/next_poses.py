@@ -33,10 +33,10 @@ class NextPoses:
 
     robot: str
     joints: tuple[str, ...]  # names in the order of q
-    prismatic: NDArray[np.bool_]  # True for each joint (d,) that slides
+    prismatic: NDArray[np.bool_]  # True for each prismatic joint (d,)
     q: FloatArray  # joint readings (n, d) [rad or m]
-    expected_m: float  # mean error of the present calibration over all poses that are allowed [m]
-    expected_after_m: float  # the same once these poses have been measured
+    expected_m: float  # mean error of the present calibration over all allowed poses [m]
+    expected_after_m: float  # the same after measuring these poses
 
     @classmethod
     def of(cls, calibration: Calibration, count: int, seed: int = 0) -> NextPoses:

@@ -72,14 +72,14 @@ class Calibration:
     """A rigid chain learnt from a recording."""
 
     robot: RobotDescription  # the nominal model
-    recording: Recording  # what was learnt
-    placed: Alignment  # the nominal chain with what robot.toml calls not known fitted: what learning started from
+    recording: Recording  # the learnt recording
+    placed: Alignment  # the nominal chain with the unknowns of robot.toml fitted, from which learning started
     # of all pairs, with the tolerances that the pairs make probable, the most probable first
     learners: tuple[RigidLearner, ...]
-    shares: FloatArray  # how probable each is (m,); they add up to 1
-    noise_told: bool  # whether the noise was told, not estimated
-    trusted: Trusted = "nothing"  # what was held as the URDF has it
-    # errors (n, 3, k) [m] that all rows share, at 1 sigma of each of k unknowns; None: none are known
+    shares: FloatArray  # their probabilities (m,), which add up to 1
+    noise_told: bool  # True if the noise was given, False if it was estimated
+    trusted: Trusted = "nothing"  # the parts held at the URDF's values
+    # errors (n, 3, k) [m] that all rows share, at 1 sigma of each of k unknowns; None if none are known
     common: FloatArray | None = None
 
     @classmethod

@@ -50,7 +50,7 @@ class LinkShapes(msgspec.Struct, frozen=True):
 
     shapes: dict[str, list[LinkShape]] = {}  # of each link, by its name
     meshes: list[bytes] = []  # as `mesh_buffer` returns them
-    said: list[str] = []  # what is not shown as the URDF has it, in sentences
+    said: list[str] = []  # differences from the URDF, in sentences
 
 
 class Body:

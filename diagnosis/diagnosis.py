@@ -89,8 +89,8 @@ class Diagnosis:
     left: ResidualStructure  # residual structure that no effect fits
     blocks: Blocks  # blocks of time for held-out errors
     seed: int  # seed of the resampling
-    part: Observations | None = None  # the observations in which causes were sought; None for all
-    ended_early: bool = False  # True if the causes describe the error and do not explain it, as there are too many
+    part: Observations | None = None  # the observations used in the search for causes; None for all
+    ended_early: bool = False  # True if the causes only describe the error, as there are too many
 
     @property
     def causes(self) -> tuple[Effect, ...]:
@@ -336,7 +336,7 @@ class _SearchResult:
     standings: Sequence[Standing]  # assessment of each cause against its rivals
     loose: Rattle | None  # play of the marker; None for one that is fixed
     is_reshaped: bool  # True if the noise has another shape than stated
-    part: _SearchResult | None = None  # what was found in a part of the observations; None where all were searched
+    part: _SearchResult | None = None  # result for a part of the observations; None if all were searched
 
     def left(self, blocks: Blocks) -> ResidualStructure:
         # With many rows, all families would take much memory to find nothing new.

@@ -26,8 +26,8 @@ LONGEST_COMMAND = 60
 class Check:
     subject: str  # what was checked
     state: State  # "wrong" prevents reading the arm, "warning" degrades it
-    said: str  # what was found
-    fix: str = ""  # the command to type, or what to do; empty if nothing needs doing
+    said: str  # the finding
+    fix: str = ""  # the command to type, or the remedy; empty if nothing needs doing
 
 
 def warned(subject: str, said: str, fix: str, *, when: bool) -> Check:

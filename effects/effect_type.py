@@ -104,22 +104,22 @@ class EffectType(ABC):
     needs_times: ClassVar[bool] = False  # True if it needs times, not only an order
     needs_stereo: ClassVar[bool] = False  # True if it needs the stereo calibration
     needs_weight: ClassVar[bool] = False  # True if it needs joints that bear the arm's weight
-    # True if only some of its amounts may differ from nominal, as where a link is too long but straight
+    # True if a subset of its amounts may differ from nominal, as for a link that is too long but straight
     in_parts: ClassVar[bool] = False
     rigid: ClassVar[bool] = False  # True if a rigid chain can hold it
-    scales_all: ClassVar[bool] = False  # True if the lengths of all links, wrong by one factor, look like it
-    is_spring: ClassVar[bool] = False  # True if its joint yields in proportion to its load
+    scales_all: ClassVar[bool] = False  # True if a common error of all links' lengths looks like it
+    is_spring: ClassVar[bool] = False  # True if its joint deflects in proportion to its load
     is_load: ClassVar[bool] = False  # True if it is a mass that the URDF does not state
     moves_joints: ClassVar[bool] = False  # True if the true joint angles differ from the readings
-    is_zero: ClassVar[bool] = False  # True for the zero of a joint, which is often wrong at several joints
+    is_zero: ClassVar[bool] = False  # True for a joint offset, which is often wrong at several joints
     of_drive: ClassVar[bool] = False  # True for a periodic error, of which every drive has a little
     stays_as: ClassVar[str | None] = None  # name of its permanent form, for an effect that begins at a moment
     drifts: ClassVar[bool] = False  # True if it grows with time
     remembers: ClassVar[bool] = False  # True if it depends on earlier readings
-    by_direction: ClassVar[bool] = False  # True if only the direction of the moves counts for it, and not their size
+    by_direction: ClassVar[bool] = False  # True if only the direction of the moves matters, not their size
     is_linear: ClassVar[bool] = True  # True if it is proportional to its amounts
     search: ClassVar[ShapeSearch] = "none"  # how its last parameter is searched
-    refines: ClassVar[bool] = False  # True if to first order it looks like a simpler effect, in whose place it is tried
+    refines: ClassVar[bool] = False  # True if to first order it looks like a simpler effect, which it may replace
     # factor on the number of shapes tried, for one that has a shape more than a simpler effect
     further_trials: ClassVar[int] = 1
     # reason why a model of the arm does not hold it
@@ -311,8 +311,8 @@ EFFECT_TYPES: dict[str, EffectType] = {}  # all effects by name, in order; `regi
 class Effect:
     """An effect of a robot."""
 
-    kind: EffectType  # what it is
-    # where, source: the joint it acts on, and the joint that causes it; None where there is none
+    kind: EffectType  # its type
+    # where, source: the joint it acts on, and the joint that causes it; None without one
     where: str | None
     source: str | None
     values: FloatArray  # its numbers (p,), in the order of `parameters`

@@ -30,29 +30,29 @@ class Reason(StrEnum):
     NO_MARKER = "no_marker"  # nothing of the marker's colour, or too few pixels
     AT_BORDER = "at_border"  # the marker touches the image border
     OCCLUDED = "occluded"  # something covers a part of it
-    NOT_ROUND = "not_round"  # the ball's outline is whole but no ellipse
+    NOT_ROUND = "not_round"  # the ball's outline is whole but not an ellipse
     NOT_STRAIGHT = "not_straight"  # a tag's edges scatter or are bent
-    MIRRORED = "mirrored"  # the tag, printed or seen as in a mirror
+    MIRRORED = "mirrored"  # the tag is mirrored, in print or in view
     OTHER_FAMILY = "other_family"  # a tag of another dictionary
-    LOW_CONTRAST = "low_contrast"  # too little difference from what surrounds it
+    LOW_CONTRAST = "low_contrast"  # too little difference from its surroundings
     BLURRED = "blurred"  # too little detail is left
     SATURATED = "saturated"  # too much of it is over-exposed
-    REFLECTION = "reflection"  # a dimmer copy of the marker, or one at a place that it cannot have
+    REFLECTION = "reflection"  # a dimmer copy of the marker, or one at an impossible place
     EPIPOLAR = "epipolar"  # the two eyes' rows disagree
     SIZE_MISMATCH = "size_mismatch"  # the two eyes' radii, or radius and depth, disagree
     AMBIGUOUS = "ambiguous"  # more than one candidate fits
-    REPROJECTION = "reprojection"  # what is seen does not fit the marker's shape
+    REPROJECTION = "reprojection"  # the detection does not fit the marker's shape
     DISAGREEING = "disagreeing"  # several sources contradict each other
     IMPLAUSIBLE_SPEED = "implausible_speed"  # farther from the last fix than a hand can move it
     NO_JOINTS = "no_joints"  # no encoder readings around the frame's time
     STALE = "stale"  # encoder readings around the frame's time too far apart
     MOVING = "moving"  # joints too fast for the uncertainty of the frame's time
     LATE_JOINTS = "late_joints"  # joints too fast for the uncertainty of the times of their readings
-    TOO_NEAR = "too_near"  # nearer than the smallest step to the predecessor: wait
+    TOO_NEAR = "too_near"  # nearer to the predecessor than the smallest step: wait
     PAUSED = "paused"  # an operator paused the sampler
-    NOT_FINITE = "not_finite"  # the tracker gave a position that is no number
-    NOT_STORED = "not_stored"  # the disk took no pair: full, read-only or failing
-    NOT_BORNE = "not_borne"  # zero-force is to bear the arm, and is off
+    NOT_FINITE = "not_finite"  # the tracker gave a position that is not a number
+    NOT_STORED = "not_stored"  # the disk did not accept the pair: full, read-only or failing
+    NOT_BORNE = "not_borne"  # zero-force should bear the arm, but is off
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,10 +21,10 @@ class Pairs:
     q: FloatArray
     x: FloatArray
     unit: FloatArray  # 1-sigma (n,) of each coordinate [m] up to a common factor; the geometric mean of all directions
-    known: bool  # whether that factor is 1; otherwise it has to be estimated
-    # (n, 3, 3): what makes an error as large in all directions; None where it is. Of determinant 1 if `known`
+    known: bool  # True if that factor is 1; otherwise it has to be estimated
+    # (n, 3, 3): matrices that make the errors isotropic; None if they are. Of determinant 1 if `known`
     shape: FloatArray | None = None
-    # (n, 3, k) [m], the errors that k unknowns shared by all pairs bring at 1 sigma of each; None: none
+    # (n, 3, k) [m], errors caused by k unknowns that all pairs share, at 1 sigma of each; None without any
     common: FloatArray | None = None
 
     def __len__(self) -> int:

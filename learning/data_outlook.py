@@ -39,7 +39,7 @@ class LearnerEvidence:
     pairs: int  # number of learnt pairs with the current tool
     region: FloatArray  # poses (k, d) [rad, m] that represent the data's region
     seen: FloatArray  # poses (n, d) [rad, m] of some of them, evenly spread
-    # q, x: the newest pairs that the solver knows, (m, d) [rad, m] and (m, 3) [m]
+    # q, x: the newest pairs of the solver, (m, d) [rad, m] and (m, 3) [m]
     q: FloatArray
     x: FloatArray
 

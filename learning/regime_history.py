@@ -30,7 +30,7 @@ from kbmaps import ChainBelief, ChainTolerances, DegenerateDataError, Explanatio
 class Fit:
     """Prior that was fitted to pairs."""
 
-    prior: KBMap  # the map to learn on top of
+    prior: KBMap  # the map on top of which to learn
     # the nominal chain, placed; after a tool change, the chain that gives the orientation of the hand
     chain: RigidChain
     belief: ChainBelief | None = None  # posterior of the chain; None after a tool change, where only the tool is fitted

@@ -49,7 +49,7 @@ class Snapshot:
     support: SupportSet | None  # support of the data with the current tool; None without data
     pairs: int  # number of pairs it had learnt
     newest_utc: str | None  # storage time of the last of them, ISO 8601; None before any since the learner started
-    waiting_for: str  # what is missing while there is no model
+    waiting_for: str  # missing information while there is no model
     orientation: OrientationModel | None = None  # the model of the marker's orientation; None if none was learnt
     # variance (n, 3) [m²] at positions (n, 3) [m] of errors that all pairs share, so that no pair shows them
     common: Callable[[FloatArray], FloatArray] | None = None

@@ -57,7 +57,7 @@ class LearningHeader(msgspec.Struct, kw_only=True):
     answering: str = PRIOR  # the model that answers
     doubted_in_a_row: int = 0  # number of consecutive outliers up to now
     replays_due: float = 0.0  # replay steps that are still due
-    # where replay is: epochs begun, number of pairs of the current epoch, and number of these that were replayed
+    # position of the replay: epochs begun, number of pairs of the current epoch, and number of these that were replayed
     replay_position: tuple[int, int, int] = (0, 0, 0)
     # prior of the chain before the first of these pairs, as bytes; None before the alignment
     belief: bytes | None = None

@@ -46,7 +46,7 @@ class ChainCalibration(msgspec.Struct, frozen=True, kw_only=True):
     points_m: float | None
     noise_m: float  # 1-sigma of a measured coordinate [m]
     outliers: int  # among the last 500 pairs: too far from the chain for this noise
-    hand_eye: HandEye | None = None  # the camera's pose as ROS takes it; null from a learner of an earlier version
+    hand_eye: HandEye | None = None  # the camera's pose for ROS; null from a learner of an earlier version
     marker_covariance: list[float] | None = None  # of the marker in its link, 3 × 3 row by row [m²]; null likewise
 
 

@@ -31,7 +31,7 @@ class _Settings:
 class JointTrack:
     t: FloatArray  # times (n,) [s]
     q: FloatArray  # (n, d) [rad, m]
-    # which readings belong together (n,): nothing is interpolated between two runs, whose clocks differ
+    # number of the run of each reading (n,): nothing is interpolated between two runs, whose clocks differ
     run: NDArray[np.int64]
 
 

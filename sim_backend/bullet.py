@@ -24,7 +24,7 @@ class PhysicsUrdf(msgspec.Struct, frozen=True):
 
     text: str  # the URDF
     meshes: dict[str, bytes] = {}  # files by name
-    said: tuple[str, ...] = ()  # what is not as the robot's own URDF has it, in sentences
+    said: tuple[str, ...] = ()  # differences from the robot's own URDF, in sentences
 
 
 def load_pybullet() -> Any:

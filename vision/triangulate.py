@@ -21,12 +21,12 @@ class Location:
     cov: FloatArray  # covariance of x, shape (3, 3) [m²]
     centres_px: FloatArray  # image of its centre as (ul, vl, ur, vr), shape (4,) [px]
     variances_px: FloatArray  # variances of `centres_px`, shape (4,) [px²]
-    level: float  # how bright the marker's colour is on it, mean of the eyes [grey levels]
-    # how far the limbs leave their ellipses, geometric mean of the two discs', in variances of their samples
+    level: float  # brightness of the marker's colour on it, mean of the eyes [grey levels]
+    # deviation of the limbs from their ellipses, geometric mean of the two discs', in variances of their samples
     unrest: float
     radii_px: FloatArray  # of the two discs, shape (2,) [px]
-    # sizes, size_sigmas: the radii as parts of what they have to be at this depth, and the 1-sigma of that which the
-    # images leave, shape (2,) each
+    # sizes, size_sigmas: the radii relative to those expected at this depth, and the 1-sigma of that due to the images,
+    # shape (2,) each
     sizes: FloatArray
     size_sigmas: FloatArray
 

@@ -82,7 +82,7 @@ def plausibility(
 class _Check:
     robot: RobotDescription  # the robot's description
     search: ReadingSearch  # the finished search over readings of the columns
-    as_it_is: Reading  # the columns as they are
+    as_it_is: Reading  # the unchanged columns
     best: Reading  # the simplest among the best readings
     others: list[Reading]  # others nearly as simple
     spread: float  # of the positions [m]

@@ -35,8 +35,8 @@ class Reading:
     unit: str = METRES  # of the positions
     degrees: bool = False  # the angles are in degrees
     millimetres: bool = False  # the readings of prismatic joints are in millimetres
-    # 1 or -1 for a joint whose column lacks the angle of the joint before, or has it twice; else 0. So do arms whose
-    # elbow counts from the horizontal, as behind a parallelogram. Empty where no joint does.
+    # 1 or -1 for a joint whose column lacks the previous joint's angle, or contains it twice; otherwise 0. This occurs
+    # for arms whose elbow counts from the horizontal, as behind a parallelogram. Empty if no joint does.
     carried: tuple[int, ...] = ()
 
     @classmethod

@@ -96,9 +96,9 @@ class ReadingFit:
     """Quality of a reading's fit."""
 
     error: float  # RMS distance of the nearest pairs, in the recording's own unit
-    nats: float  # minus the log-likelihood, what zeros and marker cost included
+    nats: float  # minus the log-likelihood, including the cost of offsets and marker
     zeros: FloatArray  # added to the joints (d,) beside the quarter turns [rad, m]
-    tool_m: float  # how far from its place the marker is [m]
+    tool_m: float  # distance of the marker from its place [m]
     rotation: FloatArray  # of the nominal measurement frame in the real one (3, 3)
 
 

@@ -38,10 +38,10 @@ THRESHOLDS = _Thresholds()
 class Plausibility:
     """Result of the plausibility check."""
 
-    refusal: str | None = None  # why the recording cannot be of this robot as it is, or None
-    remedy: str = ""  # what to do about that
-    misread: bool = False  # another reading of the columns was found that fits
-    # so many times better than the columns as they are, or than those of any real arm where none fits
+    refusal: str | None = None  # reason why the recording cannot be of this robot in its present form, or None
+    remedy: str = ""  # the remedy
+    misread: bool = False  # True if another reading of the columns fits
+    # how many times better it fits than the unchanged columns, or than those of any real arm if none fits
     better: float = 1.0
     warnings: tuple[str, ...] = ()  # sentences about possible problems
     undirected: tuple[str, ...] = ()  # joints whose sign these pairs do not determine

@@ -35,12 +35,12 @@ MORE_VIEWS = 4
 class Shown:
     """Feedback for the person who holds the board."""
 
-    coverage: Coverage  # what the views cover
+    coverage: Coverage  # coverage of the views
     views: int  # number of views taken
     look: Look | None = None  # the last pair of images; None before any, and while the cameras are lost
-    trouble: tuple[str, ...] = ()  # what is wrong with the cameras, and what to do
-    refusal: str = ""  # why the calibration was not good enough, when it was last tried
-    doing: str = ""  # what takes its time; empty while views are taken
+    trouble: tuple[str, ...] = ()  # faults of the cameras, with the remedies
+    refusal: str = ""  # reason why the last calibration was not good enough
+    doing: str = ""  # present computation; empty while views are taken
 
     @property
     def wish(self) -> str:

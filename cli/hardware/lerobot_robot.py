@@ -48,7 +48,7 @@ class LeRobotServo:
     model: str
     direction: int
     zero_ticks: float
-    middle_rad: float  # the joint's angle where LeRobot reads 0° [rad]
+    middle_rad: float  # the joint's angle at LeRobot's 0° [rad]
 
 
 def lerobot_arm(name: str) -> LeRobotArm:
@@ -192,8 +192,8 @@ class CorrectedCalibration:
     """A calibration file that contains the offsets."""
 
     file: Path  # LeRobot's
-    motors: Calibrations  # all motors as they would be written
-    changes: tuple[Correction, ...]  # what is put into which motor
+    motors: Calibrations  # all motors with their new values
+    changes: tuple[Correction, ...]  # the change of each motor
     warnings: tuple[str, ...] = ()
 
     @classmethod

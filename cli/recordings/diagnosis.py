@@ -133,7 +133,7 @@ class ReportedDiagnosis:
     diagnosis: Diagnosis
     source: Source
     robot: RobotDescription
-    warnings: tuple[str, ...]  # what may be wrong with the recording itself
+    warnings: tuple[str, ...]  # possible faults of the recording itself
 
     @cached_property
     def file(self) -> DiagnosisFile:

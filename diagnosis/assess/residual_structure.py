@@ -30,7 +30,7 @@ class ResidualStructure:
     model: SmoothModel | None = None  # the causes beside a smooth model of it; None where no structure is left
     untold: tuple[str, ...] = ()  # descriptions of time-dependent parts, which no stored model can contain
     rattle: Rattle | None = None  # play of a loose marker; None for one that is fixed
-    unpredicted_m: float = 0.0  # RMS of what neighbouring rows share and nothing predicts [m]
+    unpredicted_m: float = 0.0  # RMS of the error that neighbouring rows share and nothing predicts [m]
 
     @property
     def is_there(self) -> bool:

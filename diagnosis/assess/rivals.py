@@ -47,12 +47,12 @@ class Rival:
     """An alternative to a cause."""
 
     instead: Fit | UnnamedAlternative  # the fit with it in the place of the cause
-    itself: Effect | UnnamedAlternative  # the effect with its best-fitting numbers, or what has no name
+    itself: Effect | UnnamedAlternative  # the effect with its best-fitting numbers, or the unnamed alternative
     probability: float  # given that the cause or one of its rivals is present
     difference: float  # Δχ² by which this motion is expected to separate them
     anywhere: float  # the same for as many poses over the whole range of the joints
     signal: float  # Δχ² of the cause itself on those poses
-    # True if the cause, refitted, also covers this rival on any motion, and it does not matter which is corrected
+    # True if the refitted cause also covers this rival on any motion, so that either may be corrected
     is_one: bool
 
     @property
@@ -75,8 +75,8 @@ class Standing:
     dof: int  # number of its amounts that the data determine
     gain: float  # its Δχ²
     rivals: tuple[Rival, ...]  # the probable ones, the most probable first
-    # True if a joint that gives under the arm's weight explains nearly as much, and was not tested, or with weights
-    # that are assumed
+    # True if a joint that deflects under the arm's weight explains nearly as much, and was not tested, or only with
+    # assumed weights
     is_like_sag: bool = False
 
 

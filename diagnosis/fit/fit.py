@@ -60,7 +60,7 @@ class Fit:
     run: Simulated  # the simulation over the observed motion
     residuals: FloatArray  # (n, 3) in units of the stated noise
     noise: Noise  # the fitted noise model
-    tangent: Tangent | None = None  # derivatives about a similar fit, for the first steps; None where there is none
+    tangent: Tangent | None = None  # derivatives about a similar fit, for the first steps, or None
 
     @property
     def causes(self) -> tuple[Effect, ...]:

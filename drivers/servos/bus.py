@@ -59,7 +59,7 @@ class Request:
     ids: tuple[int, ...]  # servos that answer, in this order
     size: int  # data bytes wanted from each
     protocol: int  # version of the vendor's protocol
-    spare: int = 0  # how many extra bytes may be requested, to tell its answers from late ones to an earlier request
+    spare: int = 0  # extra bytes that may be requested, to distinguish its answers from late ones to an earlier one
     is_fast: bool = False  # all answer in one packet
 
 

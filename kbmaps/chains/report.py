@@ -38,8 +38,8 @@ class Scatter:
     """Scatter of pairs about a chain."""
 
     noise: float  # 1-sigma of a measured coordinate [m], estimated or given (their RMS)
-    misfit: float  # residual over what the noise explains; about 1 for a rigid chain, 1 where the noise was not given
-    # degrees of freedom: residual coordinates minus those that the parameters have used up. If they are few, `noise` is
+    misfit: float  # ratio of the residual to the given noise; about 1 for a rigid chain, 1 if no noise was given
+    # degrees of freedom: residual coordinates minus the effective number of parameters. If they are few, `noise` is
     # uncertain.
     freedom: float
 

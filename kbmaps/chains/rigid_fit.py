@@ -54,8 +54,8 @@ class RigidFit:
     """Change of the chain with its uncertainty."""
 
     belief: ChainBelief  # the posterior of the parameters
-    noise: float  # estimated noise over unit; at least 1 where the units are the noise (more: the chain does not fit)
-    freedom: float  # residual coordinates minus those that the parameters have used up
+    noise: float  # estimated noise over unit; at least 1 if the units are the noise (more: the chain does not fit)
+    freedom: float  # residual coordinates minus the effective number of parameters
     inliers: BoolArray  # True for each pair (n,) that is not an outlier
     rank: int  # number of independent directions of the parameters that the data determine
     log_evidence: float  # log marginal likelihood of the inliers (Laplace's approximation)

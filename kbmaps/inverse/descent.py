@@ -66,7 +66,7 @@ class Descent:
     q: FloatArray  # the configuration (d,)
     error: FloatArray  # the remaining error there [m]
     steps: int  # derivatives evaluated
-    ended: bool  # True if no step from there can lessen the error, or none is needed; False if the steps ran out
+    ended: bool  # True if no step from there can reduce the error, or none is needed; False if the steps ran out
 
 
 def descend(goal: Goal, start: FloatArray, joints: JointRange, max_steps: int) -> Descent:

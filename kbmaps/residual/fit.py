@@ -81,7 +81,7 @@ class ResidualFit:
 
     model: ResidualModel  # the fitted model
     noise: float  # estimated noise over unit; at least 1 where the units are the noise
-    freedom: float  # residual coordinates minus those that all weights have used up
+    freedom: float  # residual coordinates minus the effective number of all weights
     shared: float  # correlation of the errors of neighbours on a path; 0 where pairs are apart
     inliers: BoolArray  # True for each pair (n,) that is not an outlier
     groups: tuple[str, ...]  # supported by the pairs or part of the prior; the model averages over others too

@@ -66,7 +66,7 @@ class _Settings:
 class Adapted:
     """State from which learning continues."""
 
-    prior: KBMap  # the map to learn on top of
+    prior: KBMap  # the map on top of which to learn
     arm: KnownArm  # prior of the arm before the first pair since the change
     belief: ChainBelief  # posterior of the chain after these pairs
 

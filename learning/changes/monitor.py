@@ -45,7 +45,7 @@ class Reference:
     wide: ChainBelief  # the same without the selection of narrower tolerances
     residual: ResidualModel | None  # posterior of the arm beyond that; None without any
     claim: PredictiveUncertainty  # predictive uncertainty of the model
-    known: int  # number of pairs it knows
+    known: int  # number of pairs it was fitted to
     # q, x: some of the last of these, in their order (n, d) [rad] and (n, 3) [m]
     q: FloatArray
     x: FloatArray
@@ -98,7 +98,7 @@ class DetectedChange:
     earliest: int
     latest: int
     seqs: tuple[int, ...]  # sequence numbers of the monitored pairs (n,)
-    kept: tuple[bool, ...]  # True for each of them (n,) that was learnt, not an outlier
+    kept: tuple[bool, ...]  # True for each of them (n,) that was learnt, False for outliers
     # q, x: the monitored pairs, (n, d) [rad] and (n, 3) [m]
     q: FloatArray
     x: FloatArray

@@ -59,7 +59,7 @@ class Task:
     residual: ResidualModel | None = None  # prior of the arm beyond that; None without any
     # True if the exact map keeps to `prior`, not to the rigid chain: it stands for pairs that are no longer kept
     prior_stays: bool = False
-    # those of `belief`, if the pairs may select narrower ones; None: they may not
+    # tolerances of `belief`, if the pairs may select narrower ones; None if they may not
     tolerances: ChainTolerances | None = None
 
 

@@ -29,9 +29,9 @@ from .settings import LimbSettings as _Settings
 class Filters:
     """One filter for each of k textures of the background, over m samples of a ray in units of their noise."""
 
-    # what samples (n, m) are multiplied by, shape (m, l + 3k). The squares of the first l columns' results make the
+    # matrix applied to samples (n, m), shape (m, l + 3k). The squares of the first l columns' results make the
     # likelihoods. Then there are k filters for the edge's shift times the contrast and its information, k for the
-    # blur's error times the same, and k for the contrast, ball less background at the edge.
+    # blur's error times the same, and k for the contrast, ball minus background at the edge.
     matrix: Float32Array
     groups: Float32Array  # 1 where a square belongs to a texture, else 0, shape (l, k)
     log_ratio: Float32Array  # logarithms of the covariances' determinants less that of the first texture, shape (k,)

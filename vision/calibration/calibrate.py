@@ -79,7 +79,7 @@ class Calibrated:
     fitted: Fitted  # the selected model
     rivals_px: dict[Model, float]  # held-out error of each candidate model that fits the cameras [px]
     coverage: Coverage  # image coverage of the views
-    # relative 1-sigma of the focal lengths over the views; None if nothing shows that a lens refocused
+    # relative 1-sigma of the focal lengths over the views; None without evidence that a lens refocused
     focal_spread: float | None
 
 

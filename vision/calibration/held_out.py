@@ -22,7 +22,7 @@ class HeldOut:
     """Errors of each view when it was held out, except for its own pose."""
 
     squares: FloatArray  # sum of squared residuals of each view [px²]
-    freedom: NDArray[np.int64]  # image coordinates of each view minus those its pose takes
+    freedom: NDArray[np.int64]  # image coordinates of each view minus the parameters of its pose
 
     @property
     def rms_px(self) -> float:

@@ -38,7 +38,7 @@ class Face:
 class Shape:
     """Faces of one size that are connected on the sheet."""
 
-    name: str  # what it is
+    name: str  # description
     faces: tuple[Face, ...]  # in the order of their tags: row by row
 
     @property

@@ -58,7 +58,7 @@ class Page:
     """A sheet with its black rectangles and texts."""
 
     size_mm: tuple[float, float]  # width and height of the sheet
-    drawing_mm: tuple[float, float]  # where the drawing's upper left corner is
+    drawing_mm: tuple[float, float]  # position of the drawing's upper left corner
     rulers_mm: tuple[float, float]  # lengths of the rulers, across and upright
     rectangles: tuple[Rectangle, ...]
     texts: tuple[Text, ...]

@@ -31,7 +31,7 @@ class CommonError:
     """
 
     rig: Rig  # the calibration
-    size_sigma: float = 0.0  # relative 1-sigma of the marker's size, from which one eye has all distances
+    size_sigma: float = 0.0  # relative 1-sigma of the marker's size, from which one eye derives all distances
 
     def require_usable(self) -> None:
         """Raise CalibrationError if the eyes share no view, or a lens folds over within its image."""

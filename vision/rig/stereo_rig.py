@@ -51,9 +51,9 @@ class StereoRig:
     rotation_rad: FloatArray  # rotation vector of R, shape (3,) [rad]
     translation_m: FloatArray  # t, shape (3,) [m]
     image_size_px: tuple[int, int]  # width and height of both eyes' images
-    serials: tuple[str, str]  # what tells the left and the right device from all others; "" where it was not known
+    serials: tuple[str, str]  # serial numbers of the left and the right device; "" if unknown
     covariance: FloatArray  # of `vector`, shape (p, p)
-    made: Made  # how it was made
+    made: Made  # provenance
 
     def __post_init__(self) -> None:
         for name in ("rotation_rad", "translation_m", "covariance"):
@@ -129,9 +129,9 @@ class OneEyeRig:
 
     left: Lens  # the lens, as that of a pair's left eye
     image_size_px: tuple[int, int]  # width and height of its images
-    serials: tuple[str]  # what tells the device from all others; "" where it was not known
+    serials: tuple[str]  # serial number of the device; "" if unknown
     covariance: FloatArray  # of `vector`, shape (p, p)
-    made: Made  # how it was made
+    made: Made  # provenance
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "covariance", frozen_array(self.covariance))

@@ -33,7 +33,7 @@ _DECIMAL = 1e-3
 class FoundCause:
     """A cause with its numbers."""
 
-    # where, source: the joint it acts on, and the joint that causes it; None where there is none
+    # where, source: the joint it acts on, and the joint that causes it; None without one
     where: str | None
     source: str | None
     numbers: Mapping[str, float]  # of shifts and turns, only those given count

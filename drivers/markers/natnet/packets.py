@@ -56,8 +56,8 @@ class RigidBody:
     id: int  # its streaming ID
     x: tuple[float, float, float]  # position of its pivot [m]
     turn: tuple[float, float, float, float]  # quaternion (x, y, z, w)
-    error: float  # mean distance of its markers from where the body has them [m]
-    is_tracked: bool  # whether the pose was measured in this frame
+    error: float  # mean distance of its markers from their places on the body [m]
+    is_tracked: bool  # True if the pose was measured in this frame
 
 
 @dataclass(frozen=True, slots=True)
