@@ -105,7 +105,7 @@ def _smooth(values: FloatArray) -> BSpline:
 class Latency:
     """Result of the estimate."""
 
-    latency_s: float  # from the exposure's middle to the time stamp, with its 1-sigma sigma_s [s]
+    latency_s: float  # from the exposure's middle to the timestamp, with its 1-sigma sigma_s [s]
     sigma_s: float
     fixes: int  # number of positions used
     residual_m: float  # RMS distance of these from the positions that the angles predict

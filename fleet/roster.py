@@ -105,7 +105,7 @@ def places(endpoints: Sequence[str], files: Sequence[Path]) -> list[Place]:
 
 
 class Fleet:
-    """Queries the status of all robots. Use as a context manager; robots and routes may come and go."""
+    """All robots, with queries of their status. Use as a context manager; robots and routes may come and go."""
 
     def __init__(self, places: Sequence[Place]) -> None:
         self._places = places

@@ -54,7 +54,7 @@ class BagTopics:
     marker: str | None = None  # topic of the marker's positions
     frame: str | None = None  # the marker's frame, where it comes by TF
     names: Mapping[str, str] = field(default_factory=dict)  # the joints' names in the bag, where they differ
-    delay_s: float = 0.0  # delay of the time stamps of the marker's positions [s]
+    delay_s: float = 0.0  # delay of the timestamps of the marker's positions [s]
 
 
 def is_bag(source: Path) -> bool:

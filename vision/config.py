@@ -54,7 +54,7 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     min_brightness: Annotated[float, Meta(gt=0, le=1)] = 0.6
     cameras: CamerasConfig | None = None  # where images come from; without it there are none
     further_cameras: tuple[FurtherCameras, ...] = ()  # others that see the same marker; their positions are fused
-    tag: TagConfig = TagConfig()  # the tag, or what the tags of a cluster have in common
+    tag: TagConfig = TagConfig()  # the tag, or the properties common to the tags of a cluster
     cluster: ClusterConfig = ClusterConfig()  # where on the marker which tag is
     chessboard: ChessboardConfig | None = None  # the squares of a chessboard
     plugin: PluginConfig | None = None  # the tracker of another package

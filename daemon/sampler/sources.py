@@ -184,7 +184,7 @@ class MarkerTopic(Source, Protocol):
 
 
 class ToolRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Mounts another tool on the simulated hand. An empty request returns the truth instead."""
+    """Request to mount another tool on the simulated hand. An empty request returns the truth instead."""
 
     tool: tuple[float, float, float]  # marker position in `marker_link`, at most 2 m from the hand [m]
 

@@ -105,7 +105,7 @@ def _has_line(pipe: int) -> bool:
 
 
 class Supervisor:
-    """Keeps child processes running until `stop`, and ends them all."""
+    """Supervisor that keeps child processes running until `stop`, and ends them all."""
 
     def __init__(self, children: Sequence[Child]) -> None:
         self._children = children

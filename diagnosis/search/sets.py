@@ -66,7 +66,7 @@ class Together:
     sigma: float  # size of the noise, in units of the stated one
     spent: FloatArray  # effective number of data that determine each scale (4,)
     amounts: FloatArray  # amounts of all its columns (p,)
-    factor: FloatArray  # lower Cholesky factor (p, p) of their precision; what is above its diagonal has no meaning
+    factor: FloatArray  # lower Cholesky factor (p, p) of their precision; entries above its diagonal have no meaning
     columns: NDArray[np.intp]  # indices of its columns (p,)
 
     @cached_property

@@ -37,7 +37,7 @@ class SourceTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     body: str | int | None = None  # the body whose positions are used; without it, only one may be sent
     unit: Literal["m", "mm"] = "m"  # of the positions and their covariances that are sent
     sigma_m: Positive = 1e-3  # 1-sigma per axis of a position that comes without a covariance [m]
-    latency_s: float = 0.0  # from the measurement to its time stamp [s]; `bodyschema calibrate latency` measures it
+    latency_s: float = 0.0  # from the measurement to its timestamp [s]; `bodyschema calibrate latency` measures it
     latency_sigma_s: NonNegative | None = None  # its 1-sigma [s]
     max_delay_s: Positive = 0.1  # a message is rejected if it arrives this much later than the fastest one
     # xyz, rpy: pose of the source's frame in the measurement frame [m], [rad]; for several sources

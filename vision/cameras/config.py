@@ -114,7 +114,7 @@ class CamerasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     # the file that `bodyschema calibrate cameras` wrote, relative to robot.toml. Without it the images are assumed to
     # be rectified, as [camera] describes.
     calibration: str | None = None
-    # time from mid-exposure to the time stamp [s]; `bodyschema calibrate latency` measures it
+    # time from mid-exposure to the timestamp [s]; `bodyschema calibrate latency` measures it
     latency_s: Annotated[float, Meta(ge=-1, le=1)] = 0.0
     latency_sigma_s: NonNegative | None = None  # its 1-sigma; without it 15 ms for devices, 0 for files
     # time from the exposure of a rolling shutter's first row to that of its last [s]; 0 for a global shutter. Without

@@ -15,7 +15,7 @@ KEPT = 4  # images of each camera; older ones are never paired
 class Shot:
     """An image of one camera and its time."""
 
-    t: float  # time stamp [s], the latency not yet taken off
+    t: float  # timestamp [s], latency not yet subtracted
     t_sigma: float  # 1-sigma of it [s]
     image: ImageArray  # (height, width, 3), uint8, BGR
 

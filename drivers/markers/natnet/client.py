@@ -188,6 +188,6 @@ class NatnetReceiver:
             elif message == Message.FRAME:
                 return Packet(contents, self._table.server, arrived)
         except Unusable:
-            # Let the stream count it: treated as a frame, it is rejected with a reason.
+            # Pass it on as a frame, so that the stream rejects and counts it with its reason.
             return Packet(data[packets.HEADER.size :][:8], self._table.server, arrived)
         return None
