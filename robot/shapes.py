@@ -23,7 +23,7 @@ class Shape:
     sizes: tuple[float, ...]  # edges of a box; radius; radius and length [m]; of a mesh the factors of x, y and z
     T_link_shape: FloatArray  # its pose (4, 4)
     rgba: tuple[float, ...] | None  # its colour; None where the URDF gives none
-    mesh: str = ""  # name of the mesh's file, as the URDF has it; empty for other kinds
+    mesh: str = ""  # name of the mesh's file in the URDF; empty for other kinds
 
 
 def link_shapes(root: Any) -> dict[str, list[Shape]]:

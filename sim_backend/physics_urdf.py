@@ -290,7 +290,7 @@ def _hull(triangles: FloatArray) -> FloatArray:
 
 
 def _moved(tree: UrdfTree) -> set[str]:
-    """Return the links that a moving joint carries, and those between such a link and the root."""
+    """Return the child links of moving joints, and the links between them and the root."""
     moved = {joint.child for joint in tree.joints.values() if joint.kind in MOVING}
     above = {joint.child: joint.parent for joint in tree.joints.values()}
     for link in tuple(moved):

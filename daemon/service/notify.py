@@ -34,7 +34,7 @@ class Notifier:
 
     @classmethod
     def of_environment(cls, environment: MutableMapping[str, str] = os.environ) -> Notifier:
-        """Return the notifier that systemd requested; remove the request from the environment, before children see it."""
+        """Return the notifier that systemd requested; remove the request from the environment of later children."""
         address = environment.pop(SOCKET, None) or None
         microseconds, pid = environment.pop(WATCHDOG, ""), environment.pop(WATCHDOG_PID, "")
         ours = not pid or pid == str(os.getpid())
