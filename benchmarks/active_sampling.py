@@ -1,12 +1,14 @@
 """Pairs saved by choosing the next pose: `python -m benchmarks.active_sampling [--seeds N] [--pairs N] [--only PART]`.
 
-The arm, its drawing and the noise are those of benchmarks.rigid_learner (drawing wrong by 3 degrees an axis, 15 mm a
-point, 30 mm at the marker; 10 mm of noise, told). Both kinds start from the drawing. "chosen" takes the best of 200
-random candidates within the given range, one or (later) a tenth of the pairs so far between two fits. "planned" plans
-ten pairs, later half as many as there are, together and anywhere within the range. The error is the
-mean over the seeds of the mean distance to the truth at poses within +-80 degrees that nothing else has seen. The
-ratio is of the numbers of pairs, all counted, that lead to this error: chosen over random ones (up to `random_times` as
-many were tried, so a ratio of its inverse means "at most"); 95 % interval by bootstrap over the seeds.
+Arm, nominal model and noise are those of benchmarks.rigid_learner: the nominal model is wrong by 3 degrees an axis,
+15 mm a point and 30 mm at the marker; the learner is given the noise of 10 mm. All runs start from the nominal model.
+"chosen" takes the best of 200 random candidates within the given range; it refits after every pair, later after a tenth
+of the pairs so far. "planned" plans ten pairs together, later half as many as there are, anywhere within the range.
+
+The error is the distance to the truth at held-out poses within +-80 degrees, mean over poses and seeds. The ratio
+compares the numbers of pairs (all counted) that lead to the same error: chosen over random. At most `random_times` as
+many random pairs were tried, so a ratio of 1 / `random_times` means "at most". The 95 % interval is a bootstrap over
+the seeds.
 """
 
 from __future__ import annotations
@@ -37,15 +39,15 @@ BOOTSTRAPS = 1000
 
 @dataclass(frozen=True)
 class Setup:
-    """A range of poses from which pairs may be taken.
+    """The range of poses from which pairs may be taken.
 
     Attributes:
-        name: what is printed.
-        joints: number of them.
+        name: name in the table.
+        joints: number of joints.
         range_deg: half the range of the poses to choose from.
-        first: pairs taken at random within `first_deg` before any choice.
-        bend: as in `bent`.
-        random_times: random pairs tried, over those chosen.
+        first: number of pairs taken at random within `first_deg` before any choice.
+        bend: kind of non-rigid effect, as in `bent`.
+        random_times: ratio of random pairs tried to chosen pairs.
     """
 
     name: str
@@ -79,7 +81,7 @@ class Trial:
         self._truth = self.arm.positions(self._test)
         self._learner = RigidLearner(self.arm.drawing, ROUGH)
         self._range_deg, self._way = setup.range_deg, way
-        # Pairs and choices have a stream each, so that both ways meet the same arm, test poses and first pairs.
+        # Separate streams for pairs and choices, so that both ways meet the same arm, test poses and first pairs.
         if setup.first:
             self.learn(self.arm.angles(setup.first, setup.first_deg, self._rng))
 
@@ -122,7 +124,7 @@ def curve(setup: Setup, seed: int, way: str, last: int) -> dict[int, float]:
 def pairs_to_reach(level: float, pairs: FloatArray, errors: FloatArray) -> float:
     """Return the number of pairs at which a curve of mean errors first falls to a level, interpolated log-log.
 
-    If the curve never falls that far, return its last number of pairs, which is then a lower bound.
+    If the curve never falls that far, return its last number of pairs as a lower bound.
     """
     falling = np.minimum.accumulate(errors)
     return float(np.exp(np.interp(-np.log(level), -np.log(falling), np.log(np.maximum(pairs, 0.5)))))
@@ -130,7 +132,7 @@ def pairs_to_reach(level: float, pairs: FloatArray, errors: FloatArray) -> float
 
 @dataclass(frozen=True)
 class Curves:
-    """Curves of several seeds, which have the same numbers of pairs.
+    """Error curves of several seeds at the same numbers of pairs.
 
     Attributes:
         pairs: (k,).

@@ -22,7 +22,7 @@ BEGUN_S = 1_700_000_000
 
 
 def main() -> None:
-    """Write a bag of each kind, and read it in a process of its own."""
+    """Write a bag of each kind, and read it in a separate process."""
     if len(sys.argv) > 1:
         _read(Path(sys.argv[1]))
         return

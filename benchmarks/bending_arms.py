@@ -1,8 +1,8 @@
 """False alarms of the whole learner: `python -m benchmarks.bending_arms [--truth NAME ...] [--seeds N] [--pairs N]`.
 
-Nothing changes, but the arms are not rigid: those of `benchmarks.rough_truths`, six joints, guided in steps of 1 to 3
-degrees, 2 mm of noise (--sigma). All models learn, solved every 75 pairs (--every). Behind the false alarms:
-how often each model answered, and the CPU time.
+Nothing changes, but the arms are not rigid: those of `benchmarks.rough_truths`, with six joints, guided in steps of
+1 to 3 degrees, with 2 mm of noise (--sigma). All models learn and are solved every 75 pairs (--every). Each line
+lists the false alarms, how often each model answered, and the CPU time.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Arms that no rigid chain describes: what springs, gears and lenses do, in the sizes that are met."""
+"""Arms that no rigid chain describes: effects of springs, gears and lenses, in sizes found in practice."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ Bend = Callable[[FloatArray], FloatArray]
 
 @dataclass(frozen=True)
 class BentArm(RoughArm):
-    """A rough arm whose joints do not turn by what is read, and whose camera is not straight.
+    """A rough arm whose true joint angles differ from the readings, and whose camera distorts.
 
     Attributes:
-        joints: angles (n, d) that the joints really have where q is read.
-        camera: positions (n, 3) that are measured of a marker at x, noise aside.
+        joints: maps readings q (n, d) to the true joint angles (n, d).
+        camera: maps marker positions (n, 3) to the measured ones, without noise.
     """
 
     joints: Bend
@@ -57,11 +57,11 @@ def _same(values: FloatArray) -> FloatArray:
 
 
 def _sag(arm: RoughArm, rng: np.random.Generator) -> Bend:
-    """Return joint springs that yield in proportion to the torque of a weight at the marker."""
+    """Return joint springs whose deflection is proportional to the torque of a weight at the marker."""
     chain = arm.parameters.chain(arm.change)
 
     def torques(q: FloatArray) -> FloatArray:
-        # The weight pulls along -z, so that its torque about a joint is how the joint lifts the marker.
+        # The weight pulls along -z, so its torque about a joint equals the rate at which the joint lifts the marker.
         return chain.jacobian(q)[:, 2, :]
 
     most = np.abs(torques(arm.angles(_SIZING_POSES, 80, rng))).max(axis=0)
@@ -84,7 +84,7 @@ def _affine(_: RoughArm, rng: np.random.Generator) -> Bend:
 
 
 def _radial(_arm: RoughArm, _rng: np.random.Generator) -> Bend:
-    # The camera looks along x, at the arm before it.
+    # The camera looks along x, at the arm in front of it.
     def distorted(x: FloatArray) -> FloatArray:
         across = np.square(x[:, 1:]).sum(axis=1, keepdims=True) / _FIELD_M**2
         return np.concatenate([x[:, :1], x[:, 1:] * (1.0 + _RADIAL * across)], axis=1)

@@ -1,14 +1,14 @@
 """Bent arms on a hand-guided path: `python -m benchmarks.bent_walk [--seeds N] [--truth NAME ...] [--pairs N ...]`.
 
-Six joints of a humanoid arm (the two of the neck that carries the cameras, four of the arm), one smooth path in steps
-of 1 to 3 degrees, the nominal model wrong by 2 degrees an axis, 10 mm a point and 30 mm at the marker. The truths are
-those of `benchmarks.rough_truths`; the noise is 3 mm on each coordinate, of its own for each pair or shared between
-neighbours (AR(1), 0.9 from one pair to the next). Errors are mean distances to the noise-free truth [mm]:
+Six joints of a humanoid arm (two of the neck that carries the cameras, four of the arm) follow one smooth path in steps
+of 1 to 3 degrees. The nominal model is wrong by 2 degrees an axis, 10 mm a point and 30 mm at the marker. The truths
+are those of `benchmarks.rough_truths`. The noise is 3 mm on each coordinate, either independent for each pair or shared
+between neighbours (AR(1), 0.9 from one pair to the next). Errors are mean distances to the noise-free truth [mm]:
 
     region  every joint moved by 5 degrees (standard deviation)
-    later   as many pairs as were learnt, which would have come next
+    later   the next pairs of the path, as many as were learnt
 
-Behind them how many per cent of the coordinates lie within 1 and 2 sigma.
+They are followed by the percentage of coordinates within 1 and 2 sigma.
 """
 
 from __future__ import annotations

@@ -1,9 +1,10 @@
-"""One calibrated camera and a tag measured with a caliper: how an arm learnt from them is off, and what it claims.
+"""One calibrated camera and a tag measured with a caliper: errors of the learnt arm and its claimed uncertainty.
 
-Run `python -m benchmarks.calibrated_camera [--arms N] [--pairs N] [--online N]`. The desk arm and the camera of
+Run `python -m benchmarks.calibrated_camera [--arms N] [--pairs N] [--online N]`. Arm and camera are those of
 `benchmarks.one_camera`. For each arm the camera is calibrated from 20 views of a board, whose corners have 0.05 px of
 noise, and the tag's side is off by 0.1 mm (1-sigma). Corners of the tag have 0.012 px of noise. Nothing is rendered.
-Truth is in the frame that the calibration means: without its best-fitting turn over the view.
+The truth is expressed in the frame that the calibration defines: the rotation that fits it best over the view is taken
+out.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ def calibrated(rng: np.random.Generator) -> Rig:
 
 
 def measured(arm: Arm, q: FloatArray, rig: Rig, side_m: float, rng: np.random.Generator) -> tuple[FloatArray, ...]:
-    """Return positions (n, 3) [m] of the tag and their covariances, through the calibration and its stated side."""
+    """Return positions (n, 3) [m] of the tag and their covariances, from the calibration and the stated side."""
     rectification, x, cov = Rectification(rig), [], []
     cov_px = (TAG_PX * rectification.calibration.focal_px / CAMERA.focal_px) ** 2 * np.eye(8)
     for pose in arm.true.poses(q):
@@ -69,7 +70,7 @@ def measured(arm: Arm, q: FloatArray, rig: Rig, side_m: float, rng: np.random.Ge
 
 
 def frame_turn(rig: Rig) -> FloatArray:
-    """Return the rotation (3, 3) from the lens's true frame to the one that its calibration means."""
+    """Return the rotation (3, 3) from the lens's true frame to the frame that its calibration defines."""
     u, v = np.meshgrid(*np.linspace((0.0, 0.0), np.array(CAMERA.image_size_px) - 1.0, 9).T)
     px = np.column_stack([u.ravel(), v.ravel()])
     true, meant = (np.column_stack([lens.directions(px), np.ones(len(px))]) for lens in (LENS, rig.left))
@@ -79,7 +80,7 @@ def frame_turn(rig: Rig) -> FloatArray:
 def online(
     arm: Arm, q: FloatArray, x: FloatArray, cov: FloatArray, common: Callable[[FloatArray], FloatArray] | None
 ) -> OnlineLearner:
-    """Return the learner that runs beside the sampler, after these pairs."""
+    """Return the learner that runs beside the sampler, after it has learnt these pairs."""
     nominal = NominalModel(arm.nominal, arm.lower, arm.upper, pose_known=False, marker_known=False)
     learner = OnlineLearner(nominal, LearnerConfig(), DirectSolver(), common=common)
     for k in range(len(q)):
@@ -130,7 +131,7 @@ def main() -> None:
 
 
 def figures(off: FloatArray, sigma: FloatArray) -> tuple[float, ...]:
-    """Return mean squares of errors and of claims (n, 3) [m²], and the shares within 1 and 2 sigma."""
+    """Return mean squares of errors and of claimed sigmas (n, 3) [m²], and the shares within 1 and 2 sigma."""
     squares = (np.square(off).sum(axis=1).mean(), np.square(sigma).sum(axis=1).mean())
     return *map(float, squares), *(float((np.abs(off) < times * sigma).mean()) for times in (1.0, 2.0))
 

@@ -1,8 +1,8 @@
 """Coverage of a calibration's intervals: `python benchmarks/calibration_intervals.py [--rigs N] [--first SEED]`.
 
-Rigs of two webcams drawn at random, one half with fisheye lenses, are calibrated from 20 rendered pairs of a board,
-with the lens model that they have; a normal distribution has 68 % of the parameters within one claimed sigma, 95 %
-within two. No rig is skipped; refused ones are printed. Ctrl-C ends early, with the table.
+Random rigs of two webcams, half of them with fisheye lenses, are calibrated from 20 rendered pairs of a board, with
+their own lens model. Ideally 68 % of the parameters lie within one claimed sigma and 95 % within two. No rig is
+skipped; refused ones are printed. Ctrl-C ends early and prints the table.
 """
 
 from __future__ import annotations

@@ -1,18 +1,22 @@
 """Changes while running: `python -m benchmarks.changes [--quiet] [--seeds N] [--joints 6 7] [--sigmas 1 5 20]`.
 
-The learner's watch over guided walks in steps of 1 to 3 degrees, as the sampler takes them. It holds the pairs against
-a chain of 1,000 pairs (--known); the arm changes 520 to 580 pairs later. By case: after how many pairs the change is
-noticed (mean, 95th percentile, share within 30), against three that have one false alarm in 50,000 pairs by theory
-(Siegmund 1985; Pollak 1987): a CUSUM that knows the arm to the last digit and the change with its size and direction;
-one that knows the change but has the watch's own model of the arm and, like it, counts no pair beyond four sigmas (so
-it is of no use for large changes); and, with that model, the sum over onsets of one that knows kind and size of the
-change, but not its direction. Each with its mean, its own share within 30, and the ratio of the watch's mean to it.
-Then the shares that are named rightly, called undecided, and named wrongly 30, 100 and 300 pairs after the change; what
-is missing was not noticed by then.
+The learner's change monitor runs over guided walks in steps of 1 to 3 degrees, as the sampler takes them. It compares
+the pairs with a chain learnt from 1,000 pairs (--known); the arm changes 520 to 580 pairs later. Each case lists the
+pairs until the change is detected (mean, 95th percentile, share within 30), beside three reference detectors whose
+theoretical rate is one false alarm in 50,000 pairs (Siegmund 1985; Pollak 1987):
 
-With --quiet: walks without a change, with 1 % gross outliers, of arms that are rigid, of arms that are not, with
-nothing but a chain to follow them, and of rigid ones whose noise is a real arm's: encoders of 4,096 ticks a turn, and a
-stereo camera that is worse along its view; the false alarms among them.
+- a CUSUM that knows the exact arm, and the change with its size and direction;
+- a CUSUM that knows the change, but has the monitor's own model of the arm and, like it, counts no pair beyond four
+  sigmas (so it is of no use for large changes);
+- with that model, the sum over onsets for a change of known kind and size, but unknown direction.
+
+Each reference has its mean, its own share within 30, and the ratio of the monitor's mean to its mean. Then follow the
+shares that are identified correctly, left undecided and identified wrongly 30, 100 and 300 pairs after the change; the
+remainder was not detected by then.
+
+With --quiet: false alarms on walks without a change. The arms are rigid, rigid with 1 % gross outliers, not rigid (with
+only a chain to follow them), and rigid with the noise of a real arm: encoders of 4,096 ticks a turn, and a stereo
+camera that is less accurate along its view.
 """
 
 from __future__ import annotations
@@ -69,10 +73,12 @@ TICK_RAD, DEPTH = 2.0 * math.pi / 4096, 8.0
 
 @dataclass(frozen=True)
 class Case:
-    """A change: the tool by so many metres, the camera (about 1 degree and 10 mm), or a joint's zero by radians.
+    """A change of the arm.
 
     Attributes:
-        mean_way: the size is how far the marker moves on average over the pairs after it [m].
+        kind: "tool", "camera" or "joint".
+        size: tool: shift [m]; joint: offset [rad]; camera: multiple of about 1 degree and 10 mm.
+        mean_way: True if the size is the marker's mean displacement over the pairs after the change [m].
     """
 
     name: str
@@ -97,7 +103,7 @@ CASES = (
 
 @dataclass(frozen=True)
 class Outcome:
-    """One seed: delays [pairs], infinite where undetected, and the verdicts after each number of pairs."""
+    """Result of one seed: delays [pairs], infinite where undetected, and the verdicts after each number of pairs."""
 
     delay: float
     optimal: float
@@ -108,7 +114,7 @@ class Outcome:
 
 
 def walk(joints: int, count: int, rng: np.random.Generator) -> FloatArray:
-    """Return straight ways between random waypoints in steps of 1 to 3 degrees, shape (count, joints)."""
+    """Return straight segments between random waypoints in steps of 1 to 3 degrees, shape (count, joints)."""
     q, goal = [np.zeros(joints)], rng.uniform(-REACH, REACH, joints)
     while len(q) < count:
         step = math.radians(rng.uniform(*STEPS_DEG))
@@ -134,7 +140,7 @@ def changed(
         theta[parameters.base_turn] = math.radians(1.0) * direction(rng)
         theta[parameters.base_shift] = 0.01 * direction(rng)
     else:
-        # The first and the last joint's zeros look like another camera and another tool.
+        # Offsets of the first and the last joint look like a change of the camera and of the tool.
         joint = int(rng.integers(1, arm.drawing.joints - 1))
         theta[np.arange(parameters.size)[parameters.zeros][joint]] = math.radians(1.0) if case.mean_way else case.size
     if case.mean_way:
@@ -168,7 +174,7 @@ def cusum_threshold(information: float) -> float:
     beyond = 1.166 * math.sqrt(2.0 * information)
 
     threshold = 1.0
-    for _ in range(100):  # a contraction: its slope is below 1 where false alarms are rare
+    for _ in range(100):  # a contraction: its slope is below 1 if false alarms are rare
         threshold = math.log(PAIRS_BETWEEN_FALSE_ALARMS * information + 1.0 + threshold + beyond) - beyond
     return max(threshold, 0.0)
 
@@ -220,9 +226,9 @@ def outcome(case: Case, joints: int, sigma: float, seed: int, known_pairs: int) 
 
 
 def verdict(found: list[Explanation], case: Case, joint: int | None) -> str:
-    """Judge the learner's verdict on the change: right, wrong or undecided.
+    """Classify the learner's verdict on the change as right, wrong or undecided.
 
-    A joint offset that is not identifiable apart from the tool or the camera counts as right for these.
+    A joint offset that cannot be distinguished from a change of the tool or the camera counts as right for these.
     """
     kinds = [KindOfChange(each.kind.name, each.kind.joint, each.probability) for each in found]
     record = msgspec.structs.replace(ChangeRecord.told(0), kinds=kinds)
@@ -233,7 +239,7 @@ def verdict(found: list[Explanation], case: Case, joint: int | None) -> str:
 
 
 def statistics_if_told(watch: ChangeMonitor, theta: FloatArray, case: Case, joint: int | None) -> tuple[float, float]:
-    """Return log statistics of detectors that know the change beforehand, computed with the watch's own model.
+    """Return log statistics of detectors that know the change beforehand, computed with the monitor's own model.
 
     The first is the greatest likelihood ratio over the onsets, given the change. The second is the sum of these ratios
     over the onsets, given its kind and size but not its direction.
@@ -269,7 +275,7 @@ def pair_of(number: int, q: FloatArray, x: FloatArray, cov: FloatArray) -> Pair:
 
 
 def quiet(kind: str, joints: int, sigma: float, seed: int, pairs: int) -> int:
-    """Count false alarms along a walk without a change; the watch restarts after each."""
+    """Count false alarms along a walk without a change; the monitor restarts after each."""
     rng = np.random.default_rng([seed, joints, round(1e4 * sigma), (RIGID, BENT, TICKS).index(kind), 99])
     arm = rough_arm(joints, rng, TOLERANCES)
     q = walk(joints, KNOWN + pairs, rng)

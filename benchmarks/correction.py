@@ -1,9 +1,9 @@
-"""CPU time that the readers of correction.json take for one reading of a 6-joint arm with 5 effects, best of 7.
+"""CPU time of the readers of correction.json for one reading of a 6-joint arm with 5 effects, best of 7.
 
     python -m benchmarks.correction
 
-Measured without compliant joints and with two, whose load is computed three times a reading. Needs g++ for C++ and node
-for JavaScript; missing ones are skipped.
+Measured without compliant joints, and with two, for which the load is computed three times a reading. Needs g++ for C++
+and node for JavaScript; missing ones are skipped.
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 """Coverage of the models' predictive uncertainty: `python -m benchmarks.coverage [--seeds N]`.
 
-Per task and model: the share of coordinates of the true position, at poses that were not learnt, within 1 and within
-1.96 of the claimed sigma of the prediction (mean over the seeds, with its standard error), and the mean error. Goal:
-66 to 70 % and 93 to 97 %; where the model is wrong and has to extrapolate, at least 60 and 85 %. "!" marks what misses
-it by more than two standard errors. The arm, its drawing and the noise are those of benchmarks.rigid_learner.
+Per task and model, at held-out poses: the share of coordinates of the true position within 1 and within 1.96 claimed
+sigmas of the prediction (mean over the seeds, with its standard error), and the mean error. The goal is 66 to 70 % and
+93 to 97 %; where the model is wrong and has to extrapolate, at least 60 and 85 %. "!" marks a share that misses its
+goal by more than two standard errors. Arm, nominal model and noise are those of benchmarks.rigid_learner.
 
-A task or model is chosen by a part of its name: `--tasks "d=6" sag --models batch`.
+Tasks and models are selected by a part of their name: `--tasks "d=6" sag --models batch`.
 """
 
 from __future__ import annotations
@@ -51,14 +51,14 @@ class Task:
 
     Attributes:
         joints: 6 or 7.
-        pairs: how many.
-        told: whether the learner knows the noise.
+        pairs: number of pairs.
+        told: True if the learner is given the noise.
         reach_deg: half the range of independent poses; 0 for a guided path.
         around_deg: half the range of the random centre of those poses.
         test_deg: half the range of the test poses.
-        bend: as in `bent`.
+        bend: kind of non-rigid effect, as in `bent`.
         outliers: share of the pairs that are off by 200 mm.
-        new_tool: whether the marker is moved by 200 mm and 30 more pairs are taken.
+        new_tool: True if the marker is then moved by 200 mm and 30 more pairs are taken.
     """
 
     joints: int
@@ -136,7 +136,7 @@ MODELS: dict[str, Entry] = {
 
 @dataclass(frozen=True)
 class Outcome:
-    """Shares of coordinates within 1 and 1.96 sigma, mean error and what was claimed for it [m]."""
+    """Shares of coordinates within 1 and 1.96 sigma, mean error [m], and the mean error that was claimed [m]."""
 
     one: float
     two: float

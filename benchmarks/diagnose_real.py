@@ -1,9 +1,9 @@
 """Diagnoses of measured arms: `python -m benchmarks.diagnose_real --data FOLDER [--sets NAME ...] [--every N]`.
 
-FOLDER holds a folder of each set, with robot.toml and measured.csv. Errors are of rows that were not fitted, held out
-by blocks of rows next to each other, and dealt to folds at random; with `--corners`, also of corners of the workspace
-that the diagnosis did not see. Then the effects that were found on one day are
-taken to another day's recording of the same arm: only the instrument's place and the marker's are fitted again.
+FOLDER holds a folder for each set, with robot.toml and measured.csv. Errors are those of held-out rows: held out in
+blocks of adjacent rows, and row by row at random; with `--corners`, also in corners of the workspace that were left out
+of the diagnosis. Then the effects found on one day are applied to another day's recording of the same arm; only the
+instrument's pose and the marker's position are fitted again.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ ASKED_LATER = "RMS < 0.44, aim 0.33"
 
 @dataclass(frozen=True, eq=False)
 class Arm:
-    """A set: its simulation and what was measured."""
+    """A set: the simulation of its arm and the recording."""
 
     simulation: Simulation
     recording: Recording
@@ -69,7 +69,7 @@ def corner(x: FloatArray, number: int) -> BoolArray:
 
 
 def corner_mm(arm: Arm, number: int, seed: int) -> FloatArray:
-    """Return errors (n,) [mm] on a corner of the workspace, by the extended simulation found without it."""
+    """Return errors (n,) [mm] in a corner of the workspace, of the extended simulation found without it."""
     out = corner(arm.recording.x, number)
     found = diagnose(arm.recording.rows(np.flatnonzero(~out)), arm.simulation, seed=seed)
     there = Observations.of(arm.recording, arm.simulation).motion

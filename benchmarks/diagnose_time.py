@@ -1,8 +1,9 @@
 """Cost of a diagnosis: `python -m benchmarks.diagnose_time [--pairs 1600] [--times 10] [--causes 1 2 3 5]`.
 
-The shipped upper body's arm, six joints and the eyes, walks; effects of the table are put into its simulation, pixel
-noise and whole ticks are added. All hypotheses are tried. Each case runs in a process of its own: seconds are the
-processor's, whatever else runs beside it, and the memory is the process's peak. Ratios are to `--times` as many.
+The arm of the shipped upper body (six joints and the eyes) follows a random walk. Effects of the table are put into its
+simulation, with pixel noise and encoder quantisation added. All hypotheses are tried. Each case runs in its own
+process: seconds are CPU time, independent of other programs, and memory is the process's peak. Ratios compare `--times`
+as many pairs with `--pairs`.
 """
 
 from __future__ import annotations

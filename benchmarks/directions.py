@@ -1,4 +1,4 @@
-"""What it gains that the online learner weighs each direction of a position by its covariance.
+"""Benefit of weighting each direction of a position by its covariance in the online learner.
 
 Run `python -m benchmarks.directions [--arms N] [--pairs N ...] [--joints 4|6] [--eyes 1|2] [--encoder DEG] [--alike]`.
 The desk arm and the camera of `benchmarks.one_camera`, or an arm of six joints. One eye: covariances of the corners of
@@ -39,7 +39,7 @@ LIMITS_DEG = (150.0, 90.0, 130.0, 120.0, 170.0, 120.0)
 
 
 class SixJoints(Arm):
-    """An arm of six joints before the camera of the desk arm, with the same errors of its nominal model."""
+    """An arm of six joints in front of the desk arm's camera, with the same errors of its nominal model."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         fixed = np.tile(np.eye(4), (7, 1, 1))
@@ -56,7 +56,7 @@ class SixJoints(Arm):
 
 
 def one_eye(arm: Arm, q: FloatArray) -> FloatArray:
-    """Return covariances (n, 3, 3) [m²] of a tag's place."""
+    """Return covariances (n, 3, 3) [m²] of a tag's position."""
     found = np.empty((len(q), 3, 3))
     for row, pose in enumerate(arm.true.poses(q)):
         rotation = pose[:3, :3] @ arm.turn
@@ -71,7 +71,7 @@ def one_eye(arm: Arm, q: FloatArray) -> FloatArray:
 
 
 def two_eyes(arm: Arm, q: FloatArray) -> FloatArray:
-    """Return covariances (n, 3, 3) [m²] of a ball's place."""
+    """Return covariances (n, 3, 3) [m²] of a ball's position."""
     x = arm.true.positions(q)
     sight = x / np.linalg.norm(x, axis=1)[:, None]
     along = sight[:, :, None] * sight[:, None, :]
@@ -81,7 +81,7 @@ def two_eyes(arm: Arm, q: FloatArray) -> FloatArray:
 
 
 def snapshots(arm: Arm, q: FloatArray, x: FloatArray, cov: FloatArray, counts: list[int]) -> list[Snapshot]:
-    """Return the learner's answers after so many pairs."""
+    """Learn the pairs in order; return the learner's snapshot after each number of pairs in `counts`."""
     nominal = NominalModel(arm.nominal, arm.lower, arm.upper, pose_known=False, marker_known=False)
     settings = LearnerConfig(replays_per_pair=1.0, solve_every=SOLVE_EVERY)
     learner, found = OnlineLearner(nominal, settings, DirectSolver()), list[Snapshot]()

@@ -1,7 +1,8 @@
 """Error of a random chain recovered from noise-free samples: `python -m benchmarks.exactness [--seeds N]`.
 
-The paper: 3^d samples determine the chain, wherever they lie. In float64 a smaller cluster costs digits outside it.
-Errors are the largest of 500 configurations within +-80 degrees [m], median (and worst) over the seeds.
+According to the paper 3^d samples determine the chain, wherever they lie. In float64, samples from a smaller cluster
+lose digits outside it. Errors are the largest of 500 configurations within +-80 degrees [m], median (and worst) over
+the seeds.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ TEST_ROWS = 500
 
 
 def errors(joints: int, cluster_deg: float, times: int, seed: int) -> FloatArray:
-    """Return distances (500,) [m] within +-80 degrees after a multiple of 3^d pairs from a cluster."""
+    """Return errors (500,) [m] within +-80 degrees after a multiple of 3^d pairs from a cluster."""
     rng = np.random.default_rng(seed)
     chain, prior = random_chain(joints, rng), random_chain(joints, rng)
     cluster, reach = (np.full(joints, np.radians(deg)) for deg in (cluster_deg, REACH_DEG))

@@ -2,9 +2,9 @@
 
     python -m benchmarks.export_real --data $DATA
 
-Of each recording three tenths are held out, in blocks. The rest is diagnosed, and exported as MJCF and correction.json.
+Three tenths of each recording are held out, in blocks. The rest is diagnosed, and exported as MJCF and correction.json.
 MuJoCo and examples/correction/correction.py then predict the held-out rows from their readings. *Before* is the robot
-as described, placed by the rows that were diagnosed. The gain should lie in the interval stated in diagnosis.json.
+as described, aligned with the diagnosed rows. The gain should lie in the interval stated in diagnosis.json.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def row(folder: Path) -> list[object]:
     known, asked = recording.rows(~held), recording.rows(held)
     diagnosis = diagnose(known, simulation)
     gains = conclusion(diagnosis).gain
-    # Among the held-out rows are fixes that are not the marker, too.
+    # The held-out rows, too, contain fixes that are not the marker.
     promised = gains.with_outliers_ci95 or gains.ci95
     start = aligned(Observations.of(known, simulation), simulation).simulation
     written = diagnosis.stored.written
@@ -78,7 +78,7 @@ def row(folder: Path) -> list[object]:
             "correction": corrected(correction, asked.q),
         }
     left = {name: np.linalg.norm(x - asked.x, axis=1) for name, x in predicted.items()}
-    # Rows that lie next to each other are not independent: thirty blocks of them.
+    # Adjacent rows are not independent: resample thirty blocks of them.
     blocks = np.arange(len(asked)) * 30 // len(asked)
     cells: list[object] = [f"`{folder.name}`", [len(known), len(asked)], rms_mm(left["before"])]
     percent = gains.held_out_percent if gains.with_outliers_percent is None else gains.with_outliers_percent

@@ -1,14 +1,15 @@
 """False alarm rate when the model's uncertainty is correct: `python -m benchmarks.false_alarms [--arms N] [--draws N]`.
 
-Waiting for alarms that come once in 75,000 pairs would take too long. But if a change is sampled from the
-detector's prior (kind, size, direction, any first pair t), the pairs have the density R_n over those without a change,
-R_n being the statistic itself, summed over t (Wald's likelihood identity). So without a change an alarm comes once in
+An alarm comes once in 75,000 pairs, so waiting for alarms would take too long. Instead, a change is sampled from the
+detector's prior (kind, size, direction, any first pair t). The density of such pairs relative to pairs without a change
+is then R_n, the statistic itself, summed over t (Wald's likelihood identity). So without a change an alarm comes once
+in
 
     1 / E[1 / R_alarm]
 
-pairs, the mean over changes. R_alarm lies beyond the limit, for large changes far beyond it. The detector counts no
-pair beyond four sigmas, so its R is less than that, and alarms are rarer still. Printed: that number of pairs for the
-detector's own limit, and by which factor a limit may lie below the number of pairs that it stands for.
+pairs; E is the mean over changes. R_alarm lies beyond the limit, for large changes far beyond it. The detector counts
+no pair beyond four sigmas, so its R is smaller, and alarms are rarer still. Printed are this number of pairs for the
+detector's own limit, and the factor by which a limit may lie below the number of pairs that it stands for.
 """
 
 from __future__ import annotations
@@ -33,14 +34,14 @@ QUIET, LONGEST = (20, 120), 600
 
 
 def inverse_statistics(joints: int, sigma: float, seed: int, draws: int) -> list[float]:
-    """Return 1 / R at the alarm for changes of one arm; 0 where no alarm comes in time."""
+    """Return 1 / R at the alarm for changes of one arm; 0 for a change without an alarm in time."""
     rng = np.random.default_rng([seed, joints, round(1e4 * sigma), 17])
     arm = rough_arm(joints, rng, TOLERANCES)
     known = walk(joints, KNOWN, rng)
     belief = reference(arm, known, arm.measured(known, sigma, rng), noise_of(sigma, KNOWN)).belief
     found: list[float] = []
     for _ in range(draws):
-        # A correct belief: the arm's parameters are sampled from it, and positions are linear in them.
+        # A correct posterior: the arm's parameters are sampled from it, and positions are linear in them.
         detector = ChangeDetector(belief, SharedNoise(np.ones(1), 1.0), sigma, 1.0)
         q = walk(joints, QUIET[1] + LONGEST, rng)
         _, jacobian = belief.parameters.linearised(belief.mean, q)

@@ -1,8 +1,9 @@
-"""Wrong readings that the drivers accept when answers are lost, late, corrupt, cut, swapped or amid garbage.
+"""Wrong readings accepted by the drivers when answers are lost, late, corrupt, cut, swapped or surrounded by garbage.
 
-Virtual time: millions of transactions take minutes. Run: python -m benchmarks.fault_storm --transactions 10_000_000
+Time is virtual, so millions of transactions take minutes:
+python -m benchmarks.fault_storm --transactions 10_000_000
 Readings per second of six servos when answers are lost: python -m benchmarks.fault_storm --rates
-Servos that repeat their answer before the last: python -m benchmarks.fault_storm --stale 2 --transactions 36_000
+Servos that repeat an answer two transactions old: python -m benchmarks.fault_storm --stale 2 --transactions 36_000
 """
 
 from __future__ import annotations
@@ -58,13 +59,13 @@ def swing(phase: float) -> Callable[[float], float]:
 
 @dataclass
 class Rig:
-    """A driver with a bench behind it.
+    """A driver with an emulated device.
 
     Attributes:
-        device: whose faults are the storm.
-        transactions: how many there were: questions, or lines.
-        rad_per_tick: of its sensors.
-        parts: so many answers make a reading.
+        device: emulated device into which the faults are injected.
+        transactions: returns the number of transactions so far (queries, or lines).
+        rad_per_tick: resolution of the sensors.
+        parts: number of answers that make a reading.
     """
 
     device: Any
@@ -136,7 +137,7 @@ KINDS: dict[str, Make] = {
 
 
 class Stale:
-    """A fault: a servo answers with data of an earlier answer of the same length, and a right checksum."""
+    """A fault: a servo repeats the data of an earlier answer of the same length, with a correct checksum."""
 
     def __init__(self, back: int) -> None:
         self._back = back
@@ -147,11 +148,11 @@ class Stale:
         return replace(reply, data=self._given[reply.id, len(reply.data)][0])
 
     def storm(self, share: float, rng: Random) -> Storm:
-        """Return the faults of a device that answers so in a share of the cases."""
+        """Return a storm that applies this fault to a share of the answers."""
         return _Remembered({"stale": (share, self)}, rng, self)
 
     def keep(self, reply: Any) -> None:
-        """Remember what the servo would have answered."""
+        """Remember the servo's correct answer."""
         self._given.setdefault((reply.id, len(reply.data)), deque(maxlen=self._back + 1)).append(reply.data)
 
 
@@ -166,7 +167,12 @@ class _Remembered(Storm):
 
 
 def run(make: Make, transactions: int, intensity: float, seed: int, back: int | None = None) -> str:
-    """Return a line about that many transactions, a share of whose answers is struck; `back`: by stale data alone."""
+    """Run a storm of faults until the number of transactions is reached; return a line of results.
+
+    Args:
+        intensity: probability that an answer is faulty.
+        back: if given, the only fault is stale data, this many answers old.
+    """
     clock, rng = VirtualClock(), Random(seed)
     rig = make(clock, rng, JOINTS)
     tolerance = rig.rad_per_tick + FASTEST * TIMING_S
@@ -201,7 +207,7 @@ def run(make: Make, transactions: int, intensity: float, seed: int, back: int | 
 
 
 def rate(make: Make, loss: float, seconds: float, seed: int) -> float:
-    """Return how many readings come in a second of virtual time, openings included, when so many answers are lost."""
+    """Return the readings per second of virtual time, openings included, when the share `loss` of answers is lost."""
     clock, rng = VirtualClock(), Random(seed)
     rig, readings, begin = make(clock, rng, JOINTS_OF_AN_ARM), 0, clock.now()
     rig.device.faults = Storm({"mute": (loss, mute)}, rng)
@@ -213,7 +219,7 @@ def rate(make: Make, loss: float, seconds: float, seed: int) -> float:
 
 
 def rates(make: Make, seconds: float, seed: int) -> str:
-    """Return a line about the rates, and their ratios to that without losses."""
+    """Return a line with the rate at each loss, and its ratio to the rate without losses."""
     found = [rate(make, loss, seconds, seed) for loss in LOSSES]
     return ", ".join(
         f"{100 * loss:g} % lost: {each:.0f}/s ({each / found[0]:.2f})" for loss, each in zip(LOSSES, found, strict=True)

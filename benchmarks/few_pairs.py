@@ -2,8 +2,8 @@
 
 Run `python -m benchmarks.few_pairs [--seeds N] [--only PART]`. The arm is a humanoid's, its marker seen by a camera on
 the head; the nominal model is wrong by 3 degrees an axis, 15 mm a point and 30 mm at the marker (each component).
-Errors are mean distances to the noise-free truth [mm], means over the seeds, with the share of coordinates within one
-and 1.96 claimed sigma where there is a claim [%]. No learner knows the noise.
+Errors are mean distances to the noise-free truth [mm], means over the seeds. Models with an uncertainty also have the
+share of coordinates within one and 1.96 claimed sigmas [%]. No learner is given the noise.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def pseudo_inverse(joints: int, q: FloatArray, x: FloatArray) -> KBMap:
 
 
 def evidence(prior: RigidChain | None, joints: int, q: FloatArray, x: FloatArray) -> Model | KBMap:
-    """Fit through the kernel while pairs are few, else through the control points."""
+    """Fit through the kernel if pairs are few, otherwise through the control points."""
     if len(q) <= MOST_KERNEL_PAIRS:
         return taught(KernelLearner(bases(joints), prior), q, x)
     learner = ExactLearner(nothing(joints) if prior is None else prior.to_kbmap(bases(joints)))

@@ -1,11 +1,11 @@
 """Errors and uncertainty of the learner with few pairs: `python -m benchmarks.first_pairs [--seeds N] [--only PART]`.
 
-Arms of four, six and seven joints, guided along a path. Their nominal models err by half, once and twice the
-learner's tolerances. The frame is known, or the camera's pose is unknown, or also the marker's position. Each seed
-draws one of the noises of 0.3, 3 and 10 mm and one of the nominal errors. After the last stage comes an announced tool
-change. Printed per stage: mean distance to the truth, mean length of the claimed sigma [mm], share of coordinates
-within one and 1.96 sigma [%], and how often each model answered. "near" are poses within three degrees a joint of the
-path, "anywhere" those within the limits of 90 degrees.
+Arms of four, six and seven joints are guided along a path. Their nominal models err by half, once and twice the
+learner's tolerances. The frame is known, or the camera's pose is unknown, or the marker's position is unknown too. Each
+seed selects a noise of 0.3, 3 or 10 mm and one of the nominal errors. An announced tool change follows the last stage.
+Printed per stage: mean distance to the truth, mean length of the claimed sigma [mm], share of coordinates within one
+and 1.96 sigma [%], and how often each model answered. "near" are poses within three degrees a joint of the path,
+"anywhere" those within the limits of 90 degrees.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class Outcome:
 
 
 def guided(joints: int, count: int, rng: np.random.Generator) -> FloatArray:
-    """Return straight ways between random waypoints in steps of 2 degrees, shape (count, joints)."""
+    """Return straight segments between random waypoints in steps of 2 degrees, shape (count, joints)."""
     q, goal = [np.zeros(joints)], rng.uniform(-REACH, REACH, joints)
     while len(q) < count:
         if np.linalg.norm(goal - q[-1]) < STEP:
@@ -84,7 +84,7 @@ def guided(joints: int, count: int, rng: np.random.Generator) -> FloatArray:
 
 
 def elsewhere(built: RigidChain, frame: str, rng: np.random.Generator) -> RigidChain:
-    """Return the arm with a random tool or camera pose where `frame` leaves them unknown."""
+    """Return the arm with a random tool or camera pose, whichever `frame` leaves unknown."""
     pose_known, marker_known = FRAMES[frame]
     if not marker_known:
         built = built.with_tool(MARKER_M * rng.normal(size=3))
@@ -97,7 +97,7 @@ def elsewhere(built: RigidChain, frame: str, rng: np.random.Generator) -> RigidC
 
 
 def outcomes(case: Case, pairs: int) -> Iterator[Outcome]:
-    """Teach one arm, all background work done after each pair, and look at its stages."""
+    """Teach one arm, with all background work done after each pair; yield the outcome of each stage."""
     rng = np.random.default_rng(case.seed)
     settings = LearnerConfig()
     arm = rough_arm(case.joints, rng, chain_tolerances(settings))

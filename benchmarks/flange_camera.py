@@ -1,9 +1,10 @@
-"""A calibrated camera on the flange and a tag in the world: T_flange_camera, and what `bodyschema calibrate` claims.
+"""A calibrated camera on the flange and a tag in the world: T_flange_camera, and its uncertainty from `calibrate`.
 
 Run `python -m benchmarks.flange_camera [--arms N] [--pairs N]`. For each arm the camera is calibrated from 20 rendered
-views of a board, and sees rendered tags as `benchmarks.one_camera` renders them, 0.25 to 0.8 m away. The tag's side is
-off by 0.1 mm (1-sigma), joint zeros by 3°, encoders have 12 bits, links are as in the URDF. What joint zeros cannot be
-told from belongs to the truth: the last one turns the camera. A turn of the calibration's frame does, too.
+views of a board, and sees tags 0.25 to 0.8 m away, rendered as in `benchmarks.one_camera`. The tag's side is off by
+0.1 mm (1-sigma), joint zeros by 3°, encoders have 12 bits, links are as in the URDF. Joint zeros that cannot be
+distinguished from the camera's pose belong to the truth: the last one rotates the camera. So does a rotation of the
+calibration's frame.
 """
 
 from __future__ import annotations
@@ -73,11 +74,11 @@ class Wrist:
         return RobotDescription.load(ROBOT).with_placement(np.eye(4), np.zeros(3)).chain.poses(q)
 
     def tag(self, q: FloatArray) -> FloatArray:
-        """Return the tag's poses (n, 4, 4) in the camera at angles (n, d) [rad] as they are read."""
+        """Return the tag's poses (n, 4, 4) in the camera at measured angles (n, d) [rad]."""
         return np.linalg.inv(self.gripper(q + self.zeros) @ self.T_gripper_camera) @ T_BASE_TAG
 
     def readings(self, count: int, rng: np.random.Generator) -> FloatArray:
-        """Return angles (count, d) [rad] as they are read where the camera sees the tag."""
+        """Return measured angles (count, d) [rad] of poses in which the camera sees the tag."""
         robot = RobotDescription.load(ROBOT)
         q = rng.uniform(robot.lower, robot.upper, (400 * count, len(robot.joints)))
         T = self.tag(q)
@@ -92,7 +93,7 @@ class Wrist:
         return q[seen][:count]
 
     def truth(self, rig: Rig) -> FloatArray:
-        """Return x, y, z [mm] and roll, pitch, yaw [°] of the camera, as the last joint's nominal zero shows it."""
+        """Return x, y, z [mm] and roll, pitch, yaw [°] of the camera, given the last joint's nominal zero."""
         last = np.zeros((2, len(self.zeros)))
         last[1, -1] = self.zeros[-1]
         before, after = self.gripper(last)
@@ -109,7 +110,7 @@ def recorded(wrist: Wrist, rig: Rig, count: int, rng: np.random.Generator) -> Re
     """Return the pairs of rendered images."""
     rectification, q = Rectification(rig), wrist.readings(count, rng)
     maps, tracker = rectification.maps(0), TagTracker(rectification.calibration, TagBody.single(TAG), TAG)
-    one_camera.SIDE_M = SIDE_M + SIDE_SIGMA_M * rng.standard_normal()  # as it was printed
+    one_camera.SIDE_M = SIDE_M + SIDE_SIGMA_M * rng.standard_normal()  # the tag's printed side
     first, kept, fixes = int(rng.integers(1 << 40)), [], []
     for k, T in enumerate(wrist.tag(q)):
         tracker.forget()

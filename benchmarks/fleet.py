@@ -1,19 +1,19 @@
-"""One learner host for many robots: what each costs, and whether the instant models keep up.
+"""One learner host for many robots: the cost of each robot, and the lag of the instant models.
 
 python benchmarks/fleet.py [--robots 1,10,25,50] [--rate 20] [--warm 20] [--seconds 20] [--processes 2]
 
-Robots of six joints, whose pairs come over real zenoh from a process that publishes them and answers from their
+Robots of six joints. Their pairs come over real zenoh from a process that publishes them and answers from their
 history as samplers do. For each number of robots, after `--warm` seconds of pairs:
 
-    pairs/s    that came, of all robots
-    cpu        processor's time of the host's processes per pair [ms]: of the threads that take, learn and judge pairs;
-               of the background's (replay, findings, the solver's orders); of all others (zenoh, answers, statuses,
+    pairs/s    pairs received from all robots
+    cpu        CPU time of the host's processes per pair [ms]: of the threads that receive, learn and evaluate pairs;
+               of the background (replay, findings, requests to the solver); of all others (zenoh, answers, statuses,
                checkpoints); of the solvers
-    cores      what that is together, in cores
-    behind     pairs published and not learnt yet by the instant model whenever a robot is asked for a prediction: at
-               the median, 99 % and at most
+    cores      the sum of these, in cores
+    behind     pairs that are published but not yet learnt by the instant model when a robot is asked for a prediction:
+               median, 99 % and maximum
     MB         memory of the host's processes per robot
-    load       of the machine, with whatever else runs on it
+    load       of the machine, other programs included
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def free_endpoint() -> str:
 
 
 class Walk:
-    """One robot's pairs: a walk of an arm whose zeros are off, with history."""
+    """Pairs of one robot: a walk of an arm with joint offsets, with history."""
 
     def __init__(self, config: Config, seed: int) -> None:
         self._config, self._rng = config, np.random.default_rng(seed)
@@ -110,7 +110,7 @@ class Walk:
 
 @dataclass(frozen=True)
 class Usage:
-    """Processor time [s] by `PARTS` and memory [bytes] of a process and its children."""
+    """CPU time [s] by `PARTS` and memory [bytes] of a process and its children."""
 
     seconds: dict[str, float]
     memory: int
@@ -139,7 +139,7 @@ def _family(pid: int) -> list[int]:
 
 
 class Asker(threading.Thread):
-    """Asks one robot after the other for a prediction, and notes how many pairs its instant model is behind."""
+    """Client that asks the robots in turn for a prediction, and records how many pairs each instant model is behind."""
 
     def __init__(self, ends: list[str], walks: list[Walk]) -> None:
         super().__init__()
@@ -212,7 +212,7 @@ def _row(pid: int, ends: list[str], walks: list[Walk], publish: list, course: Co
 
 
 def _publish(walks: list[Walk], publish: list, rate: float, seconds: float) -> int:
-    """Publish pairs in turns at their rate; how many."""
+    """Publish pairs of all robots in turns at their rate; return their number."""
     begin, published = time.monotonic(), 0
     while (now := time.monotonic() - begin) < seconds:
         while published < now * rate * len(walks):

@@ -1,12 +1,13 @@
 """Accuracy of the learners on a hand-guided recording: `python -m benchmarks.guided_walk [--seeds N] [--sweep]`.
 
 Seven joints (two of the neck that carries the cameras, five of the arm). The nominal model is wrong by 2 degrees and
-10 mm a link and by 30 mm at the marker. 600 pairs with 3 mm noise along a smooth path, then another tool, 250 mm
-away, and 300 pairs more. Errors are mean distances to the noise-free truth [mm], mean over the seeds (and the worst):
+10 mm a link and by 30 mm at the marker. 600 pairs with 3 mm noise are learnt along a smooth path; then the marker is
+moved by 250 mm and 300 more pairs follow. Errors are mean distances to the noise-free truth [mm], mean over the seeds
+(and the worst):
 
     near    the path's own configurations moved by 5 degrees (norm over the joints)
     region  every joint moved by 5 degrees (standard deviation)
-    later   the 600 pairs that would have come next, between new waypoints
+    later   the next 600 pairs, between new waypoints
 """
 
 from __future__ import annotations

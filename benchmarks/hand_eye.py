@@ -1,10 +1,10 @@
 """Hand-eye calibration of a wrist camera from a tag fixed in the world, compared with OpenCV's five methods.
 
 Run `python -m benchmarks.hand_eye [--seeds N] [--views N] [--opencv4 PYTHON]`. OpenCV 5 has no `calibrateHandEye` in
-Python: PYTHON is an interpreter with OpenCV 4, without which only this learner runs. The arm is the desk arm, exact and
-with exact encoders, as OpenCV's methods take it to be; its camera sits near the gripper and sees a tag of 50 mm from
-0.3 to 0.8 m. Its corners have noise of 0.05 px. All methods get the same views; errors are those of T_flange_camera,
-RMS over the seeds.
+Python: PYTHON is an interpreter with OpenCV 4; without it only this learner runs. Arm and encoders are exact, as
+OpenCV's methods assume. The camera of the desk arm sits near the gripper and sees a tag of 50 mm from 0.3 to 0.8 m,
+with 0.05 px of noise on its corners. All methods get the same views. Errors are those of T_flange_camera, RMS over the
+seeds.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def views(
         # The nominal chain goes from the gripper, where the camera nominally sits, to the world.
         T_gripper_world = robot.chain.poses(angles[None])[0]
         if T_world_tag is None:
-            # The tag stands before the camera of the first view.
+            # The tag is placed in front of the camera of the first view.
             ahead = transform(Rotation.from_rotvec([np.pi - 0.4, 0.2, 0.1]), np.array([0.0, 0.0, 0.5]))
             T_world_tag = np.linalg.inv(T_gripper_world) @ T_gripper_camera @ ahead
         T_camera_tag = T_camera_gripper @ T_gripper_world @ T_world_tag

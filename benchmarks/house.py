@@ -75,7 +75,7 @@ def product() -> list[Path]:
 
 
 def numbers(tree: ast.Module) -> list[str]:
-    """Return the names at the top of a module that get a value with a number in it, types left out."""
+    """Return the module-level names that are assigned a value containing a number, type aliases excluded."""
     return [
         ast.unparse(node.targets[0] if isinstance(node, ast.Assign) else node.target).strip("()")
         for node in tree.body
@@ -85,7 +85,7 @@ def numbers(tree: ast.Module) -> list[str]:
 
 
 def kind_of_number(file: Path, name: str) -> str:
-    """Return "fact", "bound", "wait", or "tuned" for what is none of these."""
+    """Classify a module-level number as "fact", "bound" or "wait"; all others are "tuned"."""
     if str(file) in TABLES or FACTS.fullmatch(name.split(",")[0]) or MORE_FACTS.fullmatch(name):
         return "fact"
     if file.parts[0] in OF_IO:
@@ -119,7 +119,7 @@ def small_with_one_importer(files: list[Path]) -> int:
 
 
 def leaves() -> int:
-    """Return the number of commands that do something, of the command line."""
+    """Return the number of commands of the command line, groups excluded."""
     from bodyschema.cli.main import app
 
     def of(command: object) -> int:
@@ -131,7 +131,7 @@ def leaves() -> int:
 
 
 def keys() -> int:
-    """Return the number of keys of robot.toml on its page; kinds of one table share theirs."""
+    """Return the number of keys of robot.toml on its page; variants of one table share theirs."""
     table, found = "", set[tuple[str, str]]()
     for line in (ROOT / "docs" / "reference" / "robot_toml.md").read_text("utf-8").splitlines():
         if line.startswith("## "):

@@ -1,4 +1,4 @@
-"""A humanoid arm seen by cameras on its own head, and a hand-guided path of it: the data of several benchmarks."""
+"""A humanoid arm seen by cameras on its own head, and a hand-guided path of it, for several benchmarks."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ WAYPOINT_DEG = 45.0
 
 
 def nominal_chain() -> RigidChain:
-    """Camera on the head, two neck joints, then five arm joints; lengths near those of ARMAR-III [m].
+    """Return the nominal chain: camera on the head, two neck joints, five arm joints; lengths near ARMAR-III's [m].
 
-    The measurement frame is the camera's. Camera 80 mm before and 320 mm above the shoulder line, upper arm 310 mm,
-    forearm 240 mm, hand with tool 220 mm, the elbow bent by 60 degrees at zero.
+    The measurement frame is the camera's. The camera is 80 mm in front of and 320 mm above the shoulder line. Upper arm
+    310 mm, forearm 240 mm, hand with tool 220 mm; the elbow is bent by 60 degrees at zero.
     """
     x, y, z = np.eye(3)
-    # Axes in the order camera -> marker: neck tilt, neck pan, shoulder yaw, pitch, roll, elbow, forearm roll.
+    # Axes from camera to marker: neck tilt, neck pan, shoulder yaw, pitch, roll, elbow, forearm roll.
     axes = np.array([y, z, z, y, x, y, x])
     shifts = [(-0.08, 0.0, -0.12), (0, 0, 0), (0, -0.2, -0.20), (0, 0, 0), (0, 0, 0), (0.31, 0, 0), (0.24, 0, 0)]
     fixed = np.tile(np.eye(4), (JOINTS + 1, 1, 1))
@@ -45,7 +45,7 @@ def built_chain(
 ) -> RigidChain:
     """Return a random true arm: every link of the nominal one rotated and shifted a little, and the marker moved.
 
-    axis_deg and shift_mm are standard deviations of each component, tool_mm of the marker's.
+    `axis_deg` and `shift_mm` are standard deviations of each component, `tool_mm` that of the marker's shift.
     """
     fixed = nominal.fixed.copy()
     for transform in fixed:

@@ -1,7 +1,8 @@
 """Inverse kinematics on random arms: how often targets are reached, steps, and time.
 
-Positions (and poses) that random configurations within the limits have, so all of them are in reach; then positions
-that certainly are not. Arms: random link lengths and axes. No start is given: every answer is found globally.
+Targets are positions (and poses) of random configurations within the limits, so all of them are in reach; then
+positions that certainly are not. Arms have random link lengths and axes. No initial guess is given: every answer is
+found globally.
 Run: python benchmarks/inverse_kinematics.py
 """
 
@@ -59,7 +60,7 @@ def random_arm(rng: np.random.Generator, case: Case) -> tuple[KBMap, np.ndarray]
 
 
 def farthest(kbmap: KBMap, half: np.ndarray, rng: np.random.Generator) -> float:
-    """Return a distance [m] from the base that no configuration reaches: over twice the farthest sample."""
+    """Return a distance [m] from the base that no configuration reaches: more than twice the farthest sample."""
     reach = np.linalg.norm(kbmap.predict(rng.uniform(-half, half, (4000, len(half)))), axis=1).max()
     return 2.0 * float(reach) + BEYOND_M
 

@@ -1,9 +1,9 @@
 """Accuracy of the marker's centre, compared with OpenCV's detectors: `python benchmarks/marker_centres.py`.
 
-Balls of 5 to 40 px radius, drawn at random by the tests' ray tracer, with a webcam's noise (light and sensor). Each
-rival gets the same part of the image and the same mask of colours, and the correction for the sphere's ellipse with
-the true distance. Then the error in space at 1 m against the Cramér-Rao bound, from the derivative of the rendered
-pixels by the ball's position; the bound takes all else as known.
+Random balls of 5 to 40 px radius, rendered by the tests' ray tracer, with a webcam's noise (light and sensor). All
+detectors get the same image region, the same colour mask, and the correction for the sphere's ellipse with the true
+distance. Then the error in space at 1 m is compared with the Cramér-Rao bound, computed from the derivative of the
+rendered pixels by the ball's position; the bound takes all else as known.
 """
 
 from __future__ import annotations
@@ -128,7 +128,7 @@ def information(x: FloatArray, look: Look, pictures: list[FloatArray], calibrati
     """Return the Fisher information (3, 3) [1/m²] of the ball's position in the noisy pixels of both cameras."""
     total = np.zeros((3, 3))
     fine = replace(look, samples=16)
-    # Large beside the rays' spacing, small beside the blur: 0.2 px.
+    # Large compared with the rays' spacing, small compared with the blur: 0.2 px.
     steps = np.diag([2e-4, 2e-4, 2e-3])
     for eye, picture in enumerate(pictures):
 

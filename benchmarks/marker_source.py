@@ -1,8 +1,8 @@
 """Learn a desk arm from positions that another program sends: the real daemon, sockets and clocks, an emulated arm.
 
-The joints come by ROS 2 (rmw_zenoh), the marker by UDP datagrams or NatNet frames with another clock, noise, delay and
-lost packets. The arm differs from its URDF by joint offsets, and the source's frame stands anywhere. Errors are
-measured against the true chain on poses that were not learnt.
+The joints come by ROS 2 (rmw_zenoh). The marker comes by UDP datagrams or NatNet frames, with another clock, noise,
+delay and lost packets. The arm differs from its URDF by joint offsets, and the source's frame is arbitrary. Errors are
+measured against the true chain on held-out poses.
 
 Type: python -m benchmarks.marker_source [udp|natnet] [--seconds 60] [--rate 100] [--sigma-mm 0.5] [--lost 0.01]
 """
@@ -70,10 +70,10 @@ state_dir = "state"
 
 
 class Arm:
-    """An arm as it was built, guided along a path of its own for each joint.
+    """The true arm, each joint on its own path.
 
     Attributes:
-        is_wiggled: moved to and fro, to measure the latency.
+        is_wiggled: True while it moves to and fro, to measure the latency.
     """
 
     def __init__(self, description: RobotDescription, rng: np.random.Generator) -> None:
@@ -88,7 +88,7 @@ class Arm:
         self._rates = rng.uniform(0.12, 0.45, (len(JOINTS), 3))
 
     def path(self, joint: int) -> Callable[[float], float]:
-        """Return a joint's reading [rad] by time [s]: three sines that do not repeat."""
+        """Return a joint's reading [rad] as a function of time [s]: a sum of three sines that does not repeat."""
         phases, rates = self._phases[joint], self._rates[joint]
 
         def reading(t: float) -> float:
@@ -107,14 +107,14 @@ class Arm:
 
 
 def free_port() -> int:
-    """Return a TCP port that is free now."""
+    """Return a free TCP port."""
     with socket.socket() as found:
         found.bind(("127.0.0.1", 0))
         return found.getsockname()[1]
 
 
 class Sender:
-    """Measures the marker at a rate and sends it: by UDP, or as Motive does."""
+    """Sender of the marker's measured positions at a fixed rate, by UDP or as Motive does."""
 
     def __init__(self, arm: Arm, arguments: argparse.Namespace, rng: np.random.Generator) -> None:
         self._arm, self._arguments, self._rng = arm, arguments, rng
@@ -140,7 +140,7 @@ class Sender:
 
     @property
     def table(self) -> str:
-        """The keys of [marker_source]."""
+        """Return the keys of [marker_source]."""
         if self._motive is not None:
             keys = f'kind = "natnet"\ncommand_port = {self._motive.command_port}\nbody = "tool"\n'
         else:
@@ -171,7 +171,7 @@ class Sender:
 
 
 def main() -> None:
-    """Run the daemon for a while; print what it learnt."""
+    """Run the daemon for a while; print the learnt arm's errors."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("kind", choices=("udp", "natnet"), nargs="?", default="udp")
     parser.add_argument("--seconds", type=float, default=60.0)
@@ -204,7 +204,7 @@ def main() -> None:
 
 
 def _latency(file: Path) -> str:
-    """Measure the latency as a user does, print it, and return its two keys."""
+    """Measure the latency with the command line, print it, and return its two keys."""
     command = [*COMMAND, "calibrate", "latency", "--seconds", "8", "--json", "--robot", str(file)]
     done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
     found = json.loads(done.stdout)

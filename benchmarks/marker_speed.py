@@ -1,8 +1,8 @@
 """CPU time of a stereo pair, on one core: `python benchmarks/marker_speed.py [--pairs N]`.
 
-A ball that moves a little before clutter, drawn by the tests' ray tracer with a webcam's noise; at 640x480 and at
-1280x720, in sizes from 8 to 30 px of radius; followed, and searched for in the whole images each time. In the last of
-each a box of the ball's hue is beside it. They take turns; of each pair the round with the least CPU time counts.
+A ball moves a little in front of clutter, rendered by the tests' ray tracer with a webcam's noise, at 640x480 and at
+1280x720, with a radius of 8 to 30 px. It is tracked, or searched for in the whole images each time. In the last variant
+of each, a box of the ball's hue is beside it. Variants take turns; the round with the least CPU time counts.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def _paint_brick(picture: FloatArray, centre_px: FloatArray, radius_px: float) -
 
 
 def tracked(calibration: StereoCalibration, frames: list[StereoFrame], *, forget: bool) -> tuple[list[float], int]:
-    """Return CPU times [s] of all frames but the first, and how many were fixes."""
+    """Return CPU times [s] of all frames but the first, and the number of fixes."""
     tracker = StereoTracker(calibration)
     tracker.track(frames[0])
     seconds: list[float] = []

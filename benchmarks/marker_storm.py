@@ -1,15 +1,16 @@
 """Wrong fixes among hard frames: `python benchmarks/marker_storm.py --frames 100000`.
 
-Short scenes of a ball that is moved before clutter, by a hand with fingers around it or without, with distractors
-(smaller balls, balls of other hues, a twin), its copy in a mirror, things of its own hue behind and beside it, light
-that changes, over-exposure and a webcam's noise; sometimes it is hidden. A fix is wrong where it is farther from the
-ball than 5 of its sigmas and 2 mm, or where there is no ball to be seen; of these, what is farther off than the ball's
-radius is another thing. (Of perfectly normal errors 1.5 in 100,000 are beyond 5 sigmas.) A ball is good where it is in
-full view, clear of the border, before things of other hues and without a twin: those are to be kept. The twin shows
-beside the ball from a scene's first frame on and has to be called ambiguous.
+Short scenes of a ball that is moved in front of clutter, by a hand with fingers around it or without. They contain
+distractors (smaller balls, balls of other hues, a twin), a mirror image of the ball, objects of its own hue behind and
+beside it, changing light, over-exposure and a webcam's noise; sometimes the ball is hidden.
 
-Each scene has random numbers of its own; Ctrl-C ends the storm early, with its table. `--list` names the scenes of what
-is wrong and of good balls that are refused, `--only` shows one of them again.
+A fix is wrong if it is farther from the ball than 5 of its sigmas and 2 mm, or if no ball is visible. A wrong fix
+farther off than the ball's radius counts as another object. (Of perfectly normal errors 1.5 in 100,000 are beyond
+5 sigmas.) A ball is good, and should be kept, if it is in full view, clear of the border, in front of other hues, and
+without a twin. A twin is beside the ball from a scene's first frame on and has to be reported as ambiguous.
+
+Each scene has its own random numbers. Ctrl-C ends the run early and prints the table. `--list` names the scenes with
+wrong fixes and with good balls that are refused; `--only` shows one of them again.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ CONFIG = VisionConfig()
 
 @dataclass(frozen=True)
 class Scene:
-    """Contents of the view beside the ball, and the ball's motion: start (3,) [m] and step a frame (3,) [m]."""
+    """Contents of the view besides the ball, and the ball's motion: start (3,) [m] and step a frame (3,) [m]."""
 
     kind: str
     start: FloatArray
@@ -60,7 +61,7 @@ class Scene:
 
 
 def draw_scene(rng: np.random.Generator, kind: str) -> Scene:
-    """Draw a random scene of this kind; the second ball, if any, is well apart from the first in both images."""
+    """Sample a random scene of this kind; the second ball, if any, is well apart from the first in both images."""
     look = random_light(rng, Look(noise_sd=1.5, shot=0.03, exposure=float(rng.uniform(0.5, 1.1)), samples=4))
     start = place(SMALL, float(np.exp(rng.uniform(*np.log((7.0, 20.0))))), rng)
     step = rng.normal(0.0, 0.003, 3)
@@ -221,7 +222,7 @@ def main() -> None:
         sum(getattr(count, part) for count in counts.values())
         for part in ("frames", "wrong", "elsewhere", "good", "kept")
     )
-    # No wrong one among n: the rate is below 3/n with 95 % confidence.
+    # No wrong fix among n: the rate is below 3/n with 95 % confidence.
     bound = f", below {100 * 3 / frames:.3f} % at 95 %" if wrong == 0 else ""
     share = f" ({kept / good:.1%})" if good else ""
     print(f"\n{wrong} wrong fixes in {frames} frames{bound}, {elsewhere} of other things")

@@ -1,13 +1,13 @@
 """One camera and a tag on the tool: fixes, their claimed uncertainty, the arm learnt from them, and frame rates.
 
-Run `python -m benchmarks.one_camera [--seeds N] [--pairs N]`. A desk arm of four joints is rendered as one camera of
-640×480 pixels and f = 600 px sees it: a lens blur of 0.5 px, each pixel's light exactly, 2 grey levels of noise. The
+Run `python -m benchmarks.one_camera [--seeds N] [--pairs N]`. A desk arm of four joints is rendered as seen by one
+camera of 640×480 pixels and f = 600 px: exact light of each pixel, a lens blur of 0.5 px, 2 grey levels of noise. The
 tag of 50 mm on its tool is 0.5 to 0.7 m away and turned by up to 50° from the line of sight. The nominal model is wrong
 by 1° an axis, 5 mm a point, 2° a joint offset and 20 mm at the tool. Encoders are exact, so the remaining error comes
 from the corners.
 
 The bound is that of Cramér and Rao for a chain with the nominal model's tolerances as its prior, from the corners'
-claimed covariances: positions alone, and with the orientations too.
+claimed covariances: for positions alone, and for positions with orientations.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ TEST_POSES = 300
 
 
 class Arm:
-    """A true arm, of which the drawing is `nominal`, and how the tag is turned on its tool."""
+    """A true arm, its nominal model, and the tag's orientation on the tool."""
 
     def __init__(self, rng: np.random.Generator) -> None:
         robot = RobotDescription.load(ROBOT)
@@ -90,10 +90,10 @@ class Arm:
 
 
 def image(number: int, x: FloatArray, rotation: FloatArray) -> ImageArray:
-    """Return the camera image of the tag at x (3,) [m] with rotation (3, 3), before a plain wall.
+    """Return the camera image of the tag at x (3,) [m] with rotation (3, 3), in front of a plain wall.
 
-    Pixels are squares that collect light evenly. Along 24 lines within each row of pixels, the places where the level
-    changes are computed, and what lies between is summed exactly. The lens blurs quarters of pixels.
+    Pixels are squares that collect light evenly. Along 24 lines within each row of pixels the grey level is integrated
+    exactly between the computed places where it changes. The lens blur is applied at a quarter of the pixel size.
     """
     width, height = CAMERA.image_size_px
     u0, v0 = CAMERA.principal_point_px
@@ -154,7 +154,7 @@ def measured(arm: Arm, q: FloatArray) -> tuple[list[MarkerFix], FloatArray, int]
 
 
 def bound(arm: Arm, q: FloatArray, fixes: list[MarkerFix], test: FloatArray, *, oriented: bool) -> float:
-    """Return the RMS distance [m] that no unbiased learner of these pairs falls below on average."""
+    """Return the lower bound of the expected RMS distance [m] of any unbiased learner of these pairs."""
     parameters = ChainParameters(arm.true)
     spread = parameters.standard_deviations(DRAWN)
     columns = np.flatnonzero(spread > 0.0)

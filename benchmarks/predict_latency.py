@@ -1,7 +1,7 @@
 """Latency of `predict` over loopback TCP at d = 7, while the learner learns, replays and solves.
 
-Three processes as in real use: the learner, a client that asks 250 times a second, and this one, which stands in for
-the sampler: it has 3,000 pairs in its history and publishes 30 more a second. Run: python benchmarks/predict_latency.py
+Three processes as in real use: the learner, a client that asks 250 times a second, and this one, which replaces the
+sampler: it has 3,000 pairs in its history and publishes 30 more a second. Run: python benchmarks/predict_latency.py
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ STORE = "00000000-0000-4000-8000-000000000000"
 
 
 class StandInSampler:
-    """Pairs of the robot with a tool that the nominal model does not know, stored and published."""
+    """Pairs of a robot with a tool that the nominal model does not know, stored and published."""
 
     def __init__(self, config: Config, count: int) -> None:
         rng = np.random.default_rng(1)
@@ -69,7 +69,7 @@ class StandInSampler:
 
 
 def walk(rng: np.random.Generator, count: int, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Return joint angles (count, d) [rad]: straight ways between random waypoints in steps of 2 degrees."""
+    """Return joint angles (count, d) [rad]: straight segments between random waypoints in steps of 2 degrees."""
     step, q = np.radians(STEP_DEG), [(low + high) / 2]
     goal = rng.uniform(low, high)
     while len(q) < count:
@@ -106,7 +106,7 @@ def asked(robot_file: Path) -> FloatArray:
 
 @contextmanager
 def running_learner(robot_file: Path, endpoint: str) -> Iterator[None]:
-    """Run `bodyschema run learner`, from its first answer to the end of the with statement."""
+    """Run `bodyschema run learner` in the `with` statement, which is entered after its first answer."""
     command = module_command("bodyschema", "run", "learner", "--robot", str(robot_file))
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
     try:
@@ -175,7 +175,7 @@ def measure(robot_file: Path) -> tuple[FloatArray, FloatArray]:
 
 
 def feed(bus: ZenohSession, keys: Keys, sampler: StandInSampler, stop: threading.Event) -> None:
-    """Publish pairs at their rate until told to stop."""
+    """Publish pairs at their rate until `stop` is set."""
     publish = bus.publisher(keys.pair)
     while not stop.wait(1.0 / PAIRS_PER_S):
         publish(sampler.next())

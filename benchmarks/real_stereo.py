@@ -1,13 +1,13 @@
-"""The calibration of public stereo pairs of a chessboard beside OpenCV's.
+"""Calibration of public stereo pairs of a chessboard, compared with OpenCV's.
 
 Run `python benchmarks/real_stereo.py [FOLDER] [--left PATTERN --right PATTERN] [--squares 10x7] [--square-mm 25]`.
 
 The default is OpenCV's own sample pairs: left01.jpg to right14.jpg, which its sources have in samples/data and Debian's
 package opencv-doc in /usr/share/doc/opencv-doc/examples/data. No images are in this repository.
 
-Both calibrate from the same corners: once from all views, then from three quarters of the pairs, with which the corners
-of every fourth pair are predicted. OpenCV takes the lens model that is chosen here; the 1-sigma of its baseline is a
-delete-one jackknife over the pairs. Where OpenCV finds no start of a fisheye lens, it gets ours.
+Both calibrate from the same corners: once from all views, then from three quarters of the pairs, to predict the corners
+of every fourth pair. OpenCV uses the lens model that is chosen here; the 1-sigma of its baseline is a delete-one
+jackknife over the pairs. If OpenCV finds no initial values for a fisheye lens, it gets ours.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def show(views: Sequence[View], board: Board, size_px: tuple[int, int]) -> None:
 
 
 def rows(ours: Calibrated, theirs: FloatArray | None) -> list[tuple[str, str, str, str]]:
-    """Name, our value, its sigma and OpenCV's value."""
+    """Return the name, our value, its sigma and OpenCV's value of each row."""
     rig = ours.rig
     assert isinstance(rig, StereoRig)
     n = len(rig.vector) if theirs is None else len(theirs)
@@ -93,7 +93,7 @@ def rows(ours: Calibrated, theirs: FloatArray | None) -> list[tuple[str, str, st
     ]
     distance = 1e3 * float(np.linalg.norm(other[-3:]))
     baseline = f"{1e3 * rig.baseline_m:.3f}", f"{1e3 * rig.baseline_sigma_m:.3f}", f"{distance:.3f}"
-    # A point's distance is of two coordinates.
+    # A point has two coordinates.
     errors = [f"{np.sqrt(2) * each:.3f}" for each in (rig.made.reprojection_px, rig.made.held_out_px)]
     return [
         *table,
@@ -104,7 +104,7 @@ def rows(ours: Calibrated, theirs: FloatArray | None) -> list[tuple[str, str, st
 
 
 def predicted(views: Sequence[View], board: Board, model: Model, vector: FloatArray) -> float:
-    """Return the RMS error of a point [px] of views whose poses alone are fitted."""
+    """Return the RMS error of a point [px] in views of which only the poses are fitted."""
     left = split(model, vector)[0]
     squares, points = 0.0, 0
     for view in views:
@@ -118,10 +118,10 @@ def predicted(views: Sequence[View], board: Board, model: Model, vector: FloatAr
 def opencv(
     views: Sequence[View], board: Board, size_px: tuple[int, int], model: Model, known: FloatArray | None = None
 ) -> FloatArray | None:
-    """Return the rig, as `StereoRig.vector` has it, of OpenCV's own calibration; None if it fails.
+    """Return the rig of OpenCV's own calibration, in the order of `StereoRig.vector`; None if it fails.
 
     Args:
-        known: a rig whose lenses are the start, in the place of each eye's own calibration.
+        known: a rig whose lenses are the initial values, instead of a calibration of each eye alone.
     """
     eyes = [(view.left, view.right) for view in views if view.left is not None and view.right is not None]
     corners = [board.corners_m[each.numbers][None].astype(np.float32) for each, _ in eyes]

@@ -28,8 +28,8 @@ class Recording:
     """A measured robot.
 
     Attributes:
-        chain: as its maker draws it.
-        q, x: what was measured, (n, d) [rad] and (n, 3) [m].
+        chain: the manufacturer's nominal chain.
+        q, x: measured readings (n, d) [rad] and positions (n, 3) [m].
     """
 
     chain: RigidChain
@@ -46,6 +46,6 @@ class Recording:
         return cls(robot.chain, table[:, : robot.chain.joints], table[:, -3:])
 
     def split(self, pairs: int, seed: int) -> tuple[IntArray, IntArray]:
-        """Split rows at random into those to learn and all others."""
+        """Split rows at random into `pairs` training rows and all others."""
         order = np.random.default_rng(seed).permutation(len(self))
         return order[:pairs], order[pairs:]

@@ -1,9 +1,10 @@
 """Accuracy of the rigid chain learners: `python -m benchmarks.rigid_learner [--seeds N]`.
 
-The arm is a humanoid's, its marker seen by a camera on the head; d joints, configurations uniform within +-80 degrees,
-10 mm of noise on each coordinate, nominal model wrong by 3 degrees an axis, 15 mm a point and 30 mm at the marker (each
-component) unless said. Errors are mean distances to the noise-free truth, in mm, means over the seeds. `bound` is what
-the posterior of the right model with the right prior leaves. The learner does not know the noise.
+The arm is a humanoid's, its marker seen by a camera on the head. It has d joints, configurations uniform within
++-80 degrees, and 10 mm of noise on each coordinate. Unless stated otherwise the nominal model is wrong by 3 degrees an
+axis, 15 mm a point and 30 mm at the marker (each component). Errors are mean distances to the noise-free truth [mm],
+means over the seeds. `bound` is the error of the posterior of the right model with the right prior. The learner is not
+given the noise.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ def batch(arm: RoughArm, q: FloatArray, x: FloatArray) -> RigidLearner:
 
 
 def exact_from_drawing(pairs: int, seed: int) -> float:
-    """Return the error [mm] of noise-free pairs, d = 7."""
+    """Return the error [mm] of a fit to noise-free pairs from the nominal model, d = 7."""
     rng = np.random.default_rng(seed)
     arm = rough_arm(7, rng)
     q = arm.angles(pairs, 80, rng)
@@ -48,7 +49,7 @@ def exact_from_drawing(pairs: int, seed: int) -> float:
 
 
 def exact_from_nothing(pairs: int, reach_deg: float, seed: int) -> tuple[float, float]:
-    """Return the error over +-80 degrees [mm] of noise-free pairs within the reach, d = 7, and CPU time [s]."""
+    """Return error [mm] over +-80 degrees of a fit to noise-free pairs within the reach, d = 7, and CPU time [s]."""
     rng = np.random.default_rng(seed)
     arm = rough_arm(7, rng)
     q = arm.angles(pairs, reach_deg, rng)
@@ -77,7 +78,7 @@ class NoisyFit:
     """Errors of one fit [mm]: near within +-80, wide within +-120 degrees, online pair by pair; and its bounds.
 
     Attributes:
-        seconds: of CPU time.
+        seconds: CPU time.
         within_one, within_two: shares of coordinates within 1 and 1.96 sigma.
     """
 
@@ -132,7 +133,7 @@ def noisy(seeds: int) -> None:
 
 
 def found_error(pairs: int, seed: int) -> float:
-    """Return the error [mm] from nothing, d = 6, with a noise sigma of 10 mm known to the search."""
+    """Return the error [mm] without a nominal model, d = 6, with a noise sigma of 10 mm known to the search."""
     rng = np.random.default_rng(seed)
     arm = rough_arm(6, rng)
     q = arm.angles(pairs, 80, rng)
@@ -150,7 +151,7 @@ def from_nothing(seeds: int) -> None:
 
 
 def local_fit(seed: int) -> tuple[float, float, float, float]:
-    """Return the error and bound [mm] over +-80 degrees of 300 pairs from a zone, shares within 1 and 1.96 sigma."""
+    """Return error and bound [mm] over +-80 degrees of 300 pairs from a zone, and shares within 1 and 1.96 sigma."""
     rng = np.random.default_rng(seed)
     arm = rough_arm(6, rng)
     q = arm.angles(300, 20, rng, centre_deg=rng.uniform(-60, 60, 6))
@@ -220,7 +221,7 @@ STAGES = (30, 300, 1700)
 
 @dataclass(frozen=True)
 class GuidedFit:
-    """Errors [mm] off the path, pair by pair and of the batch, the bound of these; the batch's near the path."""
+    """Errors [mm] off the path, pair by pair and of the batch, the bound of both; the batch's error near the path."""
 
     online: float
     off: float

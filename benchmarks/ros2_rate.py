@@ -1,4 +1,4 @@
-"""Joint states over zenoh on the loopback interface: what arrives, what it costs, and how right the times are.
+"""Joint states over zenoh on the loopback interface: messages received, their cost, and the error of their timestamps.
 
 One process is robot and router, another reads. Type: python -m benchmarks.ros2_rate
 """
@@ -31,7 +31,7 @@ def swing(phase: float) -> Callable[[float], float]:
 
 
 def publish(rate_hz: float, count: int, ready: Event, done: Event) -> None:
-    """Be the robot: publish so many messages, each at its time, once somebody listens."""
+    """Publish `count` messages on schedule as the robot does, starting when a subscriber is ready."""
     node = Node({name: swing(place) for place, name in enumerate(JOINTS)}, rate_hz)
     with ZenohRobot([node], ENDPOINT) as robot:
         ready.set()

@@ -1,4 +1,4 @@
-"""An arm of five to seven joints, and how it was really built when its drawing is only rough."""
+"""A rough nominal arm of five to seven joints, and its true counterpart."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ROUGH = ChainTolerances(axes=np.radians(3.0), points=0.015, tool=0.03)
 
 @dataclass(frozen=True)
 class RoughArm:
-    """A drawing, the arm as built [change of the drawing's parameters], and pairs of it."""
+    """A nominal model, the true arm as a change of its parameters, and pairs of the true arm."""
 
     parameters: ChainParameters
     change: FloatArray

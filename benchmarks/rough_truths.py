@@ -1,23 +1,23 @@
 """Arms that are not quite rigid: `python -m benchmarks.rough_truths [--seeds N] [--truth NAME ...] [--pairs N ...]`.
 
-With `--recording FOLDER` (one with a robot.toml) the mean error of the rows of a measured arm that were not learnt,
-over random splits, learnt from so many `--pairs`.
+With `--recording FOLDER` (one with a robot.toml): the mean error on the held-out rows of a measured arm, over random
+splits with `--pairs` training rows.
 
-Six joints of a humanoid arm, drawing wrong by 2 degrees an axis, 10 mm a point and 30 mm at the marker (each
+Six joints of a humanoid arm, nominal model wrong by 2 degrees an axis, 10 mm a point and 30 mm at the marker (each
 component), pairs uniform within +-60 degrees, 5 mm of noise on each coordinate. Errors are mean distances to the
-noise-free truth within +-60 and within +-80 degrees [mm]; behind them how many per cent of the coordinates lie within
-1 and 2 sigma. Means over the seeds. The noise is not told to the learners unless `--told`.
+noise-free truth within +-60 and within +-80 degrees [mm], followed by the percentage of coordinates within 1 and 2
+sigma. All are means over the seeds. The learners are given the noise only with `--told`.
 
-Truths, all made by what happens to the arm and not by what a learner supposes:
+The truths are built from physical effects and not from the assumptions of a learner:
 
-    rigid       the arm as built
+    rigid       the rigid true arm
     affine      the camera stretches each axis by 2 to 3 % and shears by 1 %
-    eccentric   each encoder reads 1 degree * sin off, at a phase of its own
+    eccentric   each encoder reads 1 degree * sin off, at its own phase
     gain        each gear is off by 1 %
-    sag1, sag3  links with masses beside their axes; each joint yields to gravity's torque about it by up to 1 or 3
-                degrees within +-60, at equilibrium
-    head        as sag1, but the camera is on the head: gravity stands still behind the two joints of the neck
-    bearings    as sag1, and each joint also yields by a third as much across its axis
+    sag1, sag3  links with masses beside their axes; gravity's torque deflects each joint by up to 1 or 3 degrees within
+                +-60, at equilibrium
+    head        as sag1, but the camera is on the head: gravity is constant behind the two joints of the neck
+    bearings    as sag1, and each joint also deflects by a third as much across its axis
     lens        radial distortion, 2 % at the edge, and 1 % of depth
 """
 
@@ -55,9 +55,9 @@ class SaggingArm:
     """A chain of links with masses, whose joints are springs.
 
     Args:
-        largest: greatest yielding about each joint's axis for configurations within the reach [rad].
-        across: yielding across the axis, over that about it for the same torque.
-        still: number of joints before the link that stands still, in which gravity is fixed.
+        largest: greatest deflection about each joint's axis for configurations within the reach [rad].
+        across: ratio of the deflections across and about the axis, for the same torque.
+        still: number of joints before the stationary link, in whose frame gravity is constant.
     """
 
     def __init__(
@@ -219,7 +219,7 @@ def run(truth: str, model: str, pairs: int, seed: int, told: bool) -> list[float
 
 
 def recording_split(known: Recording, pairs: int, seed: int) -> tuple[float, float]:
-    """Mean errors [mm] of the rows that were not learnt, of the rigid chain and with residual, for a random split."""
+    """Return mean held-out errors [mm] for a random split: of the rigid chain, and with the residual."""
     learnt, rest = known.split(pairs, seed)
     learner = ResidualLearner(known.chain, RECORDED)
     learner.learn(known.q[learnt], known.x[learnt])

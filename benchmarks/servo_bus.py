@@ -1,4 +1,4 @@
-"""Six servos on a pseudo-terminal with the wire time of 1 Mbit/s: rate, processor time and time stamps of the drivers.
+"""Six servos on a pseudo-terminal with the wire time of 1 Mbit/s: rate, CPU time and timestamps of the drivers.
 
 Type: python -m benchmarks.servo_bus
 """
@@ -56,7 +56,7 @@ def dynamixel(return_delay_s: float, *, is_fast: bool) -> tuple[Chain, Open]:
 
 
 def floating(return_delay_s: float) -> tuple[Chain, Open]:
-    """Dynamixel servos that bear their part of an arm while they are read."""
+    """Return a chain of Dynamixel servos that carry their part of the arm while they are read, and its opener."""
     chain, _ = dynamixel(return_delay_s, is_fast=True)
     for servo in chain.servos:
         servo["operating_mode"] = CURRENT_MODE

@@ -1,6 +1,7 @@
-"""Models that learn side by side, of which the best predictor of pairs before they are learnt answers.
+"""Several models learn side by side; the one that best predicted the pairs before learning them answers.
 
-As the daemon's learner does it, without processes: residual, rigid chain and tensor train around a nominal model.
+This is what the daemon's learner does, without processes: residual, rigid chain and tensor train around a nominal
+model.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ class SideBySide:
         self._answering = "residual"
 
     def learn(self, q: FloatArray, x: FloatArray, sigma: float | None = None) -> None:
-        """Learn all pairs q (n, d) and x (n, 3) in their order: once."""
+        """Learn all pairs q (n, d) and x (n, 3) once, in order."""
         learnt = dict.fromkeys(self._models, 0)
         begin = 0
         while begin < len(q):
@@ -109,5 +110,5 @@ class SideBySide:
 
 
 def _proper(tolerance: float, default: float) -> float:
-    """Return a tolerance that a Gaussian prior can have."""
+    """Return a tolerance that is valid for a Gaussian prior."""
     return tolerance if 0.0 < tolerance < math.inf else default

@@ -1,8 +1,8 @@
-"""The simulation's figures: `python -m benchmarks.simulation [--seeds N] [--seconds S] [--frames F]`.
+"""Figures of the simulation: `python -m benchmarks.simulation [--seeds N] [--seconds S] [--frames F]`.
 
 Over seeds, on the shipped upper body: share of frames 1..3 degrees after their predecessor, share in which both eyes
-see the ball, how much of each joint's range is covered, how far the nominal model is from the truth, and how much
-faster than real time the mechanics alone run. Then stereo frames a second with the renderer beside it.
+see the ball, covered share of each joint's range, distance of the nominal model from the truth, and the real-time
+factor of the mechanics alone. Then stereo frames a second with the renderer running in parallel.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ LONG_TOOL = (0.23, 0.0, -0.37)
 def guide(
     robot: RobotDescription, calibration: StereoCalibration, config: SimConfig, seconds: float, tool: FloatArray
 ) -> tuple[FloatArray, float, float]:
-    """Return readings (n, d) at the frames' times, the share of visible frames, and the real-time factor."""
+    """Return readings (n, d) [rad] at the frames' times, the share of visible frames, and the real-time factor."""
     truth = TrueRobot.draw(robot, config)
     q, readings, visible = np.zeros(len(robot.joints)), [], []
     spent = 0.0
@@ -68,7 +68,7 @@ def report_guiding(
 
 
 def report_frames(robot: RobotDescription, frames: int) -> None:
-    """Print stereo frames a second with the renderer's process beside the mechanics, without tracking."""
+    """Print stereo frames a second with the renderer's process running beside the mechanics, without tracking."""
     with SimWorld(robot, SimConfig()) as world, world.joints, world.camera:
         world.camera.read(30.0)
         start, simulated = time.perf_counter(), world.now()

@@ -1,8 +1,8 @@
 """Cost of learning and predicting at seven joints, NumPy and compiled: `python -m benchmarks.speed`.
 
-Input checks and basis functions are included, except for padasip's FilterNLMS, one filter a coordinate, which is handed
-its 2187 features ready-made. numba takes part where it is installed. All rivals take turns in this one process, so
-their ratios hold on a busy machine. Times are those of the thread on the processor.
+Input checks and basis functions are included, except for padasip's FilterNLMS (one filter a coordinate), which gets its
+2187 features precomputed. numba is included if it is installed. All variants take turns in this one process, so their
+ratios hold on a busy machine. Times are the thread's CPU times.
 """
 
 from __future__ import annotations
@@ -164,9 +164,9 @@ class ExactCost:
     """Cost of the exact learner at a number of pairs: learning [us a pair] and solves [ms].
 
     Attributes:
-        ridge: with a given one.
-        plain: without.
-        evidence: with the evidence's.
+        ridge: solve with a given ridge.
+        plain: solve without a ridge.
+        evidence: solve with the ridge chosen by the evidence.
     """
 
     pairs: int
@@ -177,7 +177,7 @@ class ExactCost:
 
 
 def exact_costs(kbmap: KBMap, rng: np.random.Generator) -> tuple[list[ExactCost], float]:
-    """Return the costs at each of `STAGES`, and the peak memory [MB] of learning and solving the pairs of the last."""
+    """Return the costs at each of `STAGES`, and the peak memory [MB] of learning and solving the last stage."""
     learner, costs = ExactLearner(kbmap), list[ExactCost]()
     q, x = np.empty((0, JOINTS)), np.empty((0, 3))
     for total in STAGES:
@@ -211,7 +211,7 @@ def exact_learner(kbmap: KBMap, rng: np.random.Generator) -> None:
 
 
 def solve_ms(learner: ExactLearner, precision: float | Literal["evidence"] | None) -> float:
-    """Return the median of three solves."""
+    """Return the median time of three solves [ms]."""
     times: list[float] = []
     for _ in range(3):
         begin = time.thread_time()
@@ -241,7 +241,7 @@ def recursive_stream(rng: np.random.Generator) -> None:
 
 
 def some_pairs(rng: np.random.Generator, count: int = PAIRS) -> tuple[FloatArray, FloatArray]:
-    """q (count, 7) [rad] and x (count, 3) [m] of a guided path."""
+    """Return q (count, 7) [rad] and x (count, 3) [m] of a guided path."""
     q = guided_path(count, rng).q
     return q, nominal_chain().with_tool([0.05, 0.0, 0.0]).positions(q) + NOISE_M * rng.normal(size=(count, 3))
 

@@ -1,13 +1,13 @@
-"""Corners of tags on photographs of flat grids, beside OpenCV's and AprilTag's refined corners.
+"""Corners of tags on photographs of flat grids, compared with OpenCV's and AprilTag's refined corners.
 
 Run `python -m benchmarks.tag_grids FOLDER [--columns 6] [--pitch 1.3] [--dictionary APRILTAG_36H11] [--border 1]
 [--lens 5] [--pupil PYTHON]`. FOLDER holds photographs of one grid (larger ones are shrunk to 2048 px), tags numbered
-from 0 row by row, `--pitch` sides apart. A plane and a lens with `--lens` coefficients are fitted to the corners of one
-detector: a truth that no other detector shares. The error of a corner is its distance from the plane of all *other*
-tags. Each detector gets the same tags.
+from 0 row by row, `--pitch` sides apart. For each detector a plane and a lens with `--lens` coefficients are fitted to
+its corners as ground truth, which no other detector shares. The error of a corner is its distance from the plane
+through all *other* tags. Each detector gets the same tags.
 
 Kalibr's grids have a border of two modules (`--border 2`). With `--pupil PYTHON`, an interpreter that has the package
-pupil_apriltags, AprilTag's own detector takes part.
+pupil_apriltags, AprilTag's own detector is included.
 """
 
 from __future__ import annotations
@@ -59,12 +59,12 @@ Corners = dict[int, FloatArray]
 
 @dataclass(frozen=True)
 class Grid:
-    """How a grid is printed.
+    """Layout of a printed grid.
 
     Attributes:
-        dictionary: OpenCV's name of it, of six by six modules.
+        dictionary: OpenCV's name of a dictionary of six by six modules.
         columns: tags in a row.
-        pitch: from one tag to the next, in sides.
+        pitch: distance from one tag to the next, in sides.
         border: black modules around the data.
     """
 
@@ -85,7 +85,7 @@ class Grid:
         return np.asarray(cv2.aruco.generateImageMarker(self._tags, id, bits, borderBits=self.border) > 127, np.float64)
 
     def opencv(self, grey: ImageArray, refinement: int) -> Corners:
-        """Return the tags that OpenCV finds, with corners refined its way."""
+        """Return the tags that OpenCV finds, with its own refinement of the corners."""
         parameters = cv2.aruco.DetectorParameters()
         parameters.markerBorderBits, parameters.cornerRefinementMethod = self.border, refinement
         parameters.relativeCornerRefinmentWinSize = 0.8  # with 0.3, the window of small tags is one pixel
@@ -107,7 +107,7 @@ def april_tag(python: str, grey: ImageArray, border: int) -> Corners:
 
 
 def ours(grey: ImageArray, grid: Grid, rough: Corners, *, bleeding: bool) -> tuple[Corners, dict[int, FloatArray]]:
-    """Return corners and covariances (8, 8) of the tags that are measured."""
+    """Return corners and covariances (8, 8) of the tags that could be measured."""
     with mock.patch.object(image, "tag_modules", grid.modules):
         if bleeding:
             found = [image.measure_tag(grey, id, quad, TagConfig()) for id, quad in rough.items()]
@@ -119,7 +119,7 @@ def ours(grey: ImageArray, grid: Grid, rough: Corners, *, bleeding: bool) -> tup
 
 
 def plane(numbers: FloatArray, printed: FloatArray) -> FloatArray:
-    """Return printed points (n, 2) in the image, whose half width is 1: a homography, then a lens."""
+    """Project printed points (n, 2) into the image, whose half width is 1, by a homography and then a lens."""
     flat = np.concatenate([printed, np.ones((len(printed), 1))], axis=1) @ np.append(numbers[:8], 1.0).reshape(3, 3).T
     x = flat[:, :2] / flat[:, 2:]
     k1, k2, p1, p2, k3 = np.pad(numbers[8:], (0, 13 - len(numbers)))
@@ -131,7 +131,7 @@ def plane(numbers: FloatArray, printed: FloatArray) -> FloatArray:
 
 
 def left_out(printed: FloatArray, corners_px: FloatArray, size_px: tuple[int, int], lens: int) -> FloatArray:
-    """Return how far the corners (n, 4, 2) are [px] from the plane that all other tags have."""
+    """Return leave-one-out distances [px] of the corners (n, 4, 2) from the plane through all other tags."""
     half = max(size_px) / 2.0
     middle = (np.array(size_px) - 1.0) / 2.0
     seen = (corners_px.reshape(-1, 2) - middle) / half
@@ -163,7 +163,7 @@ def arrangement(grid: Grid, corners: Corners) -> FloatArray:
 
 
 def photograph(path: Path, grid: Grid, lens: int, pupil: str | None) -> dict[str, Any] | None:
-    """Measure one photograph; None if too few tags are on it."""
+    """Measure one photograph; return None if too few tags are on it."""
     grey = np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
     shrink = min(1.0, LONGEST_PX / max(grey.shape))
     grey = np.asarray(cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA), np.uint8)
@@ -201,7 +201,7 @@ def photograph(path: Path, grid: Grid, lens: int, pupil: str | None) -> dict[str
 
 
 def in_order(corners: FloatArray, order: FloatArray) -> FloatArray:
-    """Return a tag's corners in the order of those that they are nearest to."""
+    """Return a tag's corners in the order in which they are nearest to the corners `order`."""
     orders = [np.roll(way, turn, axis=0) for way in (corners, corners[::-1]) for turn in range(4)]
     return min(orders, key=lambda each: float(np.abs(each - order).sum()))
 

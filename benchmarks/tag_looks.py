@@ -1,9 +1,9 @@
-"""Tags before a rolling shutter while they move, and tags on a display whose pixels alias with the camera's.
+"""Moving tags seen by a rolling shutter, and tags on a display whose pixels alias with the camera's.
 
 Run `python -m benchmarks.tag_looks moving|display [--tags N] [--eyes 1|2]`. A tag of 50 mm at 0.45 to 0.7 m swings at
-0.7 Hz; each row is rendered at its own time, 20 ms from first to last, exposed for 5 ms. The second frame is judged
-at the time of the tag's middle row. A display has pixels of three coloured stripes on black; truth is the place of
-their luminance.
+0.7 Hz; each row is rendered at its own time, 20 ms from first to last, exposed for 5 ms. The second frame is compared
+with the truth at the time of the tag's middle row. A display has pixels of three coloured stripes on black; its truth
+is the position of their luminance.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ LEFT = 0.062
 
 @dataclass
 class Judged:
-    """Errors of fixes (n, 6), place [m] and turn [rad], beside what they claim."""
+    """Errors of fixes (n, 6), position [m] and rotation [rad], beside their claimed uncertainty."""
 
     errors: list[FloatArray] = field(default_factory=list)
     sigmas: list[FloatArray] = field(default_factory=list)
     misses: Counter[str] = field(default_factory=Counter)
 
     def add(self, found: MarkerFix | MarkerMiss, rotation: Rotation, x: FloatArray) -> None:
-        """Judge one answer."""
+        """Add the errors of one fix."""
         if isinstance(found, MarkerMiss) or found.R is None or found.cov_R is None:
             self.misses[str(getattr(found, "reason", ""))] += 1
             return
@@ -82,7 +82,7 @@ COLUMNS = (
 
 
 def some_rotation(rng: np.random.Generator) -> Rotation:
-    """Return a tag turned away from the camera by 10 to 45°."""
+    """Return the random orientation of a tag tilted by 10 to 45° from the camera."""
     axis = np.append(rng.normal(size=2), 0.0)
     tilt = Rotation.from_rotvec(np.radians(rng.uniform(10.0, 45.0)) * axis / np.linalg.norm(axis))
     spin = Rotation.from_euler("z", rng.uniform(0.0, 2.0 * np.pi))
@@ -150,7 +150,7 @@ def display(tags: int) -> Table:
 
 
 def main() -> None:
-    """Run one of the two."""
+    """Run one of the two benchmarks."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("look", choices=("moving", "display"))
     parser.add_argument("--tags", type=int, default=20)

@@ -1,13 +1,13 @@
-"""Corners of single tags that are fixed in a room, against a truth that no tag's own size is part of.
+"""Corners of single tags that are fixed in a room, compared with a truth that does not depend on a tag's own size.
 
 Run `python -m benchmarks.tag_room FOLDER [--focal 760] [--pupil PYTHON]`. FOLDER holds photographs by one camera of
 36h11 tags, all printed to one size, two or more on each. All poses of cameras and tags and the lens are fitted to the
-corners of all photographs at once. Edges that are shifted by pixels make far tags smaller by a larger share than near
-ones, and dim tags by another one than bright ones: no pose explains that.
+corners of all photographs at once. Edges that are shifted by pixels shrink far tags by a larger share than near ones,
+and dim tags by a different share than bright ones: no pose explains that.
 
-`share` is how much of the correction for bleeding the corners ask for, fitted with the rest: 1 if it is right, 0 if the
-edges are where they seem to be. Its standard error takes photographs for independent, not tags. With `--pupil PYTHON`,
-an interpreter that has the package pupil_apriltags, AprilTag's own detector takes part.
+`share` is the share of the correction for bleeding that the corners need, fitted with the rest: 1 if the correction is
+right, 0 if the edges are not shifted. Its standard error assumes that photographs are independent; tags need not be.
+With `--pupil PYTHON`, an interpreter that has the package pupil_apriltags, AprilTag's own detector is included.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Seen:
 
 @dataclass(frozen=True)
 class Room:
-    """Which photograph (n,) and which tag (n,) each detection is of, and the size of the photographs [px]."""
+    """The photograph (n,) and the tag (n,) of each detection, and the size of the photographs [px]."""
 
     photographs: Indices
     tags: Indices
@@ -56,11 +56,11 @@ class Room:
 
     @property
     def counts(self) -> tuple[int, int]:
-        """Number of photographs and of tags."""
+        """Return the numbers of photographs and of tags."""
         return int(self.photographs.max()) + 1, int(self.tags.max()) + 1
 
     def split(self, numbers: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return poses of cameras and tags, lens, and the focal lengths' relative deviations."""
+        """Return the poses of cameras and tags, the lens, and the focal lengths' relative deviations."""
         cameras, tags = self.counts
         ends = np.cumsum([6 * cameras, 6 * tags, LENS])
         poses, placed, lens, focus = np.split(numbers[: ends[-1] + cameras], ends)
@@ -97,7 +97,7 @@ class Room:
 
 @dataclass(frozen=True)
 class Fitted:
-    """A fit: its numbers, the residuals (n, 4, 2) [px], and the standard errors of the numbers."""
+    """A fit: its parameters, the residuals (n, 4, 2) [px], and the standard errors of the parameters."""
 
     numbers: FloatArray
     residuals: FloatArray
@@ -105,19 +105,19 @@ class Fitted:
 
     @property
     def per_tag_px(self) -> FloatArray:
-        """RMS residual of each detection's corners [px]."""
+        """Return the RMS residual of each detection's corners [px]."""
         return np.sqrt(np.square(self.residuals).sum(axis=2).mean(axis=1))
 
 
 def fitted(room: Room, corners: FloatArray, start: FloatArray, correction: FloatArray | None = None) -> Fitted:
-    """Fit all poses and the lens to corners (n, 4, 2), and with a correction its share, by Levenberg's method."""
+    """Fit all poses and the lens to corners (n, 4, 2) by Levenberg's method, and the share of a correction if given."""
     cameras, tags = room.counts
     numbers: FloatArray = np.append(start, np.zeros(int(correction is not None)))
     weak = np.zeros((cameras + 8, len(numbers)))
     lens = 6 * (cameras + tags)
     weak[np.arange(cameras), lens + LENS + np.arange(cameras)] = 1.0 / FOCUS
     weak[cameras + np.arange(2), lens + 1 + np.arange(2)] = 1.0 / MIDDLE_PX
-    weak[cameras + 2 + np.arange(6), 6 * cameras + np.arange(6)] = 1e4  # the first tag holds the frame
+    weak[cameras + 2 + np.arange(6), 6 * cameras + np.arange(6)] = 1e4  # the first tag defines the frame
 
     def off(numbers: FloatArray) -> tuple[FloatArray, FloatArray]:
         at, jacobian = room.prediction(numbers)
@@ -158,7 +158,7 @@ def fitted(room: Room, corners: FloatArray, start: FloatArray, correction: Float
 
 
 def placed(found: list[Seen], focal_px: float, size_px: tuple[int, int]) -> tuple[list[Seen], Room, FloatArray]:
-    """Return the detections that hang together, and poses and lens to start from; large tags come first."""
+    """Return the detections that are connected, and initial poses and lens; large tags come first."""
     middle = (np.array(size_px) - 1.0) / 2.0
     camera = np.array([[focal_px, 0.0, middle[0]], [0.0, focal_px, middle[1]], [0.0, 0.0, 1.0]])
     found = sorted(found, key=lambda seen: -cv2.contourArea(seen.corners["tracker"].astype(np.float32)))
@@ -194,7 +194,7 @@ def placed(found: list[Seen], focal_px: float, size_px: tuple[int, int]) -> tupl
 
 
 def detections(folder: Path, pupil: str | None) -> tuple[list[Seen], tuple[int, int]]:
-    """Return the tags that all detectors find on the photographs of the commonest size, and that size."""
+    """Return the tags that all detectors find on the photographs of the most common size, and that size."""
     grid = Grid("APRILTAG_36H11", columns=1, pitch=1.0, border=1)
     images = {path.name: cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in sorted(folder.iterdir())}
     shapes = [grey.shape for grey in images.values() if grey is not None]

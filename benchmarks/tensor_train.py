@@ -1,8 +1,8 @@
 """Accuracy of a tensor train by number of pairs: `python -m benchmarks.tensor_train [--seeds N] [--only PART]`.
 
-Parts: exact, noisy, prior, cluster, bent, outliers, stream, cost. "Rough prior": every link turned by 3 degrees and
-shifted by 15 mm and the marker by 30 mm, standard deviations of each component; "mild": 2 degrees, 10 mm, 30 mm.
-Errors are distances to the noise-free truth on poses drawn like the pairs unless said.
+Parts: exact, noisy, prior, cluster, bent, outliers, stream, cost. "Rough prior": every link is rotated by 3 degrees and
+shifted by 15 mm, and the marker by 30 mm (standard deviations of each component); "mild": 2 degrees, 10 mm, 30 mm.
+Unless stated otherwise, errors are distances to the noise-free truth at poses distributed like the pairs.
 """
 
 from __future__ import annotations
@@ -47,11 +47,11 @@ class Task:
 
     Attributes:
         joints: 6 and 7 are the humanoid arm, built with an error; others random chains.
-        n: pairs.
+        n: number of pairs.
         sigma: noise of a coordinate [m].
-        reach_deg: half the range that pairs are drawn from.
-        test_deg: half the range that test poses are drawn from.
-        prior: (degrees, mm, mm) of the rough prior; None learns from nothing.
+        reach_deg: half the range of the pairs.
+        test_deg: half the range of the test poses.
+        prior: (degrees, mm, mm) of the rough prior; None to learn without a prior.
         bend: "rigid", "eccentric" (encoders off by 1 deg · sin) or "gain" (gears off by 1 %).
         outliers: share of pairs off by 200 mm.
     """

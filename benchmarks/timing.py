@@ -1,4 +1,4 @@
-"""Comparing costs on a machine that others use too: rivals take turns, medians are compared."""
+"""Compare costs on a machine that others use too: variants take turns, and medians are compared."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ def interleaved_medians_us(
     calls: int = 200,
     clock: Callable[[], float] = time.perf_counter,
 ) -> dict[str, float]:
-    """Return the median over rounds of the mean time of a call [us]. Each round times every rival under the same load.
+    """Return the median over rounds of the mean time of a call [us]; each round times all variants under the same load.
 
     Args:
-        clock: [s]; time.thread_time leaves out what others have of the processor.
+        clock: returns [s]; time.thread_time excludes the CPU time of other programs.
     """
     times: dict[str, list[float]] = {name: [] for name in rivals}
     for call in rivals.values():

@@ -1,8 +1,9 @@
 """Stereo frames a second on one core: `python benchmarks/tracking.py [--frames N]`.
 
-The tracker alone, with its region of interest and searching the whole images each time, and the sampler's process as
-it runs beside the hardware: tracker, time alignment, gate, store and publication. Frames (640x480) and encoder
-readings come from memory; the simulated robot was recorded before, so rendering is not timed. The rivals take turns.
+Two variants: the tracker alone, with its region of interest or searching the whole images each time; and the sampler's
+process as it runs beside the hardware: tracker, time alignment, gate, store and publication. Frames (640x480) and
+encoder readings come from memory; they were recorded from the simulated robot, so rendering is not timed. The variants
+take turns.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ T = TypeVar("T")
 
 
 class FromMemory(Generic[T]):
-    """A source that gives what it was given, as fast as it is read."""
+    """A source that returns recorded items as fast as it is read."""
 
     def __init__(self, items: list[T], calibration: StereoCalibration, joints: tuple[str, ...] = ()) -> None:
         self.calibration, self.joints = calibration, joints
@@ -83,7 +84,7 @@ def record(config: Config, frames: int) -> tuple[list[StereoFrame], list[JointRe
 
 
 def track(calibration: StereoCalibration, config: VisionConfig, frames: list[StereoFrame], *, forget: bool) -> str:
-    """Track all frames; what was found."""
+    """Track all frames; return a line about the fixes."""
     tracker = StereoTracker(calibration, config)
     missed: Counter[str] = Counter()
     for frame in frames:
@@ -96,7 +97,7 @@ def track(calibration: StereoCalibration, config: VisionConfig, frames: list[Ste
 
 
 def sample(config: Config, sources: Sources) -> str:
-    """Run a sampler with a store of its own until the sources are through; what became of the frames."""
+    """Run a sampler with its own store until the sources end; return a line about the frames."""
     with tempfile.TemporaryDirectory() as folder:
         mine = config.with_state_dir(Path(folder))
         with (

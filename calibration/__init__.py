@@ -1,1 +1,1 @@
-"""Calibration of the arm from recordings, latency, comparison, plausibility; the cameras': `vision/calibration`."""
+"""Calibrate the arm from recordings; latency, comparison and plausibility. Cameras are in `vision/calibration`."""

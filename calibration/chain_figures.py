@@ -1,4 +1,4 @@
-"""Express the belief about a chain in named parameters: camera pose, marker position, joint offsets."""
+"""Express the posterior of a chain in named parameters: camera pose, marker position, joint offsets."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ class _Settings:
 
 @dataclass(frozen=True, eq=False)
 class ChainFigures:
-    """Figures (9 + d,): camera xyz [m], rpy [rad] and marker xyz [m] in their links, joint zeros [rad, m]."""
+    """Figures (9 + d,): camera xyz [m], rpy [rad] and marker xyz [m] in their links, joint offsets [rad, m]."""
 
     robot: RobotDescription  # the nominal model
-    # in its chain, or in that chain placed elsewhere; the most probable first. They change one chain.
+    # posteriors of its chain, or of that chain placed elsewhere, the most probable first; all have the same chain
     beliefs: tuple[ChainBelief, ...]
-    shares: FloatArray  # how probable each is (m,); they add up to 1
-    prior: ChainBelief  # what was believed of that chain before any pair
+    shares: FloatArray  # their probabilities (m,), which add up to 1
+    prior: ChainBelief  # prior of that chain before any pair
 
     @property
     def geometry(self) -> CalibratedGeometry:
@@ -59,9 +59,9 @@ class ChainFigures:
 
     @cached_property
     def covariance(self) -> FloatArray:
-        """Covariance (9 + d, 9 + d) of `values`, given that zeros which are not `shown` are right.
+        """Covariance (9 + d, 9 + d) of `values`, given that offsets which are not `shown` are right.
 
-        Not knowing how well the arm is made is part of it: it is of the mixture of the beliefs.
+        It is that of the mixture of the posteriors, so it includes the uncertainty of the arm's tolerances.
         """
         covariance = np.zeros((len(self.values), len(self.values)))
         for belief, share in zip(self.beliefs, self.shares, strict=True):
@@ -83,21 +83,21 @@ class ChainFigures:
     def half_widths(self) -> FloatArray:
         """Half the 95 % intervals (9 + d,) of `values`."""
         variances = np.diagonal(self.covariance)
-        return HALF_WIDTH_95 * np.sqrt(np.maximum(variances, 0.0))  # of a zero that is given, rounding is left
+        return HALF_WIDTH_95 * np.sqrt(np.maximum(variances, 0.0))  # a given offset keeps some rounding
 
     @cached_property
     def shown(self) -> BoolArray:
         """Mask (d,) of identifiable joint offsets; others may be equivalent to a rotation of the camera or the marker.
 
-        An offset that exact pairs of all poses would not show counts as not identifiable: along such directions a
-        belief that was linearised at several places seems more certain than it is.
+        An offset that exact pairs of all poses would not determine counts as not identifiable: along such directions a
+        posterior that was linearised at several places seems more certain than it is.
         """
         zeros = self._zeros
         return (_spread(self.beliefs[0], zeros) < self._unsure) & (_spread(self._best, zeros) < self._unsure)
 
     @property
     def moved(self) -> FloatArray:
-        """`values` less `drawn` (9 + d,), angles the shorter way round."""
+        """`values` minus `drawn` (9 + d,), angles the shorter way round."""
         return _unwound(self.values - self.drawn)
 
     @property
@@ -142,14 +142,14 @@ class ChainFigures:
         )
 
     def _figures(self, split: FloatArray) -> FloatArray:
-        """Return the figures (9 + d,) of a change: of the links too, else a zero that is not shown moves the marker."""
+        """Return the figures (9 + d,) of a change, links included; else an unidentifiable offset moves the marker."""
         geometry = self._geometry(split, split)
         camera = geometry.T_parent_camera
         return np.concatenate([camera[:3, 3], rpy_of(camera[:3, :3]), geometry.marker_xyz, split[self._zeros]])
 
 
 def after_exact_pairs(prior: ChainBelief, change: FloatArray, robot: RobotDescription) -> ChainBelief:
-    """Return what exact pairs of all poses would leave of the prior, linearised at a change (size,)."""
+    """Return the posterior after exact pairs of all poses, linearised at a change (size,)."""
     _, jacobian = prior.parameters.linearised(change, _poses(robot))
     rows = (jacobian @ prior.root).reshape(-1, prior.root.shape[1]) / _Settings.exact_m
     _, singular, vt = np.linalg.svd(rows, full_matrices=False)
@@ -174,13 +174,12 @@ def most_probable_alike(prior: ChainBelief, change: FloatArray, robot: RobotDesc
 
 
 def no_surer_than_possible(belief: ChainBelief, prior: ChainBelief, robot: RobotDescription) -> ChainBelief:
-    """Return a belief made in several linearisations, with the prior restored where pairs are uninformative.
+    """Return a posterior made in several linearisations, with the prior restored where pairs are uninformative.
 
-    Chains that give the same positions lie along a curve, and its tangents differ from place to place. Pairs that
-    were linearised at one place therefore seem informative about the tangents at another (Huang, Mourikis and
-    Roumeliotis 2010, on the consistency of the extended Kalman filter). In no direction is the returned belief more
-    certain than exact pairs would make it. Along directions that pairs cannot show, its mean moves to where the prior
-    is most probable.
+    Chains that give the same positions lie along a curve, and its tangents differ from place to place. Pairs that were
+    linearised at one place therefore seem informative about the tangents at another (Huang, Mourikis and Roumeliotis
+    2010, on the consistency of the extended Kalman filter). In no direction is the returned posterior more certain than
+    exact pairs would make it. Along directions that pairs do not determine, its mean moves to the maximum of the prior.
     """
     change = most_probable_alike(prior, belief.mean, robot)
     best = after_exact_pairs(prior, change, robot)
@@ -201,7 +200,7 @@ def _poses(robot: RobotDescription) -> FloatArray:
 
 
 def is_told(made: Sequence[tuple[float, float]]) -> bool:
-    """Return True if the probable workmanships (axes [rad], positions [m]) agree within the factor `told_within`."""
+    """Return True if the probable tolerances (axes [rad], positions [m]) agree within the factor `told_within`."""
     axes = [axes for axes, _ in made]
     return max(axes) <= _Settings.told_within * min(axes)
 

@@ -140,7 +140,7 @@ def compared(first: Recording, second: Recording, names: tuple[str, str]) -> Com
 
 
 def _matched(q: FloatArray, other: FloatArray) -> _Match:
-    """Match row by row where the row counts agree; otherwise each row with the nearest unmatched one of the other."""
+    """Match row by row if the row counts agree; otherwise each row with the nearest unmatched one of the other."""
     if len(q) == len(other):
         rows = np.flatnonzero(np.abs(q - other).max(axis=1) <= _Settings.same_angles)
         return _Match(rows, rows)

@@ -1,4 +1,4 @@
-"""Estimate the latency of camera time stamps from encoder and marker readings of a moving arm.
+"""Estimate the latency of camera timestamps from encoder and marker readings of a moving arm.
 
 The marker is at the position that belongs to the joint angles at the middle of the exposure. With the correct time
 shift, the positions follow most closely from the angles. A smooth function of the angles gives the shift roughly, for
@@ -54,7 +54,7 @@ class LatencyError(BodyschemaError):
 
 @dataclass(frozen=True)
 class Wiggle:
-    """Encoder readings and marker fixes, each with its own time stamp."""
+    """Encoder readings and marker fixes, each with its own timestamp."""
 
     # t_joints, q: times and angles of the encoders [s] (n,), [rad or m] (n, d)
     t_joints: FloatArray
@@ -68,7 +68,7 @@ class Wiggle:
             object.__setattr__(self, name, frozen_array(getattr(self, name)))
 
     def with_stamps_later(self, by_s: float) -> Wiggle:
-        """Return the same data with the marker's time stamps `by_s` later [s]."""
+        """Return the same data with the marker's timestamps `by_s` later [s]."""
         return replace(self, t_marker=self.t_marker + by_s)
 
     def angles(self, t: FloatArray) -> FloatArray:
@@ -102,7 +102,7 @@ def _smooth(values: FloatArray) -> BSpline:
 class Latency:
     """Result of the estimate."""
 
-    latency_s: float  # from the exposure's middle to the time stamp, with its 1-sigma sigma_s [s]
+    latency_s: float  # from the exposure's middle to the timestamp, with its 1-sigma sigma_s [s]
     sigma_s: float
     fixes: int  # number of positions used
     residual_m: float  # RMS distance of these from the positions that the angles predict
@@ -110,7 +110,7 @@ class Latency:
 
 
 def latency_of(wiggle: Wiggle, chain: RigidChain) -> Latency:
-    """Estimate the latency of the marker's time stamps relative to the encoders'.
+    """Estimate the latency of the marker's timestamps relative to the encoders'.
 
     Args:
         chain: approximate chain; only the curvature of its map matters.
@@ -235,7 +235,7 @@ class _RigidFit:
     def fitted(
         self, lag: float, keep: NDArray[np.bool_] | slice = slice(None), steps: int = 2
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the parameter changes (p,) that fit best, by Gauss-Newton from `start`, and the residual.
+        """Return the best-fitting parameter changes (p,), by Gauss-Newton from `start`, and the residual.
 
         The residual has shape (m, 3) [m].
         """

@@ -36,17 +36,17 @@ class NextPoses:
 
     robot: str
     joints: tuple[str, ...]  # names in the order of q
-    prismatic: NDArray[np.bool_]  # True for each joint (d,) that slides
+    prismatic: NDArray[np.bool_]  # True for each prismatic joint (d,)
     q: FloatArray  # joint readings (n, d) [rad or m]
-    expected_m: float  # mean error of the present calibration over all poses that are allowed [m]
-    expected_after_m: float  # the same once these poses have been measured
+    expected_m: float  # mean error of the present calibration over all allowed poses [m]
+    expected_after_m: float  # the same after measuring these poses
 
     @classmethod
     def of(cls, calibration: Calibration, count: int, seed: int = 0) -> NextPoses:
         """Choose `count` poses.
 
-        They are within the joint limits, the marker is in the image (where [camera] describes one), and no link is
-        lower than in the recording, so that an arm on a table stays above it.
+        They are within the joint limits, the marker is in the image (if [camera] describes one), and no link is lower
+        than in the recording, so that an arm on a table stays above it.
 
         Raises:
             RecordingError: hardly any pose is allowed.
@@ -82,7 +82,7 @@ class NextPoses:
         """Write the poses as JSON or CSV, by the ending of `file`.
 
         Raises:
-            RecordingError: the file is there already, or cannot be written.
+            RecordingError: the file exists already, or cannot be written.
         """
         check_target(file, replace=replace)
         with writing(file, RecordingError):
@@ -112,7 +112,7 @@ def check_target(file: Path, *, replace: bool) -> None:
 
 
 def allowed_poses(calibration: Calibration, rng: np.random.Generator) -> FloatArray:
-    """Draw joint readings (n, d), and return those that a next pose may have."""
+    """Sample joint readings (n, d), and return those allowed for a next pose."""
     robot, recording = calibration.robot, calibration.recording
     margin = _Settings.joint_margin * (robot.upper - robot.lower)
     q = rng.uniform(robot.lower + margin, robot.upper - margin, (_Settings.batch, len(robot.joints)))

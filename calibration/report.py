@@ -51,7 +51,7 @@ class ToolJump:
 
 
 def tool_jump(learner: RigidLearner, recording: Recording) -> ToolJump | None:
-    """Return the first row at which the marker has another place on the hand; None if there seems to be one tool.
+    """Return the first row with another marker position on the hand; None if there seems to be one tool.
 
     This is a change point test (Page 1955): two marker positions instead of one, with all other chain parameters fitted
     along, to first order. The chain was fitted to both tools and is therefore distorted, so distance and row are
@@ -126,11 +126,11 @@ class Zero(msgspec.Struct, frozen=True):
 
 
 class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
-    """The answers."""
+    """Figures of a calibration, with messages."""
 
     robot: str
     source: str
-    pairs: int  # that were learnt, `outliers` of them left out
+    pairs: int  # learnt pairs, `outliers` of them left out
     outliers: int
     # camera_link, camera_xyz_mm, camera_rpy_deg: pose of the measurement frame in this link (URDF convention)
     camera_link: str
@@ -139,40 +139,40 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
     marker_link: str
     marker_xyz_mm: list[Figure]
     zeros: list[Zero]  # of the joints, in the order of q
-    noise_mm: float  # 1-sigma of a measured coordinate, as the pairs scatter around the learnt arm
-    # the same as it was told with the pairs (RMS), or null; where told, the intervals rest on it
+    noise_mm: float  # 1-sigma of a measured coordinate, from the scatter of the pairs around the learnt arm
+    # the noise stated with the pairs (RMS), or null; if stated, the intervals rest on it
     told_noise_mm: float | None
-    misfit: float  # residuals over what the told noise explains; 1 where it explains them, or was not told
-    drawn_error_mm: float  # mean distance from the pairs to the drawn arm, with what robot.toml calls not known fitted
-    learnt_error_mm: float  # mean distance to the learnt arm, over the same pairs, which it was fitted to
-    # axes_deg, points_mm: how well the arm is made, by the pairs: 1-sigma of an axis' tilt and shift; null where the
-    # pairs do not tell
+    misfit: float  # ratio of the residuals to the stated noise; 1 if it explains them, or was not stated
+    drawn_error_mm: float  # mean distance from the pairs to the nominal arm, with the unknowns of robot.toml fitted
+    learnt_error_mm: float  # mean distance from the same pairs to the learnt arm, which was fitted to them
+    # axes_deg, points_mm: estimated tolerances of the arm, 1-sigma of an axis' tilt and shift; null if the pairs do not
+    # determine them
     axes_deg: float | None
     points_mm: float | None
-    # independent numbers of the arm that the pairs make three times as sure as they were, of `showable` that positions
-    # can
+    # number of identifiable parameters that the pairs determined (to a third of their prior uncertainty), out of
+    # `showable` that positions can determine
     shown: int
     showable: int
     still: list[str]  # joints that hardly moved
     first: int  # number of the first row (of a store: pair) that was learnt
-    # number of the row from which on the marker sits elsewhere on the hand, or null: the figures are then of neither
+    # number of the first row with another marker position on the hand, or null: the figures are then valid for neither
     # tool
     other_tool_from: int | None
-    other_tool_mm: float | None  # how far from there, or null
-    # why no figure is to be trusted, or null: columns read wrongly, another robot, late time stamps, zeros far off
+    other_tool_mm: float | None  # distance between the two, or null
+    # reason to distrust all figures, or null: columns read wrongly, another robot, late timestamps, large offsets
     doubt: str | None
-    # why the figures are of no arm as good as was told, or null: a part of `doubt`, for which nothing is written
+    # reason why no arm of the stated quality has these figures, or null: part of `doubt`; nothing is written then
     beyond: str | None = None
-    undirected: list[str] = []  # joints of which the pairs do not show which way they count
-    # expected_mm, expected_p95_mm: mean distance on poses that were not learnt, and what 95 % of them stay within, from
-    # blocks of rows that were held out; null of too few rows
+    undirected: list[str] = []  # joints whose sign the pairs do not determine
+    # expected_mm, expected_p95_mm: mean distance on held-out poses, and its 95th percentile, from blocks of rows; null
+    # if there are too few rows
     expected_mm: float | None
     expected_p95_mm: float | None
-    hand_eye: HandEye  # the camera's pose in SI, as ROS takes it
+    hand_eye: HandEye  # the camera's pose in SI, for ROS
     tool_xyz_m: list[float]  # the marker in its link, with the covariance (3 x 3, row by row) in `tool_covariance` [m²]
     tool_covariance: list[float]
-    trusted: Trusted  # what was held as the URDF has it
-    free_expected_mm: float | None = None  # `expected_mm` with nothing held, where something is; else null
+    trusted: Trusted  # the parts held at the URDF's values
+    free_expected_mm: float | None = None  # `expected_mm` with nothing held, if anything is; otherwise null
     schema: int = 1
 
     @classmethod
@@ -229,8 +229,8 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
             axes_deg=None if made is None else _DEG * made.axes,
             points_mm=None if made is None else 1e3 * made.points,
             shown=calibration.shown,
-            # Everett and Hsu 1988: four for each joint that turns, two for each that slides, six for the ends of the
-            # chain, less the three turns of the marker that its place does not show.
+            # Everett and Hsu 1988: four for each revolute joint, two for each prismatic one, six for the ends of the
+            # chain, minus the three rotations of the marker that its position does not determine.
             showable=4 * int((~slides).sum()) + 2 * int(slides.sum()) + 3,
             still=_still(robot, recording),
             first=first,
@@ -286,7 +286,7 @@ def _computed(drawn_error_m: float) -> list[str]:
 
 
 def _stamped_late(calibration: Calibration) -> list[str]:
-    """Return a message if the residuals follow the marker's velocity; else an empty list."""
+    """Return a message if the residuals follow the marker's velocity, otherwise an empty list."""
     recording, residuals = calibration.recording, calibration.residuals
     if recording.t is None or len(recording) < _Settings.few:
         return []
@@ -307,7 +307,7 @@ def _stamped_late(calibration: Calibration) -> list[str]:
 
 
 def _many_left_out(calibration: Calibration, first: int) -> list[str]:
-    """Return a message, if any, on more outliers than an instrument has, or on outliers in a run of rows."""
+    """Return a message, if any, on more outliers than an instrument has, or on consecutive outliers."""
     off = np.flatnonzero(~calibration.learner.inliers)
     if len(off) <= _Settings.most_outliers * len(calibration.recording):
         return []

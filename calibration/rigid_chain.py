@@ -1,4 +1,4 @@
-"""A rigid chain learnt from a recording, in the terms of the robot's files, and how sure its numbers are."""
+"""A rigid chain learnt from a recording, in the terms of the robot's files, with its uncertainty."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class _Settings:
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """Distances between prediction and measurement on poses that were not learnt [m], outliers left aside."""
+    """Distances between prediction and measurement on held-out poses [m], without outliers."""
 
     mean_m: float
     p95_m: float
@@ -72,14 +72,14 @@ class Calibration:
     """A rigid chain learnt from a recording."""
 
     robot: RobotDescription  # the nominal model
-    recording: Recording  # what was learnt
-    placed: Alignment  # the nominal chain with what robot.toml calls not known fitted: what learning started from
+    recording: Recording  # the learnt recording
+    placed: Alignment  # the nominal chain with the unknowns of robot.toml fitted, from which learning started
     # of all pairs, with the tolerances that the pairs make probable, the most probable first
     learners: tuple[RigidLearner, ...]
-    shares: FloatArray  # how probable each is (m,); they add up to 1
-    noise_told: bool  # whether the noise was told, not estimated
-    trusted: Trusted = "nothing"  # what was held as the URDF has it
-    # errors (n, 3, k) [m] that all rows share, at 1 sigma of each of k unknowns; None: none are known
+    shares: FloatArray  # their probabilities (m,), which add up to 1
+    noise_told: bool  # True if the noise was given, False if it was estimated
+    trusted: Trusted = "nothing"  # the parts held at the URDF's values
+    # errors (n, 3, k) [m] that all rows share, at 1 sigma of each of k unknowns; None if none are known
     common: FloatArray | None = None
 
     @classmethod
@@ -96,11 +96,11 @@ class Calibration:
         """Learn `recording`, around the nominal model.
 
         Args:
-            sigma_m: 1-sigma of the positions [m] where the recording has none; None: estimated.
-            zeros_rad: how far joint zeros may be off (1-sigma) [rad].
-            trusted: what is held as the URDF has it: its links, or its joint zeros too.
+            sigma_m: 1-sigma of the positions [m] if the recording has none; None to estimate it.
+            zeros_rad: 1-sigma of the joint offsets [rad].
+            trusted: the parts held at the URDF's values: its links, or its joint offsets too.
             common: returns the errors (n, 3, k) [m] that all rows share at positions (n, 3) [m], at 1 sigma of each of
-                k unknowns; None: none are known.
+                k unknowns; None if none are known.
 
         Raises:
             CalibrationError: there are too few pairs, or they do not fit the robot at all.
@@ -120,7 +120,7 @@ class Calibration:
             # Measured positions would share their noise with the rows.
             shared = None if common is None else common(placed.chain.positions(recording.q))
             learners, shares = _learners(placed.chain, choices, recording, sigma_m, shared)
-            learners[0].report()  # fits it, so that what cannot be fitted shows here
+            learners[0].report()  # fitted, so that it shows the errors that cannot be fitted
         except KBMapsError as error:
             raise CalibrationError(f"no chain can be fitted to the recording: {error}") from error
         told = sigma_m is not None or recording.cov is not None
@@ -132,13 +132,13 @@ class Calibration:
 
     @property
     def workmanship(self) -> ChainTolerances | None:
-        """Estimated workmanship of the arm; None if the pairs do not determine it."""
+        """Estimated tolerances of the arm; None if the pairs do not determine them."""
         made = [(learner.tolerances.axes, learner.tolerances.points) for learner in self.learners]
         return self.learner.tolerances if is_told(made) else None
 
     @property
     def noise_m(self) -> float:
-        """1-sigma of a measured coordinate [m], as the pairs scatter around the learnt chain; outliers apart."""
+        """1-sigma of a measured coordinate [m], from the pairs' scatter around the learnt chain, without outliers."""
         report = self.learner.report()
         if not self.noise_told:
             return report.noise
@@ -152,7 +152,7 @@ class Calibration:
 
     @cached_property
     def expected(self) -> Expected | None:
-        """Errors on new poses, from contiguous blocks that were each held out; None of too few rows."""
+        """Errors on new poses, from contiguous held-out blocks; None if there are too few rows."""
         rows = len(self.recording)
         fold = np.arange(rows) * 2 * _Settings.folds // rows % _Settings.folds
         if rows < _Settings.folds * 2 * len(self.robot.joints):
@@ -177,7 +177,7 @@ class Calibration:
     def shown(self) -> int:
         """Number of independent parameters whose uncertainty the pairs reduce to less than a third (`much_surer`).
 
-        The prior allows an arm of the worst workmanship.
+        The prior allows an arm of the widest tolerances.
         """
         report, (axes, points) = self.learner.report(), ToleranceSettings.workmanship[-1]
         parameters = ChainParameters(self.placed.chain)
@@ -189,7 +189,7 @@ class Calibration:
 
     @cached_property
     def figures(self) -> ChainFigures:
-        """Calibrated figures; their uncertainty includes that of the workmanship."""
+        """Calibrated figures; their uncertainty includes that of the tolerances."""
         prior = ChainBelief.from_tolerances(ChainParameters(self.placed.chain), self.learner.tolerances)
         return ChainFigures(self.robot, tuple(map(_claimed, self.learners)), self.shares, prior)
 
@@ -243,7 +243,7 @@ def _told(recording: Recording, learner: RigidLearner, rows: IntArray, common: F
 
 
 def _of_the_arm(learner: RigidLearner, recording: Recording, rows: IntArray, common: FloatArray | None) -> float:
-    """Return the variance [m²] per coordinate that these rows have beyond the instrument's: encoders, backlash."""
+    """Return the variance [m²] per coordinate of these rows beyond the instrument's: encoders, backlash."""
     assert recording.cov is not None
     good = rows[learner.inliers]
     residuals = _residuals(learner, recording, rows, common)[learner.inliers]
@@ -252,7 +252,7 @@ def _of_the_arm(learner: RigidLearner, recording: Recording, rows: IntArray, com
 
 
 def fewest_pairs(joints: int, trusted: Trusted) -> int:
-    """Return the number of pairs needed: two for each joint, or where the URDF is trusted, twice the unknowns."""
+    """Return the number of pairs needed: two for each joint, or twice the unknowns if the URDF is trusted."""
     unknowns = 9 + (joints if trusted == "links" else 0)
     return 2 * joints if trusted == "nothing" else min(2 * joints, math.ceil(2 * unknowns / 3))
 
@@ -260,9 +260,10 @@ def fewest_pairs(joints: int, trusted: Trusted) -> int:
 def _tolerances(
     robot: RobotDescription, distance_m: float, zeros_rad: float, trusted: Trusted
 ) -> list[ChainTolerances]:
-    """Return tolerances for each workmanship; the arm is `distance_m` from the origin of the measurement frame.
+    """Return the candidate tolerances; the arm is `distance_m` from the origin of the measurement frame.
 
-    The frame's pose is a turn about this origin and a shift: from afar, a small turn of the arm is a long shift.
+    The frame's pose is a rotation about this origin and a shift: from afar, a small rotation of the arm is a long
+    shift.
     """
     links = ToleranceSettings.workmanship if trusted == "nothing" else ((0.0, 0.0),)
     free_zeros = trusted != "urdf"
@@ -283,6 +284,6 @@ def _tolerances(
 
 
 def _claimed(learner: RigidLearner) -> ChainBelief:
-    """Return the learner's belief, widened like its intervals to allow for a noise level that was estimated."""
+    """Return the learner's posterior, widened like its intervals to allow for an estimated noise level."""
     belief = learner.belief
     return replace(belief, root=learner.report().widening * belief.root)

@@ -64,7 +64,7 @@ def front_page(width: int, *, colour: bool = False, signs: str = UNICODE) -> str
     Args:
         width: columns of the terminal, at least 20.
         colour: with ANSI escape sequences.
-        signs: those that panels are drawn with.
+        signs: characters for drawing panels.
     """
     bold, plain = (BOLD, PLAIN) if colour else ("", "")
     lines = [f"{bold}{line}{plain}" for line in textwrap.wrap("Usage: bodyschema COMMAND", width)]

@@ -1,4 +1,4 @@
-"""The command `bodyschema`. Commands, and what parses them, are imported when they run, so that `--help` is fast."""
+"""The command `bodyschema`. Commands and their parser are imported when they run, so that `--help` is fast."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ def command_line(called: str | None = None) -> cyclopts.App:
 
 
 def present_names(arguments: Sequence[str]) -> list[str]:
-    """Return the arguments with the command's present name, and print it where an earlier one was given."""
+    """Return the arguments with the command's present name, and print it if an earlier name was given."""
     for earlier, present in RENAMED.items():
         if tuple(arguments[: len(earlier)]) == earlier:
             rest = list(arguments[len(earlier) :])
@@ -101,7 +101,7 @@ def _version() -> str:
 
 
 def __getattr__(name: str) -> cyclopts.App:
-    """Return `app`, the command line in which no command is called."""
+    """Return `app`, the command line without a called command."""
     if name != "app":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return globals().setdefault(name, command_line())
@@ -135,7 +135,7 @@ def allow_enough_files() -> None:
 def prepare_streams() -> None:
     """Make standard streams of any kind usable: closed ones, encodings without our characters, terminals too narrow.
 
-    Files and pipes get UTF-8, as programs read it; a terminal of another encoding shows `?` for what it lacks.
+    Files and pipes get UTF-8, as programs expect; a terminal of another encoding shows `?` for missing characters.
     """
     while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:  # else a store would get the number of a closed stream
         pass
@@ -171,7 +171,7 @@ def _told(error: OSError) -> BodyschemaError:
 
 
 def _drop_output() -> None:
-    """Drop what is left of the output, which Python would otherwise try to write when it ends."""
+    """Discard the remaining output, which Python would otherwise try to write at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 

@@ -1,4 +1,4 @@
-"""What a client of sampler and learner needs of robot.toml, without the packages of the processes (no numpy)."""
+"""The part of robot.toml that a client of sampler and learner needs, without the processes' packages (no numpy)."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ OVERRIDES = ("BODYSCHEMA_ROBOT_", "BODYSCHEMA_ZENOH_")
 
 
 class _Plain(ElementTree.TreeBuilder):
-    """Refuses a DOCTYPE, as `parse_urdf` does: entities are not expanded."""
+    """Parser that refuses a DOCTYPE, as `parse_urdf` does: entities are not expanded."""
 
     def doctype(self, *_: object) -> None:
         raise ValueError("a DOCTYPE")
@@ -44,9 +44,9 @@ class _Tables(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class ClientConfig:
-    """The robot's name, its joints, and where its processes are.
+    """The robot's name, its joints, and the endpoints of its processes.
 
-    `Config` reads and checks everything else; clients leave that to the processes, which takes half of the time.
+    `Config` reads and checks everything else; clients leave that to the processes, which saves half of the time.
     """
 
     file: Path  # robot.toml
@@ -57,7 +57,7 @@ class ClientConfig:
 
     @classmethod
     def load(cls, file: Path, environment: Mapping[str, str] = os.environ) -> ClientConfig:
-        """Read robot.toml; where something is wrong or the environment overrides it, as `Config.load` does."""
+        """Read robot.toml; if it is wrong or the environment overrides it, read it as `Config.load` does."""
         if not any(variable.startswith(OVERRIDES) for variable in environment):
             try:
                 raw, text = read_toml(file)
@@ -89,7 +89,7 @@ class ClientConfig:
 
     @contextmanager
     def checked_on_error(self) -> Iterator[None]:
-        """Add the fault of a wrong robot.toml to an error that it may have caused: nothing answers."""
+        """Add the fault of a wrong robot.toml to an error that it may have caused: no answer."""
         try:
             yield
         except (BusError, RequestError) as error:
@@ -99,10 +99,10 @@ class ClientConfig:
 
     @cached_property
     def joint_limits(self) -> Mapping[str, tuple[str, float, float]]:
-        """By joint of the URDF, its type and its limits [rad; m if it slides].
+        """Type and limits [rad; m for a prismatic joint] of each joint of the URDF, by name.
 
         Raises:
-            ConfigError: the URDF is not one.
+            ConfigError: the file is not a URDF.
         """
         try:
             found = ElementTree.fromstring(read_at_most(self.urdf), ElementTree.XMLParser(target=_Plain())).findall(

@@ -1,7 +1,7 @@
 """robot.toml as a whole: one file, a table for each package, unknown keys refused.
 
-Precedence: what the command line says, then the environment (`BODYSCHEMA_<TABLE>_<KEY>`, a TOML value or a bare
-word), then the file.
+Precedence: the command line, then the environment (`BODYSCHEMA_<TABLE>_<KEY>`, a TOML value or a bare word), then the
+file.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ class Tables(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class Config:
-    """Everything that robot.toml says, checked."""
+    """The checked contents of robot.toml."""
 
     file: Path
     robot: RobotDescription
@@ -177,7 +177,7 @@ class Config:
         return self.extended or Simulation(self.robot)
 
     def require_learnable(self) -> None:
-        """ConfigError when there are more joints than the learner can keep up with."""
+        """Raise ConfigError if there are more joints than the learner can keep up with."""
         joints, slides = self.robot.robot.joints, self.robot.chain.prismatic
         size = math.prod(2 if sliding else 3 for sliding in slides.tolist())
         if size <= _Settings.largest_map:
@@ -244,7 +244,7 @@ def state_home() -> Path:
 
 
 def _check_router(tables: Tables, file: Path, text: str) -> None:
-    """ConfigError when another router, whose port is usually 7447 too, is where one of our processes listens."""
+    """Raise ConfigError if another router, usually on port 7447 too, uses an endpoint of one of our processes."""
     ros2 = tables.drivers.ros2
     routers = {} if ros2 is None else {("drivers", "ros2"): ros2.router}
     routers |= {(MARKER_SOURCE, table.label): table.endpoint for table in tables.marker_source}
@@ -352,7 +352,7 @@ def _override(raw: dict[str, Any], known: list[str], environment: Mapping[str, s
 
 
 def _checked(variable: str, table: str, key: str, value: Any) -> Any:
-    """Return the value. Raise ConfigError naming the environment variable if key or value is invalid in the table."""
+    """Return the value; raise ConfigError naming the environment variable if key or value is invalid in the table."""
     kind = {"robot": RobotSection, "camera": CameraSection}.get(table) or hint_at(Tables, (table,))
     fields = {field.encode_name: field.type for field in msgspec.structs.fields(kind)}
     if key not in fields:

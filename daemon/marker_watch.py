@@ -1,4 +1,4 @@
-"""Watch a marker source: what it sent since the last line."""
+"""Watch a marker source: report the messages since the last line."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from .sampler.sources import TellsHealth
 
 
 class MarkerWatch:
-    """A marker source that is read for a person. It is opened again when it is lost."""
+    """A marker source that is read for display. It is reopened after a loss."""
 
     def __init__(self, name: str, source: MarkerSource, health: TellsHealth, clock: Clock) -> None:
         """Store the settings; nothing is opened yet.
 
         Args:
-            name: of the source, in messages.
+            name: name of the source in messages.
             health: reports its problems.
         """
         self._name, self._health, self._clock = name, health, clock
@@ -50,7 +50,7 @@ class MarkerWatch:
                 self._misses[WORDS[seen.reason]] += 1
 
     def lines(self) -> Iterator[str]:
-        """Yield what came since the last call, then what is wrong."""
+        """Yield the counts since the last call, then the problems."""
         passed_s = max(self._clock.now() - self._since, 1e-3)
         hidden = "".join(f", {count} {why}" for why, count in self._misses.items())
         if self._last is None:

@@ -54,7 +54,7 @@ class Guard:
             if message["type"] == "http.response.start":
                 headers = MutableHeaders(scope=message)
                 if scope["path"].startswith("/static/"):
-                    headers.setdefault("Cache-Control", "no-cache")  # a browser keeps them, and asks each time
+                    headers.setdefault("Cache-Control", "no-cache")  # a browser keeps them, but checks each time
                 for name, value in _HEADERS.items():
                     headers.setdefault(name, value)
             await send(message)

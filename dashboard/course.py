@@ -105,7 +105,7 @@ def _marked(last: LastChange | None, pairs: int, t: float) -> Change:
 
 
 def expected_outlook(status: LearnerStatus) -> OutlookDocument | None:
-    """Return the learner's forecast as errors on new pairs; None while there is none."""
+    """Return the learner's forecast as errors on new pairs; None without a forecast."""
     outlook = status.outlook
     if outlook is None or (now_m := status.expected_error_m(outlook.error_m)) is None:
         return None

@@ -1,4 +1,4 @@
-"""Diagnoses requested on the page: each runs in a process of its own, on pairs copied from the sampler."""
+"""Diagnoses requested on the page: each runs in a separate process, on pairs copied from the sampler."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ RECORDING = "newest_pairs.csv"
 
 
 class Diagnoses:
-    """Runs one diagnosis after the other, while the with statement lasts."""
+    """Runner of one diagnosis after the other within a with statement."""
 
     def __init__(
         self,

@@ -117,7 +117,7 @@ class ArmDocument(msgspec.Struct, frozen=True):
     # null without a prediction
     measured_pose: MarkerPose
     predicted_pose: MarkerPose | None
-    # half axes of the ellipsoid around it, along the measurement frame's axes, in which 95 % of measurements should lie
+    # half axes, along the measurement frame's axes, of the ellipsoid around it that should contain 95 % of measurements
     # by the learner's estimate; null without a prediction, or while the noise is unknown
     radii: list[float] | None
     apart_m: float | None  # distance of measurement and prediction. The pair may be learnt already.
@@ -144,10 +144,10 @@ class BodyDocument(msgspec.Struct, frozen=True):
 
     links: list[str]  # names
     shapes: list[list[LinkShape]]
-    rods: list[tuple[int, int]]  # pairs of links between whose origins a rod stands for shapes that are not there
+    rods: list[tuple[int, int]]  # pairs of links joined by a rod, which replaces missing shapes
     moving: list[int]  # links that a moving joint carries
     camera: CameraShape | None  # null where robot.toml does not describe the cameras
-    said: list[str]  # what is not shown as the URDF has it, in sentences
+    said: list[str]  # differences from the URDF, in sentences
 
 
 class DiagnosisDocument(msgspec.Struct, frozen=True):

@@ -17,7 +17,7 @@ class HubFullError(BodyschemaError):
 
 
 class Follower:
-    """One browser: its pending documents, each in its newest version. A slow browser misses the versions between."""
+    """One browser: its pending documents, each in its newest version. A slow browser misses intermediate versions."""
 
     def __init__(self, documents: dict[str, bytes]) -> None:
         """Initialise for the running event loop; `documents` are the first to take."""

@@ -38,7 +38,7 @@ class RecentPairs:
         return self._pairs[-1] if self._pairs else None
 
     def upto(self, seq: int, count: int) -> list[Pair]:
-        """Return the pair with this sequence number and those before it, `count` at most; [] if it is not there."""
+        """Return the pair with this sequence number and those before it, at most `count`; [] if it is missing."""
         at = next((k for k in range(len(self._pairs) - 1, -1, -1) if self._pairs[k].seq == seq), -1)
         return [self._pairs[k] for k in range(max(at + 1 - count, 0), at + 1)]
 
@@ -77,7 +77,7 @@ def cloud(pairs: list[Pair], predict: Callable[[list[list[float]]], PredictReply
     """Return the model's residuals at pairs.
 
     Args:
-        predict: queries the learner; RequestError while it has no model.
+        predict: queries the learner; raises RequestError while it has no model.
 
     Raises:
         BusError: the learner does not answer.

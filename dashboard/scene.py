@@ -1,4 +1,4 @@
-"""The arm at its newest pair: poses of its links, and the marker where it was measured and predicted."""
+"""The arm at its newest pair: poses of its links, and the measured and the predicted marker."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def arm(
     """Return the arm at a pair, in the root link's frame.
 
     Args:
-        pairs: the pair, which is the last one, and those before it whose markers are its trail.
+        pairs: the pair, which is the last one, and those before it, whose markers are its trail.
         learner: its state, with the learnt camera pose and joint offsets; None for those of robot.toml.
         reply: the learner's prediction at the pair's joint angles; None without one.
     """

@@ -27,7 +27,7 @@ class _Settings:
 
 
 class _Server(uvicorn.Server):
-    """Ends the event streams first: a browser holds them open for ever."""
+    """Server that ends the event streams first: a browser holds them open for ever."""
 
     def __init__(self, config: uvicorn.Config, hub: Hub) -> None:
         super().__init__(config)
@@ -47,7 +47,7 @@ def serve(config: Config, port: int, ready: Callable[[str], None]) -> None:
     """Serve the page of one robot until SIGTERM or Ctrl-C.
 
     Args:
-        port: on loopback; 0 takes one that is free.
+        port: port on loopback; 0 for any free one.
 
     Raises:
         ConfigError: the port cannot be used.
@@ -81,7 +81,7 @@ def serve(config: Config, port: int, ready: Callable[[str], None]) -> None:
 
 
 def listening(port: int) -> socket.socket:
-    """Return a socket on loopback; ConfigError if the port cannot be used."""
+    """Return a socket on loopback; raise ConfigError if the port cannot be used."""
     try:
         return socket.create_server((LOOPBACK, port))
     except OSError as error:

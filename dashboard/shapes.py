@@ -1,4 +1,4 @@
-"""Shapes of the robot's links for the page, read from the files that the URDF names.
+"""Shapes of the robot's links for the page, read from the files of the URDF.
 
 A child process reads them: mesh files may be large or malformed, and the page must neither wait for them nor grow.
 """
@@ -51,11 +51,11 @@ class LinkShapes(msgspec.Struct, frozen=True):
 
     shapes: dict[str, list[LinkShape]] = {}  # of each link, by its name
     meshes: list[bytes] = []  # as `mesh_buffer` returns them
-    said: list[str] = []  # what is not shown as the URDF has it, in sentences
+    said: list[str] = []  # differences from the URDF, in sentences
 
 
 class Body:
-    """The robot as it looks, read when the first browser asks; reading ends with the with statement."""
+    """The robot's appearance, read when the first browser asks; reading ends with the with statement."""
 
     def __init__(self, robot: RobotDescription) -> None:
         self._robot = robot
@@ -90,7 +90,7 @@ class Body:
         )
 
     def mesh(self, number: int) -> bytes | None:
-        """Return a mesh of the document; None if there is none with this number."""
+        """Return a mesh of the document; None if the number is unknown."""
         meshes = self._shapes().meshes
         return meshes[number] if 0 <= number < len(meshes) else None
 
@@ -147,7 +147,7 @@ def read_shapes(urdf: Path) -> LinkShapes:
 def _sent(
     shapes: dict[str, list[Shape]], meshes: dict[tuple[str, tuple[float, ...]], FloatArray], said: list[str]
 ) -> LinkShapes:
-    """Return shapes without those whose mesh is not there, or has no triangles left, as screws may."""
+    """Return shapes without those whose mesh is missing, or has no triangles left, as screws may."""
     buffers = {key: mesh_buffer(triangles) for key, triangles in meshes.items() if len(triangles)}
     place = {key: number for number, key in enumerate(buffers)}
     found = {
@@ -177,10 +177,10 @@ def _sentences(meshes: MeshSet, before: int, after: int) -> Iterator[str]:
 
 
 def mesh_buffer(triangles: FloatArray) -> bytes:
-    """Return triangles (n, 3, 3) [m] as a little-endian buffer that a browser gives to its graphics as it is.
+    """Return triangles (n, 3, 3) [m] as a little-endian buffer that a browser passes to its graphics unchanged.
 
     The counts of vertices v and of indices i (uint32 each), positions (v, 3) float32, normals (v, 4) int8 of which the
-    last is 0, and i indices uint32. Vertices are shared where the surface is smooth.
+    last is 0, and i indices uint32. Smooth surfaces share vertices.
     """
     points, vertex = np.unique(triangles.reshape(-1, 3).astype("<f4"), axis=0, return_inverse=True)
     vertex = vertex.reshape(-1)
@@ -225,7 +225,7 @@ def _unit(vectors: FloatArray) -> FloatArray:
 
 
 def _camera(robot: RobotDescription) -> CameraShape | None:
-    """Return what the cameras see at a distance of 1 m; None where robot.toml does not describe them."""
+    """Return the cameras' field of view at a distance of 1 m; None if robot.toml does not describe the cameras."""
     eyes = robot.calibration
     if eyes is None:
         return None

@@ -1,4 +1,4 @@
-"""Follows both processes over zenoh, and keeps the hub's documents up to date."""
+"""Follow both processes over zenoh, and keep the hub's documents up to date."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class Heard(Generic[S]):
                 self._status, self._fields = status, fields
 
     def note_alive(self, alive: bool) -> None:
-        """Record that its liveliness token came, or is gone."""
+        """Record that its liveliness token appeared or disappeared."""
         with self._lock:
             self._alive = alive
 
@@ -94,7 +94,7 @@ log = logging.getLogger(__name__)
 
 
 class Watch:
-    """Follows both processes while the with statement lasts; they may come and go."""
+    """Follower of both processes within a with statement; they may come and go."""
 
     def __init__(self, config: Config, hub: Hub) -> None:
         """Initialise without opening anything; documents go to `hub`."""
@@ -212,7 +212,7 @@ class Watch:
         newest = self._recent.newest
         if newest is None:
             return
-        # The prediction was asked for before newer pairs came.
+        # The prediction was requested before newer pairs arrived.
         seq, reply = self._predicted or (newest.seq, None)
         pairs = self._recent.upto(seq, _Settings.trail) or self._recent.upto(newest.seq, _Settings.trail)
         reply = reply if pairs[-1].seq == seq and learner is not None else None
@@ -230,7 +230,7 @@ class Watch:
         self._hub.put("series", self._series.document)
 
     def _predict_time(self) -> float | None:
-        """Return the time of one prediction [s], round trip, as any program would see it."""
+        """Return the round-trip time of one prediction [s], as for any program."""
         newest, robot = self._recent.newest, self._config.robot
         q = (0.5 * (robot.lower + robot.upper) if newest is None else newest.q).tolist()
         begin = time.perf_counter()

@@ -2,6 +2,6 @@
 
 `diagnosis.diagnose` goes through the folders: `fit`, `search`, `unnamed`, `assess`; `report` presents the result.
 
-An *unnamed* cause is one that no effect describes. What remains beside named causes is the *residual structure*; the
-verdict, the key in files and `effects.Unexplained`, its stored model, call it *unexplained*.
+An *unnamed* cause is one that no effect describes. The remaining error beside named causes is the *residual structure*.
+The verdict, the key in files and `effects.Unexplained`, its stored model, call it *unexplained*.
 """

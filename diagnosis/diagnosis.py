@@ -1,4 +1,4 @@
-"""Find what a simulation gets wrong, from a recording."""
+"""Find the errors of a simulation from a recording."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class DiagnosisSettings:
 
 @dataclass(frozen=True, eq=False)
 class Diagnosis:
-    """The errors found in a simulation, with all that a report shows of them."""
+    """The errors found in a simulation, with everything that a report shows about them."""
 
     hypotheses: Hypotheses  # the effects that were tested, and the reasons why others were not
     nominal: Fit  # the unchanged simulation
@@ -87,8 +87,8 @@ class Diagnosis:
     left: ResidualStructure  # residual structure that no effect fits
     blocks: Blocks  # blocks of time for held-out errors
     seed: int  # seed of the resampling
-    part: Observations | None = None  # the observations in which causes were sought; None for all
-    ended_early: bool = False  # True if the causes describe the error and do not explain it, as there are too many
+    part: Observations | None = None  # the observations used in the search for causes; None for all
+    ended_early: bool = False  # True if the causes only describe the error, as there are too many
 
     @property
     def causes(self) -> tuple[Effect, ...]:
@@ -104,19 +104,19 @@ class Diagnosis:
 
     @cached_property
     def complete_errors(self) -> FloatArray:
-        """Measured minus predicted (n, 3) [m] by all that was found, stored or not, on held-out rows."""
+        """Measured minus predicted (n, 3) [m] by all findings, stored or not, on held-out rows."""
         return self._extended_errors(self.extended)
 
     @cached_property
     def without_model(self) -> FloatArray | None:
-        """Held-out distances (n,) [m] with causes and tolerances but no smooth model; None where there is none."""
+        """Held-out distances (n,) [m] with causes and tolerances but no smooth model; None if there is none."""
         if self.left.model is None or self.left.model.stored is None or self.leaves_out:
             return None
         return np.linalg.norm(held_out_errors(self.alone, self.blocks), axis=1)
 
     @cached_property
     def modelled(self) -> FloatArray:
-        """Change of the predictions (n, 3) [m] by the model of unnamed causes, all else fitted with and without it."""
+        """Change of the predictions (n, 3) [m] by the model of unnamed causes, with everything else refitted."""
         if self.left.model is None:
             return np.zeros_like(self.extended.predicted)
         return self.extended.predicted + self.left.model.unstored - self.alone.predicted
@@ -129,7 +129,7 @@ class Diagnosis:
 
     @cached_property
     def leaves_out(self) -> bool:
-        """True if extended.toml leaves out what reduces the error by more than a little here."""
+        """True if extended.toml leaves out parts that reduce the error here considerably."""
         squares = [np.square(errors[self.markers]).sum() for errors in (self.complete_errors, self.errors["extended"])]
         return bool(squares[0] < DiagnosisSettings.little * squares[1])
 
@@ -172,7 +172,7 @@ class Diagnosis:
         return bool(np.median(off) < DiagnosisSettings.by_so_much**2 * squares.sum())
 
     def _off_where_fast(self) -> bool:
-        """Return True if the outliers are mostly at the fastest rows; the motion is then poorly modelled."""
+        """Return True if most outliers are at the fastest rows; the motion is then poorly modelled."""
         motion = self.extended.observations.motion
         steps = np.linalg.norm(motion.moves, axis=1)
         duration = np.ones(len(motion)) if motion.t is None else np.append(np.inf, np.diff(motion.t))
@@ -185,7 +185,7 @@ class Diagnosis:
         return self._gain(np.where(self.markers, 1.0, 0.0))
 
     def gain_with_outliers(self) -> tuple[float, tuple[float, float]]:
-        """Return the same over all fixes, as they are: no model reduces the error of a fix that is not the marker."""
+        """Return the same over all fixes, including those that are not the marker, whose error no model reduces."""
         return self._gain(np.ones(len(self.markers)))
 
     def _gain(self, weights: FloatArray) -> tuple[float, tuple[float, float]]:
@@ -194,7 +194,7 @@ class Diagnosis:
 
     @cached_property
     def worse_without(self) -> dict[Identity, float]:
-        """Held-out sum of squares without each of the causes, over that with all."""
+        """Held-out sum of squares without each of the causes, divided by that with all."""
         if self.part is not None and self.left.model is None:
             fit, blocks = self.sought, Blocks.cut(len(self.part))
             whole, fewer = (
@@ -217,12 +217,12 @@ class Diagnosis:
     def noise(self) -> FloatArray:
         """Noise covariances (n, 3, 3) [m²], from the residuals of the complete model.
 
-        Where neighbouring rows share nearly all of them, only what they do not share is noise: half the square of their
+        If neighbouring rows share nearly all of their residuals, only the rest is noise: half the square of their
         differences.
         """
         fit, kept = self.extended, self.markers
         if self.left.model is not None:
-            # Large tolerances moved into the simulation are right to first order alone.
+            # Large tolerances moved into the simulation are right to first order only.
             fit = self.left.model.fit
         unstored = 0.0 if self.left.model is None else self.left.model.unstored
         left = fit.observations.x - fit.predicted - unstored
@@ -235,24 +235,24 @@ class Diagnosis:
         # Scale the stated noise to the size of the residuals, corrected for what the fit absorbed.
         spent = min(fit.background.spent(fit.noise.sigma) / max(left.size, 1), DiagnosisSettings.most_spent)
         size = np.square(left).sum() / np.trace(stated[kept], axis1=1, axis2=2).sum() / (1.0 - spent) * (1.0 - shared)
-        # The play of a loose marker is no noise.
+        # The play of a loose marker is not noise.
         return float(size) * fit.observations.own
 
     @cached_property
     def with_tolerances_alone(self) -> FloatArray | None:
-        """Held-out distances (n,) [m] with tolerances and no cause; None where no tolerance shows."""
+        """Held-out distances (n,) [m] with tolerances and no cause; None if no tolerance is detected."""
         if not self.causes or not self.tolerated.seen.any():
             return None
         return np.linalg.norm(held_out_errors(self.extended.with_causes([]), self.blocks), axis=1)
 
     @cached_property
     def sought(self) -> Fit:
-        """The complete fit over the rows in which causes were sought."""
+        """The complete fit over the rows used in the search for causes."""
         return self.extended if self.part is None else self.extended.over(self.part)
 
     @cached_property
     def in_place_of_tolerances(self) -> list[tuple[Effect, float]]:
-        """Causes that may be there instead of tolerances several times a workshop's, with probabilities."""
+        """Possible causes instead of tolerances of several times a workshop's, with probabilities."""
         return [] if self.left.is_there else in_place_of_tolerances(self.sought, self.hypotheses.effects)
 
     @cached_property
@@ -275,13 +275,13 @@ def diagnose(
     blocks: Blocks | None = None,
     tell: Told = lambda _: None,
 ) -> Diagnosis:
-    """Find what `simulation` gets wrong about a recording.
+    """Find the errors of `simulation` from a recording.
 
     Args:
         only, without: names of effects to test, all by default, and not to test.
         seed: seed of the resampling.
         blocks: blocks of held-out rows; blocks of time by default.
-        tell: called with the stage and about how much of the work is done.
+        tell: called with the stage and the approximate share of the work done.
     """
     observations = Observations.of(recording, simulation)
     hypotheses = Hypotheses.of(simulation, observations, only=only, without=without)
@@ -298,7 +298,7 @@ def diagnose(
         found = part.over(observations, simulation)
     start, explanation, search = found.start, found.explanation, found.search
     if found.loose is not None:
-        # Where the side goes with the pose, one that follows it predicts better.
+        # If the side depends on the pose, a model of this dependence predicts better.
         start = aligned(start.observations.whole, simulation)
     left = found.left(blocks)
     fit = (explanation.fit if left.model is None else left.model.fit).settled()
@@ -334,18 +334,18 @@ class _SearchResult:
     standings: Sequence[Standing]  # assessment of each cause against its rivals
     loose: Rattle | None  # play of the marker; None for one that is fixed
     is_reshaped: bool  # True if the noise has another shape than stated
-    part: _SearchResult | None = None  # what was found in a part of the observations; None where all were searched
+    part: _SearchResult | None = None  # result for a part of the observations; None if all were searched
 
     def left(self, blocks: Blocks) -> ResidualStructure:
-        # In many rows, all families take much memory to find nothing again.
+        # With many rows, all families would take much memory to find nothing new.
         asked = self if self.part is None or self.explanation.unnamed_causes else self.part
         return residual_structure(asked.explanation, asked.unnamed, blocks, self.loose)
 
     def over(self, observations: Observations, simulation: Simulation) -> _SearchResult:
-        """Return the same causes, fitted to all observations of which these were a part.
+        """Return the same causes, fitted to all observations, of which these were a part.
 
-        No further ones are sought: no model is exact, and in many rows its smallest error looks like a cause (Miller
-        and Dunson 2019). Moments are sought again, since they may lie between the parts.
+        No further causes are searched for: no model is exact, and in many rows its smallest error looks like a cause
+        (Miller and Dunson 2019). Moments are searched for again, since they may lie between the parts.
         """
         before = self.start.observations
         fit = self.explanation.fit.over(observations.with_factor(before.stated_factor))
@@ -377,10 +377,10 @@ class _SearchResult:
 
 
 def _part_of(begins: NDArray[np.bool_]) -> IntArray:
-    """Return the rows in which causes are sought: all, or equal runs that are spread over a long recording.
+    """Return the rows in which to search for causes: all, or equal runs that are spread over a long recording.
 
-    Each run is the one of its stretch that is broken least often: after a break, the side of a joint's
-    backlash is unknown.
+    Each run is the one of its stretch with the fewest breaks: after a break, the side of a joint's backlash is
+    unknown.
 
     Args:
         begins: (n,), True in the first row after each break.
@@ -397,7 +397,7 @@ def _part_of(begins: NDArray[np.bool_]) -> IntArray:
 
 
 def _moment_anew(fit: Fit, cause: Effect, searched: FloatArray) -> Candidate | None:
-    """Return a cause that begins at a moment with the best one, which was sought at some times (m,) alone."""
+    """Return a cause that begins at a moment with its best moment, which was searched for only at some times (m,)."""
     clock, after = fit.observations.motion.clock, int(np.searchsorted(searched, cause.values[-1]))
     between = (clock > searched[max(after - 1, 0)]) & (clock < searched[min(after, len(searched) - 1)])
     return moment_again(fit, cause, between)
@@ -406,7 +406,7 @@ def _moment_anew(fit: Fit, cause: Effect, searched: FloatArray) -> Candidate | N
 def _left_out(fit: Fit) -> NDArray[np.bool_]:
     """Return the rows (n,) to leave out because their history is not known well enough.
 
-    If they are too many, these are only the first ones, and the arm is taken to go straight from each run to the next.
+    If they are too many, return only the first ones; the arm is then assumed to go straight from each run to the next.
     """
     rows = fit.doubtful()
     return rows if rows.mean() <= DiagnosisSettings.most_doubtful else fit.doubtful_at_first
@@ -420,12 +420,12 @@ def _found(
     seed: int,
     told: Stages,
 ) -> _SearchResult:
-    """Search the causes in some observations, and ask whether something without a name is at work."""
+    """Search for the causes in some observations, and test for unnamed causes."""
     start = aligned(observations, simulation)
     search = Search(hypotheses, told)
     begun = start if start.is_exact else together(start, hypotheses, told)
     told.begin(SEARCH, SETS)
-    # The set of causes compared best tells the noise, and the rows that they leave out, before the long search.
+    # The most probable set gives the noise, and the rows to leave out, before the long search.
     begun, start = _refitted(begun, start, simulation)
     unnamed = UnnamedFamilies(start)
     extended = search.run(begun) if start.is_exact else _searched(begun, search)
@@ -433,7 +433,7 @@ def _found(
     if other_shape is not None and (
         rattle(extended) or explain(extended, search.path, unnamed, search, told).unnamed_causes
     ):
-        # What is left is not noise alone.
+        # The remainder is not only noise.
         other_shape = None
     again, start = (extended, start) if search.ended_early else _refitted(extended, start, simulation, other_shape)
     if again is not extended:
@@ -441,17 +441,17 @@ def _found(
         extended = _searched(again, search)
     told.begin(UNNAMED, SEARCH)
     explanation = explain(extended, search.path, unnamed, search, told)
-    # What is loose does not slip, and changes of its side may have been named jumps and bumps.
+    # A loose marker does not slip, and changes of its side may have been named jumps and bumps.
     steady = [cause for cause in extended.causes if cause.kind.stage != "tool" and not cause.kind.begins]
-    # Likelihoods compare over the same rows alone.
+    # Likelihoods can only be compared over the same rows.
     bare = begun.with_causes([]).to(start.observations)
     fits = [start, bare, *([extended.with_causes(steady)] if steady else [])]
     loose = None if start.is_exact else _loose(explanation, fits, search)
     for _ in range(DiagnosisSettings.rattled if loose is not None else 0):
         assert loose is not None
         told(loose.what)
-        # Begin again: causes may have been named for it, and the noise is smaller without it.
-        # What rattles has no place of its own, and does not slip.
+        # Start again: causes may have been named because of the play, and the noise is smaller without it.
+        # A loose marker has no offset of its own, and does not slip.
         fixed = [effect for effect in hypotheses if effect.kind.stage != "tool"]
         search = Search(fixed, told)
         start = aligned(loose.taken_out_of(start.observations), simulation)
@@ -472,15 +472,15 @@ def _found(
     found = _SearchResult(start, search, unnamed, explanation, stands, loose, other_shape is not None)
     if loose is None:
         return found
-    # No simulation tells on which side the marker lies.
+    # No simulation predicts the side on which the marker lies.
     whole = start.observations.without_play(np.zeros_like(start.observations.x)).without(_left_out(explanation.fit))
     return found.of(whole.with_rattle(loose.ratio, loose.ways), simulation)
 
 
 def _loose(explanation: Explanation, fits: Sequence[Fit], search: Search) -> Rattle | None:
-    """Return the play of a loose marker, where two sides of it beside one of the fits are more probable than all else.
+    """Return the play of a loose marker if its two sides beside one of the fits are more probable than everything else.
 
-    A joint's error can move the marker along one line as well, but then the joints or the path tell where it lies.
+    A joint's error can move the marker along one line as well, but then the joints or the path predict its position.
     """
     beside, found = explanation.beside, [(rattle_beside(fit), cost_of_names(fit.causes, search)) for fit in fits]
     other = explanation.worth - explanation.counted * beside.log_likelihood + likelihood(beside)
@@ -490,16 +490,16 @@ def _loose(explanation: Explanation, fits: Sequence[Fit], search: Search) -> Rat
 
 
 def _refitted(fit: Fit, start: Fit, simulation: Simulation, shape: Observations | None = None) -> tuple[Fit, Fit]:
-    """Refit, with the noise that a fit shows and without the rows that its causes leave out; the fit where it has them.
+    """Refit with the estimated noise and without the rows that the causes leave out; return the fit if nothing changes.
 
     Args:
-        start: fit of the parameters that robot.toml does not know, returned with the same observations.
-        shape: the observations with another shape of the noise; None where it stays.
+        start: fit of the parameters unknown to robot.toml, returned with the same observations.
+        shape: the observations with another shape of the noise; None if it stays.
     """
     observations = fit.observations
     factor, left_out = instrument_factor(fit), _left_out(fit)
     before = np.zeros_like(left_out) if observations.doubtful is None else observations.doubtful
-    # Other sizes of the same causes change few rows.
+    # Other amounts of the same causes change few rows.
     other_rows = (left_out ^ before).sum() > (left_out & before).sum()
     other_noise = abs(np.log(factor / observations.stated_factor)) > DiagnosisSettings.same_noise
     if fit.is_exact or not (other_rows or other_noise or shape is not None):
@@ -510,7 +510,7 @@ def _refitted(fit: Fit, start: Fit, simulation: Simulation, shape: Observations 
 
 
 def _stored(start: Fit, alone: Fit, complete: Fit, left: ResidualStructure, blocks: Blocks) -> Fit:
-    """Return what extended.toml holds: the complete fit, or as much of it as is surely better on another recording.
+    """Return the content of extended.toml: the complete fit, or the part that is surely better on another recording.
 
     Args:
         alone: the complete fit without a smooth model.
@@ -528,13 +528,13 @@ def _stored(start: Fit, alone: Fit, complete: Fit, left: ResidualStructure, bloc
 
 
 def _searched(begun: Fit, search: Search) -> Fit:
-    """Run the search for causes from a fit, and refit with tolerances updated to what it finds."""
+    """Run the search for causes from a fit, and refit with tolerances updated to its findings."""
     extended = begun
     for _ in range(DiagnosisSettings.rescaled):
         begun = _with_small_ones_tolerated(begun)
         extended = search.run(begun)
         before = extended.background.scales or Scales()
-        # Unnamed causes may be all there is, and inflate the apparent tolerances.
+        # Possibly all causes are unnamed, and inflate the apparent tolerances.
         bare = extended.with_causes([])
         search.path = [bare.tolerating(before.no_larger), bare, *search.path[1:]]
         scales = tolerated(extended).scales
@@ -547,7 +547,7 @@ def _searched(begun: Fit, search: Search) -> Fit:
 
 
 def _with_small_ones_tolerated(fit: Fit) -> Fit:
-    """Refit with the periodic errors of drives that are no larger than those of other drives as tolerances."""
+    """Refit with those periodic errors of drives as tolerances that are no larger than other drives' errors."""
     fit = with_small_ripples(fit)
     small = _small_ones(fit)
     return fit.tolerating(tolerated(fit).scales, small) if small else fit

@@ -1,4 +1,4 @@
-"""Tell the stage of a diagnosis and about how much of the work is done."""
+"""Report the stage of a diagnosis and the approximate share of the work done."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Stages:
         self._stage, self._done = SETS, 0.0
 
     def begin(self, stage: Stage, before: Stage | None = None) -> None:
-        """Tell that a stage begins; `before` is the stage that has just ended."""
+        """Report that a stage begins; `before` is the stage that has just ended."""
         self._stage = stage
         self._done = max(self._done, 0.0 if before is None else before.ends)
         self._say(stage.what)

@@ -29,12 +29,12 @@ PSEUDO_TERMINALS, MASTERS = "/dev/pts/", {"/dev/ptmx", "/dev/pts/ptmx"}
 class Check:
     subject: str  # what was checked
     state: State  # "wrong" prevents reading the arm, "warning" degrades it
-    said: str  # what was found
-    fix: str = ""  # the command to type, or what to do; empty if nothing needs doing
+    said: str  # the finding
+    fix: str = ""  # the command to type, or the remedy; empty if nothing needs doing
 
 
 def warned(subject: str, said: str, fix: str, *, when: bool) -> Check:
-    """Return a check that is a warning with a remedy `when` something degrades the arm, else in order."""
+    """Return a check that is a warning with a remedy if `when` is true, and passed otherwise."""
     return Check(subject, "warning", said, fix) if when else Check(subject, "ok", said)
 
 

@@ -31,7 +31,7 @@ HARDWARE = {
 
 
 class DriversConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [drivers]: where joint readings come from."""
+    """The table [drivers]: the source of joint readings."""
 
     # a recording (CSV or Parquet) that stands in for encoders and camera, relative to robot.toml
     recording: str | None = None
@@ -48,11 +48,11 @@ class DriversConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def hardware(self) -> DynamixelConfig | FeetechConfig | SerialLinesConfig | Ros2Config | PluginConfig | None:
-        """Configuration of the hardware that the joints are read from, if any."""
+        """Configuration of the hardware that provides the joint readings, if any."""
         return self.dynamixel or self.feetech or self.serial_lines or self.ros2 or self.plugin
 
     def check(self, joints: Sequence[str], file: Path, text: str) -> None:
-        """Raise ConfigError if two sources give the joints, or if the source does not fit `joints`."""
+        """Raise ConfigError if two sources provide the joints, or if the source does not fit `joints`."""
         given = [name for name in HARDWARE if getattr(self, name) is not None]
         if len(given) > 1:
             line = line_of(text, ("drivers", given[1]))
@@ -60,7 +60,7 @@ class DriversConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             raise ConfigError(what, file=file, line=line, remedy="Take one out of [drivers]")
         if self.hardware is None:
             return
-        # For its marker topic the learner reads a ROS 2 robot's joints even when the samples come from elsewhere.
+        # The learner reads a ROS 2 robot's joints for its marker topic even when the samples come from elsewhere.
         if self.recording is not None and (self.ros2 is None or self.ros2.marker is None):
             line = line_of(text, ("drivers", "recording"))
             what = f"both a recording and {HARDWARE[given[0]]}"

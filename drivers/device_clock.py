@@ -33,9 +33,9 @@ class _Settings:
 class DeviceClock:
     """Map from a device clock to host time, for events that answer a request.
 
-    The host knows an interval for each event: after it asked, and before the answer arrived. The stamp gives another
-    interval, one tick wide, up to the offset between the clocks. The intervals of all events share this offset, so it
-    is soon known to a fraction of a tick. An event whose two intervals do not overlap carries a wrong stamp.
+    The host knows an interval for each event: after the request, and before the answer arrived. The timestamp gives
+    another interval, one tick wide, up to the offset between the clocks. The intervals of all events share this offset,
+    so it is soon known to a fraction of a tick. If an event's two intervals do not overlap, its timestamp is wrong.
 
     The ratio of the clock rates is estimated too: a clock without a crystal is off by a percent.
     """

@@ -28,7 +28,7 @@ class Port(Protocol):
         """Send `data`; raise BusLost if the port is gone."""
 
     def receive(self, until: float) -> bytes:
-        """Return what has arrived, else what arrives next; empty when nothing arrives before `until` on the clock."""
+        """Return received bytes, or wait for the next; empty if nothing arrives before `until` on the clock."""
         ...
 
     def flush(self) -> None:
@@ -39,7 +39,7 @@ class Port(Protocol):
 
 
 def close_quietly(port: Port) -> None:
-    """Close a port, whatever it says."""
+    """Close a port, ignoring errors."""
     with suppress(SourceError):
         port.close()
 
@@ -74,7 +74,7 @@ class EchoFree:
         self._port.write(data)
 
     def receive(self, until: float) -> bytes:
-        """Return what has arrived besides the echo, else what arrives next; empty if nothing arrives before `until`."""
+        """Return received bytes without the echo, or wait for the next; empty if nothing arrives before `until`."""
         while data := self._port.receive(until):
             others = self._without_own(data)
             if others:

@@ -1,4 +1,4 @@
-"""A recording in the place of encoders and camera."""
+"""Replay a recording in place of encoders and camera."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class ReplaySettings:
 
 
 class Replay:
-    """Plays a recording through a joint source and a marker source in lock step.
+    """Player of a recording through a joint source and a marker source in lock step.
 
     At each row's time there is one joint reading and one fix, so that joint angles interpolated to the fix's time are
     exactly the row's. Neither source runs more than a few rows ahead of the other, however fast it is read.
@@ -101,13 +101,13 @@ class ReplayMarker:
 
 
 class ReplayClock(SystemClock):
-    """The recording's time; as wall-clock time it shows the machine's."""
+    """Clock with the recording's time; its wall-clock time is the machine's."""
 
     def __init__(self, pace: _Pace) -> None:
         self._pace = pace
 
     def now(self) -> float:
-        """Return the time [s] of the newest fix played, before any that of the first one."""
+        """Return the time [s] of the newest fix played, or that of the first one before any was."""
         return self._pace.played_until(_MARKER)
 
 
@@ -117,7 +117,7 @@ def default_covariances(
     """Return covariances of the positions [m²], shape (n, 3, 3), for a recording without its own.
 
     Args:
-        calibration: the stereo camera whose pixel noise decides when `sigma_m` is None.
+        calibration: the stereo camera whose pixel noise determines them if `sigma_m` is None.
     """
     if sigma_m is None and calibration is not None and calibration.is_stereo and (recording.x[:, 2] > 0).all():
         return stereo_covariances(recording.x, calibration)
@@ -126,7 +126,7 @@ def default_covariances(
 
 
 def stereo_covariances(x: FloatArray, calibration: StereoCalibration) -> FloatArray:
-    """Return covariances [m²], shape (n, 3, 3), of points x (n, 3) before a stereo camera, from its pixel noise."""
+    """Return covariances [m²], shape (n, 3, 3), of points x (n, 3) seen by a stereo camera, from its pixel noise."""
     depth = x[:, 2]
     scale = calibration.focal_px / depth
     J = np.zeros((len(x), 4, 3))  # derivative of (ul, vl, ur, vr) [px/m]
@@ -175,7 +175,7 @@ class _Pace:
             return row
 
     def played_until(self, reader: int) -> float:
-        """Return the time [s] of the newest row given to the reader, before any that of the first one."""
+        """Return the time [s] of the newest row given to the reader, or that of the first one before any was."""
         with self._turn:
             return float(self._t[max(self._next[reader] - 1, 0)])
 

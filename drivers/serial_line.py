@@ -33,7 +33,7 @@ def serial_ports(root: Path = Path("/")) -> list[str]:
 
 
 class BusLost(SourceLost):
-    """The port, or the device behind it, was lost, or is not there yet."""
+    """The port, or the device behind it, was lost or is not present yet."""
 
     def __init__(self, port: str, error: Exception, state: str = "is gone") -> None:
         number = next((part for part in error.args if isinstance(part, int)), None)

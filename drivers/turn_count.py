@@ -52,14 +52,14 @@ class TurnCount:
 
     Attributes:
         pose: last joint angles [rad]; None before the first reading.
-        lost: a joint that is not where it was, so that the user must confirm its turn.
+        lost: a joint that has moved meanwhile, so that the user must confirm its turn.
     """
 
     def __init__(self, limits: Sequence[tuple[float, float]], last_pose: Sequence[float] | None) -> None:
         """Start without a reading.
 
         Args:
-            limits: of each joint [rad]; a range below one turn determines the turn.
+            limits: limits of each joint [rad]; a range below one turn determines the turn.
             last_pose: joint angles of the last session [rad], shape (d,).
         """
         self._limits = list(limits)
@@ -74,7 +74,7 @@ class TurnCount:
         self._is_accepted = self.lost is not None
 
     def begin(self, sensors: Sequence[Sensor], raw: Sequence[int]) -> None:
-        """Determine the turn of each joint from its limits, else from the last pose."""
+        """Determine the turn of each joint from its limits, otherwise from the last pose."""
         self._sensors = list(sensors)
         self.counts = [self._nearest(place, ticks) for place, ticks in enumerate(raw)]
 
@@ -90,7 +90,7 @@ class TurnCount:
         return self.pose
 
     def check(self, raw: Sequence[int]) -> None:
-        """Raise SourceLost when a multi-turn joint is not where it was: its turn is unknown then."""
+        """Raise SourceLost if a multi-turn joint has moved meanwhile: its turn is unknown then."""
         if self.pose is None:
             return
         for place, (sensor, count) in enumerate(zip(self._sensors, self.counts, strict=True)):

@@ -1,4 +1,4 @@
-"""Write a corrected URDF with the effects that a URDF can hold, for programs that know no effects.
+"""Write a corrected URDF with the effects that a URDF can hold, for programs that do not know effects.
 
 extended.toml names the nominal URDF and lists the effects beside it, so that nothing is applied twice.
 """
@@ -30,7 +30,7 @@ def corrected_file(robot: RobotDescription) -> str:
 def corrected_geometry(simulation: Simulation) -> CalibratedGeometry | None:
     """Return joint origins, camera pose and marker position with the effects that these can hold.
 
-    None where there is no such effect besides the parameters that the description marks as unknown.
+    Return None if there is no such effect besides the parameters that the description marks as unknown.
     """
     simulation = simulation.placed
     robot = simulation.robot
@@ -38,7 +38,7 @@ def corrected_geometry(simulation: Simulation) -> CalibratedGeometry | None:
     if not rigid:
         return None
     origins: dict[str, FloatArray] = {}
-    # An offset turns about the axis as corrected by the link's own effect, so it is applied last.
+    # An offset rotates about the axis after the link's own correction, so it is applied last.
     for effect in sorted(rigid, key=lambda effect: effect.kind.is_zero):
         if effect.where is not None:
             origin = origins.get(effect.where, robot.tree.joint(effect.where).T_parent_joint)
@@ -53,11 +53,11 @@ def corrected_geometry(simulation: Simulation) -> CalibratedGeometry | None:
 def write_corrected(simulation: Simulation, folder: Path, heading: str) -> Path | None:
     """Write the URDF of the simulation's robot with `corrected_geometry` into `folder`.
 
-    Meshes stay where they are; relative names are rewritten to point to them. A corrected URDF of an earlier simulation
-    is replaced, or removed where nothing is to be corrected.
+    Meshes stay in place; relative names are rewritten to point to them. A corrected URDF of an earlier simulation is
+    replaced, or removed if there is nothing to correct.
 
     Returns:
-        The file; None where nothing is to be corrected.
+        The file; None if there is nothing to correct.
 
     Raises:
         ConfigError: the file cannot be written.
@@ -91,7 +91,7 @@ class LiveEncoders:
     Every reading drives a backlash. It starts on the side of the first change; before any change, it is centred.
 
     Args:
-        row_readings: number of readings between rows, for effects that depend on the row before.
+        row_readings: number of readings between rows, for effects that depend on the previous row.
     """
 
     def __init__(self, simulation: Simulation, row_readings: int = 1) -> None:
@@ -106,7 +106,7 @@ class LiveEncoders:
         """Return true joint angles (d,) [rad, m] at the readings q (d,) and the time t [s].
 
         Args:
-            move: the move (d,) since the row before, for joints that have not settled.
+            move: the move (d,) since the previous row, for joints that have not settled.
         """
         angles, motion = q.copy(), Motion.at(q, t)
         for joint, error in self._errors:

@@ -1,4 +1,4 @@
-"""Define what an effect is: its parameters, where it can sit, what it does to a run, how it is searched and exported.
+"""Define effects: their parameters, places, influence on a run, search and export.
 
 Each effect is one class in one file of `catalogue`, a subclass of the class of its stage.
 """
@@ -45,7 +45,7 @@ class EffectSettings:
 
 
 class SimulatedArm(Protocol):
-    """What an effect may ask of the simulation that it is part of; see `Simulation`."""
+    """Properties of its simulation that an effect may use; see `Simulation`."""
 
     @property
     def bears_weight(self) -> bool: ...
@@ -62,7 +62,7 @@ class SimulatedArm(Protocol):
 
 
 class SimulationRun(Protocol):
-    """What an effect may ask of a run for its derivatives; see `Simulated`."""
+    """Properties of a run that an effect may use for its derivatives; see `Simulated`."""
 
     @property
     def simulation(self) -> SimulatedArm: ...
@@ -107,22 +107,22 @@ class EffectType(ABC):
     needs_times: ClassVar[bool] = False  # True if it needs times, not only an order
     needs_stereo: ClassVar[bool] = False  # True if it needs the stereo calibration
     needs_weight: ClassVar[bool] = False  # True if it needs joints that bear the arm's weight
-    # True if only some of its amounts may differ from nominal, as where a link is too long but straight
+    # True if a subset of its amounts may differ from nominal, as for a link that is too long but straight
     in_parts: ClassVar[bool] = False
     rigid: ClassVar[bool] = False  # True if a rigid chain can hold it
-    scales_all: ClassVar[bool] = False  # True if the lengths of all links, wrong by one factor, look like it
-    is_spring: ClassVar[bool] = False  # True if its joint yields in proportion to its load
+    scales_all: ClassVar[bool] = False  # True if a common error of all links' lengths looks like it
+    is_spring: ClassVar[bool] = False  # True if its joint deflects in proportion to its load
     is_load: ClassVar[bool] = False  # True if it is a mass that the URDF does not state
     moves_joints: ClassVar[bool] = False  # True if the true joint angles differ from the readings
-    is_zero: ClassVar[bool] = False  # True for the zero of a joint, which is often wrong at several joints
+    is_zero: ClassVar[bool] = False  # True for a joint offset, which is often wrong at several joints
     of_drive: ClassVar[bool] = False  # True for a periodic error, of which every drive has a little
     stays_as: ClassVar[str | None] = None  # name of its permanent form, for an effect that begins at a moment
     drifts: ClassVar[bool] = False  # True if it grows with time
     remembers: ClassVar[bool] = False  # True if it depends on earlier readings
-    by_direction: ClassVar[bool] = False  # True if only the direction of the moves counts for it, and not their size
+    by_direction: ClassVar[bool] = False  # True if only the direction of the moves matters, not their size
     is_linear: ClassVar[bool] = True  # True if it is proportional to its amounts
     search: ClassVar[ShapeSearch] = "none"  # how its last parameter is searched
-    refines: ClassVar[bool] = False  # True if to first order it looks like a simpler effect, in whose place it is tried
+    refines: ClassVar[bool] = False  # True if to first order it looks like a simpler effect, which it may replace
     # factor on the number of shapes tried, for one that has a shape more than a simpler effect
     further_trials: ClassVar[int] = 1
     # reason why a model of the arm does not hold it
@@ -130,7 +130,7 @@ class EffectType(ABC):
 
     @abstractmethod
     def parameters(self, prismatic: bool) -> tuple[Parameter, ...]:
-        """Return its parameters at a revolute or prismatic joint; equal where it acts at no joint."""
+        """Return its parameters at a revolute or prismatic joint; both are the same if it does not act at a joint."""
 
     @abstractmethod
     def jacobian(self, run: SimulationRun, effect: Effect) -> FloatArray:
@@ -151,7 +151,7 @@ class EffectType(ABC):
 
     @property
     def is_like_tolerances(self) -> bool:
-        """True if small errors of every link may stand for it."""
+        """True if small errors of every link may replace it."""
         return (self.rigid and not self.is_zero) or self.scales_all
 
     @property
@@ -161,12 +161,12 @@ class EffectType(ABC):
 
     @property
     def changes_with_time(self) -> bool:
-        """True if it makes the same pose measure differently later, as correlated noise does."""
+        """True if the same pose is measured differently later, as with correlated noise."""
         return self.begins or self.drifts
 
     @property
     def is_transient(self) -> bool:
-        """True if it is gone once the arm is at rest and warm."""
+        """True if it disappears once the arm is at rest and warm."""
         return self.depends_on_path or self.drifts
 
     @property
@@ -180,15 +180,15 @@ class EffectType(ABC):
         return EffectSettings.most_moments if self.begins else 1
 
     def is_free(self, robot: RobotDescription) -> bool:
-        """Return True if robot.toml does not know what it changes: it is fitted first, and never a finding."""
+        """Return True if it changes a parameter unknown to robot.toml: it is fitted first, and never a finding."""
         return False
 
     def trial_shapes(self, motion: Motion) -> FloatArray:
-        """Return the values (m,) of its last parameter that are tried, in increasing order."""
+        """Return the values (m,) of its last parameter to try, in increasing order."""
         raise NotImplementedError(f"{self.name} has no shape to search")
 
     def growth(self, motion: Motion, shape: float) -> FloatArray:
-        """Return the share of its amounts (n,) that has developed, for a drift whose last parameter is `shape`."""
+        """Return the fraction of its amounts (n,) that has developed, for a drift whose last parameter is `shape`."""
         raise NotImplementedError(f"{self.name} does not grow")
 
     def shape_step(self, run: SimulationRun, effect: Effect, k: int) -> float:
@@ -205,7 +205,7 @@ class EffectType(ABC):
         return np.zeros(len(run.motion), dtype=np.bool_)
 
     def correction_rows(self, effect: Effect, place: Place) -> Rows | None:
-        """Return what it adds to the tables of correction.json; None if the format cannot hold it."""
+        """Return its entries in the tables of correction.json; None if the format cannot hold it."""
         return None
 
     def add_to(self, joint: JointErrors, effect: Effect) -> str | None:
@@ -213,17 +213,17 @@ class EffectType(ABC):
         return self.no_counterpart
 
     def finding(self, at: str, numbers: Mapping[str, float]) -> str:
-        """Describe it in a clause, where no presenter has a sentence. `at` names the joint, if any."""
+        """Describe it in a clause, if no presenter has a sentence. `at` names the joint, if any."""
         amounts = ", ".join(f"{name} = {value:.3g}" for name, value in numbers.items())
         return f"{at or 'the arm'} has {self.name.replace('_', ' ')} ({amounts})"
 
     def remedy(self, at: str) -> str:
-        """Return a remedy, where no presenter has one."""
+        """Return a remedy, if no presenter has one."""
         return f"See what could cause it{f' at {at}' if at else ''}; extended.toml takes it into account"
 
 
 class StructureEffect(EffectType):
-    """An effect on the links' poses: a moved joint frame, or a joint that yields under the arm's weight."""
+    """An effect on the links' poses: a moved joint frame, or a joint that deflects under the arm's weight."""
 
     stage = "structure"
     has_slack: ClassVar[bool] = False  # True if `slack` gives a deflection
@@ -240,7 +240,7 @@ class StructureEffect(EffectType):
         """Return the further deflection of its joint (n,) [rad, m] under a torque (n,), and its side at the last row.
 
         Args:
-            side: before the first row: 1 or -1; 0 if unknown.
+            side: side before the first row: 1 or -1; 0 if unknown.
         """
         return np.zeros_like(torque), side
 
@@ -254,7 +254,7 @@ class StructureEffect(EffectType):
 
 
 class ToolEffect(EffectType):
-    """An effect on the marker's place in its link, from its moment on if it has one."""
+    """An effect on the marker's position in its link, from its moment on if it has one."""
 
     stage = "tool"
 
@@ -266,7 +266,7 @@ class ToolEffect(EffectType):
 class CameraEffect(EffectType):
     """An effect on the camera's pose, or on the positions that it reports.
 
-    One that is none of these overrides `reported` and sets `alters_report`; its derivative is then taken numerically.
+    An effect of any other kind overrides `reported` and sets `alters_report`; its derivative is then numerical.
     """
 
     stage = "camera"
@@ -274,7 +274,7 @@ class CameraEffect(EffectType):
     alters_report: ClassVar[bool] = False
 
     def pose(self, values: FloatArray) -> FloatArray | None:
-        """Return the camera's pose (4, 4) in its frame before, from its moment on if it has one; None if unmoved."""
+        """Return the camera's pose (4, 4) in its previous frame, from its moment on if it has one; None if unmoved."""
         return None
 
     def optics(self, values: FloatArray) -> Optics | None:
@@ -284,7 +284,7 @@ class CameraEffect(EffectType):
     def reported(
         self, x: FloatArray, motion: Motion, values: FloatArray, calibration: StereoCalibration | None
     ) -> FloatArray:
-        """Return the points that are reported (n, 3) [m] in the place of those otherwise reported x (n, 3) [m]."""
+        """Return the reported points (n, 3) [m] with this effect, from those without it x (n, 3) [m]."""
         return x
 
     def jacobian(self, run: SimulationRun, effect: Effect) -> FloatArray:
@@ -293,18 +293,18 @@ class CameraEffect(EffectType):
 
 
 class TimeEffect(EffectType):
-    """An effect of time: a delay of the images, or a drift of what is measured."""
+    """An effect of time: a delay of the images, or a drift of the measurements."""
 
     stage = "time"
     needs_times = True
     no_counterpart = "it depends on time"
 
     def delay_s(self, values: FloatArray) -> float:
-        """Return the delay of the images' time stamps [s]."""
+        """Return the delay of the images' timestamps [s]."""
         return 0.0
 
     def drift(self, motion: Motion, values: FloatArray) -> FloatArray | None:
-        """Return the shift (n, 3) [m] that is added to what is measured; None without one."""
+        """Return the shift (n, 3) [m] added to the measurements; None without one."""
         return None
 
 
@@ -315,8 +315,8 @@ EFFECT_TYPES: dict[str, EffectType] = {}  # all effects by name, in order; `regi
 class Effect:
     """An effect of a robot."""
 
-    kind: EffectType  # what it is
-    # where, source: the joint it acts on, and the joint that causes it; None where there is none
+    kind: EffectType  # its type
+    # where, source: the joint it acts on, and the joint that causes it; None without one
     where: str | None
     source: str | None
     values: FloatArray  # its numbers (p,), in the order of `parameters`
@@ -382,7 +382,7 @@ class Effect:
 
     @cached_property
     def pose(self) -> FloatArray | None:
-        """Pose (4, 4) of the camera in its frame before; None if it does not move it."""
+        """Pose (4, 4) of the camera in its previous frame; None if it does not move it."""
         return self.kind.pose(self.values) if isinstance(self.kind, CameraEffect) else None
 
     @property
@@ -402,7 +402,7 @@ class Effect:
 
     @property
     def told(self) -> list[int]:
-        """Indices of the values that describe it: all but amounts that are not free."""
+        """Indices of the values that describe it: all except amounts that are not free."""
         amounts = self.amounts
         return [k for k, parameter in enumerate(self.parameters) if k in amounts or not parameter.is_amount]
 
@@ -413,7 +413,7 @@ class Effect:
 
     @property
     def is_possible(self) -> bool:
-        """True if no value is negative that must not be."""
+        """True if every value that must not be negative is not."""
         return not any(p.never_negative and value < 0.0 for p, value in zip(self.parameters, self.values, strict=True))
 
     def with_values(self, values: FloatArray) -> Effect:
@@ -423,13 +423,13 @@ class Effect:
         return Effect(self.kind, self.where, self.source, frozen, self.prismatic, self.ordinal, self.free)
 
     def with_amounts(self, amounts: FloatArray | float) -> Effect:
-        """Return the same effect with other amounts (p,), or all alike."""
+        """Return the same effect with other amounts (p,), or with all of them equal."""
         values = self.values.copy()
         values[self.amounts] = amounts
         return self.with_values(values)
 
     def freeing(self, free: tuple[int, ...] | None) -> Effect:
-        """Return the same effect with these amounts free, all for None, and the others nominal."""
+        """Return the same effect with these amounts free (None for all) and the others nominal."""
         freed = replace(self, free=free)
         fixed = [k for k in range(len(self.values)) if k not in freed.told]
         values = self.values.copy()

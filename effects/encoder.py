@@ -22,10 +22,10 @@ class EncoderSettings:
 
 
 class LiveError(Protocol):
-    """An encoder error that is given reading by reading."""
+    """An encoder error computed reading by reading."""
 
     def at(self, motion: Motion, move: float) -> float:
-        """Return true angle minus reading [rad, m] at a motion of one row, after a move since the row before."""
+        """Return true angle minus reading [rad, m] at a motion of one row, after a move since the previous row."""
         ...
 
 
@@ -45,7 +45,7 @@ class EncoderEffect(EffectType):
         return self.columns(motion, place, values) @ values
 
     def live(self, place: Place, values: FloatArray, row_readings: int) -> LiveError:
-        """Return the error reading by reading; an effect that remembers keeps its state there.
+        """Return the error reading by reading; an effect with memory keeps its state there.
 
         Args:
             row_readings: number of readings between rows.
@@ -60,7 +60,7 @@ class EncoderEffect(EffectType):
 
 @dataclass(frozen=True)
 class _WithoutMemory:
-    """The error of an effect that depends on the present reading alone."""
+    """The error of an effect that depends only on the present reading."""
 
     effect: EncoderEffect
     place: Place
@@ -100,7 +100,7 @@ class LiveDriven:
 
 
 def carried_on(added: FloatArray, kept: FloatArray) -> FloatArray:
-    """Solve e_i = added_i + kept_i e_{i-1} for all rows (n,); nothing is kept from before the first."""
+    """Solve e_i = added_i + kept_i e_{i-1} for all rows (n,); the first row keeps nothing."""
     total, kept, back = added.copy(), kept.copy(), 1
     # Doubling: `kept` is the share of a row that remains after `back` rows.
     while back < len(total) and np.abs(kept).max() > EncoderSettings.forgotten:

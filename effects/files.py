@@ -89,7 +89,7 @@ class _UnexplainedTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
 
 
 def load_simulation(file: Path) -> Simulation:
-    """Load the robot of robot.toml, or extended.toml, with the effects that it names.
+    """Load the robot of robot.toml, or of extended.toml with its effects.
 
     Raises:
         ConfigError: see `RobotDescription.load`, `read_effects` and `read_unexplained`.
@@ -129,7 +129,7 @@ def read_effects(
 
 
 def read_unexplained(robot: RobotDescription, tables: Mapping[str, Any], text: str, file: Path) -> Unexplained | None:
-    """Read the model that `[unexplained]` names; None without it.
+    """Read the model in the table `[unexplained]`; return None without it.
 
     Raises:
         ConfigError: a key or a joint is unknown, or the model's file is missing, damaged, or for other joints.
@@ -160,15 +160,15 @@ def read_unexplained(robot: RobotDescription, tables: Mapping[str, Any], text: s
 def write_extended(simulation: Simulation, folder: Path, heading: str, *, replace: bool = False) -> Path:
     """Write the simulation as `EXTENDED_FILE` into `folder`, which is created if needed.
 
-    The URDF stays where it is and is named relative to `folder`. Other tables of robot.toml are kept; store and
-    checkpoint go to a folder of their own. Where robot.toml does not know the camera's pose or the marker's position,
-    those of the simulation are written in their place and stay marked as unknown.
+    The URDF stays in place and is named relative to `folder`. Other tables of robot.toml are kept; store and checkpoint
+    go to a separate folder. If robot.toml does not know the camera's pose or the marker's position, those of the
+    simulation are written instead and stay marked as unknown.
 
     Returns:
         The path of the extended.toml.
 
     Raises:
-        ConfigError: the file is there already, or cannot be written.
+        ConfigError: the file exists already, or cannot be written.
         ValueError: the simulation's residual cannot be stored.
     """
     file = folder / EXTENDED_FILE

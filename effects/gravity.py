@@ -1,4 +1,4 @@
-"""Compute gravity's torque about each joint, from the masses in the URDF or, where it states none, from lengths."""
+"""Compute gravity's torque about each joint, from the masses in the URDF or, without any, from lengths."""
 
 from __future__ import annotations
 
@@ -44,9 +44,10 @@ class Body:
 
 
 class GravityLoad:
-    """Gravity's torques about the joints of a robot, independent of what holds them.
+    """Gravity's torques about the joints of a robot, independent of the drives.
 
-    Joints that are not read stand where robot.toml holds them. The mass of the tool is unknown and not included.
+    Joints that are not read are at the position where robot.toml holds them. The mass of the tool is unknown and not
+    included.
 
     Args:
         robot: its links have the masses of the URDF; if it states none that a joint bears, each link weighs
@@ -67,7 +68,7 @@ class GravityLoad:
         """Return the load of a mass at the marker's link alone.
 
         Args:
-            moment: mass times its place in the link's frame [kg·m], shape (3,).
+            moment: mass times its position in the link's frame [kg·m], shape (3,).
         """
         carrier, T = self._marker
         load = copy(self)
@@ -83,7 +84,7 @@ class GravityLoad:
         return carried(robot.tree, robot.robot.marker_link, robot.joints, robot.robot.held_at)
 
     def in_supports(self, k: int) -> list[FloatArray]:
-        """Return poses (4, 4) of a joint's frame in the links that carry it as one: parent link first, farthest last.
+        """Return poses (4, 4) of a joint's frame in the links that carry it rigidly: parent link first, farthest last.
 
         The farthest is the link of the next joint that is read, or the root link. Equal frames are listed once.
         """
@@ -108,7 +109,7 @@ class GravityLoad:
         return torques
 
     def loads(self, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return gravity's load on what each joint carries: moments about its origin [N·m] and forces [N], (n, d, 3).
+        """Return gravity's load on the parts a joint carries: moments about its origin [N·m] and forces [N], (n, d, 3).
 
         Vectors are in the joint's frame on its parent link, at q (n, d).
         """
@@ -120,7 +121,7 @@ class GravityLoad:
         return moments, forces
 
     def _inwards(self, q: FloatArray) -> Iterator[tuple[int, float, FloatArray, FloatArray, _Turn]]:
-        """Yield each joint's index, the mass [kg] that it bears, mass times place [kg·m], gravity [m/s²], and its turn.
+        """Yield each joint's index, the mass it bears [kg], mass times position [kg·m], gravity [m/s²], and its motion.
 
         Vectors (3, n) are in the frame of the joint's child link. They pass from frame to frame: gravity outwards, mass
         times centre of mass back.
@@ -187,7 +188,7 @@ def _borne(
 ) -> Iterator[tuple[UrdfJoint | None, FloatArray]]:
     """Yield the joint above `link` and the link's pose (4, 4) in itself, then the same for each link that bears it.
 
-    The last joint is a read one, or None where the base bears the link.
+    The last joint is a read one, or None if the base bears the link.
     """
     above = {joint.child: joint for joint in tree.joints.values()}
     unread = tree.joints.keys() - set(joints)

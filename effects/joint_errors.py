@@ -38,7 +38,7 @@ class JointErrors:
     compliance: float = 0.0  # [rad/(N·m), m/N]
 
     def add_ratio(self, source: str, ratio: float) -> None:
-        """Add a share of a joint's reading."""
+        """Add a fraction of a joint's reading."""
         self.ratios[source] = self.ratios.get(source, 0.0) + ratio
 
     def add_wave(self, name: str, values: FloatArray, frequency: float) -> None:

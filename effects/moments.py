@@ -12,7 +12,7 @@ from .motion import Motion
 
 
 def settled(motion: Motion, time_constant_s: float) -> FloatArray:
-    """Return the share of a drift that has developed (n,), from 0 at the start of the motion towards 1."""
+    """Return the fraction of a drift that has developed (n,), from 0 at the start of the motion towards 1."""
     return -np.expm1(-(motion.clock - motion.began) / time_constant_s)
 
 
@@ -22,7 +22,7 @@ def after(motion: Motion, effect: Effect) -> NDArray[np.bool_]:
 
 
 def since(motion: Motion, effect: Effect) -> FloatArray:
-    """Return 1 for rows (n, 1, 1) after the moment at which an effect begins, else 0."""
+    """Return 1 for rows (n, 1, 1) after the moment at which an effect begins, otherwise 0."""
     return after(motion, effect)[:, None, None].astype(np.float64)
 
 

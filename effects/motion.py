@@ -41,7 +41,7 @@ class Motion:
         return cls(q, None, np.arange(len(q), dtype=np.int64))
 
     def some(self, rows: NDArray[np.intp]) -> Motion:
-        """Return a part of the motion, of increasing rows (m,); a gap between them begins a new run."""
+        """Return a part of the motion, at increasing rows (m,); a gap between them begins a new run."""
         segment = np.cumsum(self.begins[rows] | np.append(False, np.diff(rows) > 1), dtype=np.int64)
         return Motion(
             self.q[rows], None if self.t is None else self.t[rows], segment, self.begun_at, self.row_numbers[rows]
@@ -67,7 +67,7 @@ class Motion:
 
     @property
     def clock(self) -> FloatArray:
-        """Time of each row (n,): times [s], or row numbers where there are none."""
+        """Time of each row (n,): times [s], or row numbers without times."""
         return self.row_numbers if self.t is None else self.t
 
     @cached_property
@@ -77,7 +77,7 @@ class Motion:
 
     @cached_property
     def moves(self) -> FloatArray:
-        """Move that ended at each row (n, d) [rad, m]; 0 at the first of a run."""
+        """Move that ended at each row (n, d) [rad, m]; 0 at the first row of a run."""
         moves = np.zeros_like(self.q)
         moves[1:] = np.diff(self.q, axis=0)
         moves[self.begins] = 0.0
@@ -85,7 +85,7 @@ class Motion:
 
     @cached_property
     def pace(self) -> FloatArray:
-        """Time since the row before (n,), as a multiple of the usual time; 1 at the start of a run."""
+        """Time since the previous row (n,), as a multiple of the usual time; 1 at the start of a run."""
         usual = ~self.begins
         pace = np.ones(len(self.q))
         if usual.any():
@@ -108,9 +108,7 @@ class Motion:
 
     @cached_property
     def cubics(self) -> FloatArray:
-        """Path from each row to the next of its run (4, n, d), as coefficients of powers of the time since, highest
-        first.
-        """
+        """Path from each row to the next of its run (4, n, d): coefficients of powers of the time, highest first."""
         cubics = np.zeros((4, *self.q.shape))
         cubics[3] = self.q
         for first, end in self.runs:
@@ -119,10 +117,10 @@ class Motion:
         return frozen_array(cubics)
 
     def earlier(self, lag_s: float | FloatArray) -> Motion:
-        """Return the readings that the encoders gave `lag_s`, alike or (n,), before each row, without overshoot.
+        """Return the interpolated readings `lag_s` (a number or (n,)) before each row, without overshoot.
 
-        Before the first row of a run, and after its last, the nearest rate continues. Single rows, and all rows where
-        there are no times, stay unchanged (Fritsch and Butland 1984).
+        Before the first row of a run, and after its last, the nearest rate continues. Single rows, and all rows without
+        times, stay unchanged (Fritsch and Butland 1984).
         """
         if self.t is None:
             return self
@@ -139,7 +137,7 @@ def _earlier(motion: Motion, lag_s: float) -> Motion:
 
 
 def _asked(motion: Motion, asked: FloatArray) -> Motion:
-    """Return the readings at the times `asked` (n,), each by the run of its row."""
+    """Return the readings at the times `asked` (n,), each from the run of its row."""
     assert motion.t is not None
     t, cubics = motion.t, motion.cubics
     lengths = [end - first for first, end in motion.runs]
@@ -156,7 +154,7 @@ def _asked(motion: Motion, asked: FloatArray) -> Motion:
 def _cubics(t: FloatArray, q: FloatArray) -> FloatArray:
     """Return the highest three coefficients (3, m - 1, d) of a path through q (m, d) at times t (m,).
 
-    It never overshoots: its rate at a reading is the harmonic mean of the slopes beside it, and 0 at a turn (Fritsch
+    It never overshoots: its rate at a reading is the harmonic mean of the adjacent slopes, and 0 at a reversal (Fritsch
     and Butland 1984).
     """
     gaps = np.diff(t)[:, None]
@@ -211,7 +209,7 @@ def rotation(values: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def moved_and_turned(shifts: FloatArray, axes: FloatArray, lever: FloatArray) -> FloatArray:
-    """Return moves (n, 3, 6) at levers (n, 3): shifts (n, 3, 3), and turns about the columns of axes (n, 3, 3).
+    """Return moves (n, 3, 6) at levers (n, 3): shifts (n, 3, 3), and rotations about the columns of axes (n, 3, 3).
 
     Shifts and axes may be one (1, 3, 3) for all.
     """

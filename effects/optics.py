@@ -37,7 +37,7 @@ class Optics:
     def reported(self, x: FloatArray, calibration: StereoCalibration | None) -> FloatArray:
         """Return points (n, 3) [m] by the nominal calibration, of points (n, 3) [m] in the true left optical frame.
 
-        A stereo pair triangulates. A single camera takes the depth from the marker's size, whose error is
+        A stereo pair triangulates. A single camera derives the depth from the marker's size, whose error is
         `scale_error`.
         """
         if not self.inside:

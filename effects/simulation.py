@@ -52,7 +52,7 @@ Staged = TypeVar("Staged", bound=EffectType)
 
 
 class _Beneath(NamedTuple):
-    """The chain, and joint angles (n, d) by the readings, as a background alone makes them."""
+    """The chain, and joint angles (n, d) from the readings, with the background as the only effects."""
 
     chain: RigidChain
     angles: WeakKeyDictionary[Motion, FloatArray]
@@ -62,7 +62,7 @@ class Residual(Protocol):
     """A smooth function of the readings for errors that no effect explains."""
 
     def predict(self, q: FloatArray) -> FloatArray:
-        """Return the difference (n, 3) [m] of measurements from the effects, at the readings q (n, d) [rad, m]."""
+        """Return the difference (n, 3) [m] between measurements and effects, at the readings q (n, d) [rad, m]."""
         ...
 
 
@@ -85,7 +85,7 @@ class Simulation:
         return GravityLoad(self.robot)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state to be pickled: weak references cannot be, and what they keep is computed again."""
+        """Return the state to be pickled, without weak references, whose targets are computed again."""
         return {name: value for name, value in self.__dict__.items() if name != "_beneath"}
 
     def with_effects(self, effects: Sequence[Effect]) -> Simulation:
@@ -149,7 +149,7 @@ class Simulation:
         return replace(self, robot=robot.with_placement(pose, marker), effects=effects)
 
     def having(self, effect: Effect) -> Simulation:
-        """Return the same simulation with an effect in the place of the one that has its identity, or added."""
+        """Return the same simulation with an effect added, or replaced by identity."""
         own, background = (
             tuple(effect if one.identity == effect.identity else one for one in effects)
             for effects in (self.effects, self.background)
@@ -199,7 +199,7 @@ class Simulation:
 
     @cached_property
     def _beneath(self) -> _Beneath:
-        """What the background alone does, which is the same with other effects."""
+        """The result of the background alone, which is the same with other effects."""
         return _Beneath(self._bent(self.robot.chain, self.background), WeakKeyDictionary())
 
     def place(self, effect: Effect) -> Place:
@@ -212,12 +212,12 @@ class Simulation:
         """Return the positions (n, 3) [m] that the camera reports of points x (n, 3) in its present frame.
 
         Args:
-            optics: in the place of its own.
+            optics: optics instead of its own.
         """
         return self.altered((self.optics if optics is None else optics).reported(x, self.robot.calibration), motion)
 
     def altered(self, x: FloatArray, motion: Motion) -> FloatArray:
-        """Return the positions (n, 3) [m] that are reported in the place of x (n, 3), by effects beyond the optics."""
+        """Return the reported positions (n, 3) [m] of points x (n, 3), altered by effects beyond the optics."""
         for effect, kind in self._of(CameraEffect):
             if kind.alters_report:
                 x = kind.reported(x, motion, effect.values, self.robot.calibration)
@@ -225,7 +225,7 @@ class Simulation:
 
     @cached_property
     def alters_report(self) -> bool:
-        """True if an effect alters what the camera reports beyond the optics."""
+        """True if an effect beyond the optics alters the camera's report."""
         return any(kind.alters_report for _, kind in self._of(CameraEffect))
 
     @cached_property
@@ -235,7 +235,7 @@ class Simulation:
 
     @property
     def latency_s(self) -> float:
-        """Delay of the images' time stamps [s]."""
+        """Delay of the images' timestamps [s]."""
         return sum(kind.delay_s(effect.values) for effect, kind in self._of(TimeEffect))
 
     def _of(self, stage: type[Staged]) -> list[tuple[Effect, Staged]]:
@@ -250,17 +250,16 @@ class Simulation:
 
     @property
     def bears_weight(self) -> bool:
-        """True if the joints bear the arm's weight; torque-free joints leave it to the guiding hand."""
+        """True if the joints bear the arm's weight; without torque, the guiding hand bears it."""
         return self.robot.robot.hold != "torque_free"
 
     @property
     def shows_weight(self) -> bool:
-        """True if the weight may show: the joints bear it, or the URDF states it and what carries them may give."""
+        """True if the weight may matter: the joints bear it, or the URDF states it and its supports may deflect."""
         return self.bears_weight or self.gravity.known
 
     def given_way(self, q: FloatArray, hung: dict[Identity, float] | None = None) -> FloatArray:
-        """Return the deflection of the joints under the arm's weight (n, d) [rad, m], their springs unloaded at q (n,
-        d).
+        """Return the joints' deflection under the arm's weight (n, d) [rad, m], their springs unloaded at q (n, d).
 
         Args:
             hung: flank of each loaded backlash before the first row, updated to the last; None if unknown.
@@ -421,16 +420,14 @@ class Simulated:
 
     @cached_property
     def wrenches(self) -> FloatArray:
-        """Loads of gravity on what each joint carries (n, d, 6), in the joint's frame on its parent link.
+        """Loads of gravity on the parts that each joint carries (n, d, 6), in the joint's frame on its parent link.
 
         These are moments about its origin [N·m], then forces [N].
         """
         return np.concatenate(self.simulation.gravity.loads(self.q), axis=2)
 
     def columns(self, effect: Effect) -> FloatArray:
-        """Return derivatives (n, 3, p) of the measurements by the effect's values; zeros for values that are not
-        amounts.
-        """
+        """Return derivatives (n, 3, p) of the measurements by the effect's values; zeros for those not amounts."""
         return effect.kind.jacobian(self, effect)
 
     def by_shape(self, effect: Effect) -> FloatArray:
@@ -446,7 +443,7 @@ class Simulated:
 
     @cached_property
     def by_marker(self) -> FloatArray:
-        """Derivatives (n, 3, 3) of the measurements by the marker's place in its link."""
+        """Derivatives (n, 3, 3) of the measurements by the marker's position in its link."""
         return self.seen(self.frames[:, -1, :3, :3])
 
     def by_optics(self, effect: Effect) -> FloatArray:
@@ -481,7 +478,7 @@ class Simulated:
         return self.optical(self.since_moved(moved))
 
     def since_moved(self, moved: FloatArray) -> FloatArray:
-        """Return moves (n, 3, p) in the present camera frame, from moves in the frame where it was set up."""
+        """Return moves (n, 3, p) in the present camera frame, from moves in its initial frame."""
         for effect in self.simulation.effects:
             if (pose := effect.pose) is not None and effect.kind.begins:
                 moved = np.where(since(self.motion, effect) > 0.0, pose[:3, :3].T @ moved, moved)

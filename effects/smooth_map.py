@@ -97,14 +97,14 @@ def smooth_map(robot: RobotDescription, shift: Shift, q: FloatArray, tolerance_m
 
     Args:
         shift: function of readings (n, d) that returns shifts (n, 3) [m]; for revolute joints, at any angle.
-        q: readings (n, d) where the function is wanted.
+        q: readings (n, d) at which the model has to be right.
         tolerance_m: parts smaller than this (RMS) are left out, and with them joints without influence.
     """
     return _learnt(robot, robot.joints, robot.chain.prismatic.tolist(), shift, q, tolerance_m)
 
 
 def place_map(robot: RobotDescription, shift: Shift, x: FloatArray, tolerance_m: float) -> Unexplained:
-    """Fit a storable model to a function of the described robot's marker position, wanted at x (n, 3) [m]."""
+    """Fit a storable model to a function of the described robot's marker position, to be right at x (n, 3) [m]."""
     return _learnt(robot, PLACE, [True] * len(PLACE), shift, x, tolerance_m)
 
 

@@ -90,7 +90,7 @@ class Unexplained:
 
     @property
     def is_of_place(self) -> bool:
-        """True if it takes a coordinate of the marker."""
+        """True if an input is a coordinate of the marker."""
         return bool(set(self.joints) & set(PLACE))
 
     def predict(self, q: FloatArray) -> FloatArray:

@@ -92,7 +92,7 @@ class TypeComparison(msgspec.Struct, frozen=True):
 def common_poses(coverages: Sequence[Mapping[str, JointRange]], joints: tuple[str, ...]) -> FloatArray:
     """Return poses (n, d) [rad, m] from the median ranges of the robots.
 
-    One robot that hardly moved does not matter.
+    One robot that hardly moved does not affect them.
 
     Raises:
         RequestError: no robot reports the ranges of its joints.
@@ -135,7 +135,7 @@ def compared(joints: tuple[str, ...], q: FloatArray, models: Sequence[Model]) ->
 def median_model(positions: Sequence[FloatArray]) -> FloatArray:
     """Return positions (n, 3), the coordinates' median of all models' (n, 3), each rigidly aligned to it.
 
-    Starts with the model that the others are nearest to, so that an outlier does not determine the frame.
+    Starts with the model that is nearest to the others, so that an outlier does not determine the frame.
     """
 
     def distance(x: FloatArray) -> float:
@@ -149,7 +149,7 @@ def median_model(positions: Sequence[FloatArray]) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class _Figure:
-    """One figure of all robots: values and half widths (m,), NaN where a robot's pairs do not determine it."""
+    """One figure of all robots: values and half widths (m,), NaN if a robot's pairs do not determine it."""
 
     name: str
     unit: str
@@ -199,7 +199,7 @@ def _spread(values: FloatArray) -> float:
 
 
 def _camera_moved(found: ChainCalibration | None) -> tuple[float, float] | tuple[None, None]:
-    """Return the distance [mm] and the turn [°] from the camera pose in robot.toml."""
+    """Return the distance [mm] and the rotation [°] from the camera pose in robot.toml."""
     if found is None:
         return None, None
     moved = math.dist([each.drawn for each in found.camera_xyz], [each.learnt for each in found.camera_xyz])
@@ -210,7 +210,7 @@ def _camera_moved(found: ChainCalibration | None) -> tuple[float, float] | tuple
 
 
 def by_type(members: Sequence[Member]) -> tuple[dict[tuple[str, ...], list[Member]], list[str]]:
-    """Group the robots whose learners answer by the names of their joints; return also why others are left out."""
+    """Group the robots whose learners answer by the names of their joints; also return why others are left out."""
     types: dict[tuple[str, ...], list[Member]] = {}
     left_out: list[str] = []
     for member in members:
@@ -224,7 +224,7 @@ def by_type(members: Sequence[Member]) -> tuple[dict[tuple[str, ...], list[Membe
 
 
 def compare_types(fleet: Fleet, members: Sequence[Member]) -> tuple[list[TypeComparison], list[str]]:
-    """Return a comparison for each type with at least two answering models, and who was left out and why."""
+    """Return a comparison for each type with at least two answering models, and the robots left out with the reason."""
     types, left_out = by_type(members)
     found: list[TypeComparison] = []
     for joints, robots in types.items():
@@ -287,7 +287,7 @@ def sentences(comparison: TypeComparison) -> list[str]:
 
 
 def figure_told(odd: Odd) -> str:
-    """Return a figure that stands out, as `zero of elbow +2.1 ± 0.2°`."""
+    """Return an outlying figure as text, such as `zero of elbow +2.1 ± 0.2°`."""
     factor, unit = (math.degrees(1.0), "°") if odd.unit == "rad" else (1e3, " mm")
     half = factor * odd.half_width
     digits = min(max(1 - math.floor(math.log10(half)), 0), 4) if half > 0.0 else 3

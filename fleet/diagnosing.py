@@ -120,7 +120,7 @@ def diagnose_all(
     """Diagnose all recordings; a failed one is reported as such, and does not end the others.
 
     Args:
-        out: a folder for each recording is written here.
+        out: folder in which a folder for each recording is written.
         cluster: a client of the scheduler; running work is cancelled if this ends early.
         told: called with a recording's name and its current step.
 
@@ -165,7 +165,7 @@ def workers(scheduler: str | None, jobs: int, count: int | None = None) -> Itera
 
     Args:
         scheduler: its address; None starts processes here.
-        count: of processes; None: one for each core, and no more than jobs.
+        count: number of processes; None for one per core, at most the number of jobs.
 
     Raises:
         ConfigError: the scheduler does not answer, or has no workers.
@@ -184,7 +184,7 @@ def workers(scheduler: str | None, jobs: int, count: int | None = None) -> Itera
                 n_workers=count or min(os.cpu_count() or 1, jobs),
                 threads_per_worker=1,
                 processes=True,
-                dashboard_address="127.0.0.1:0",  # without one it takes port 8787, and warns where that is in use
+                dashboard_address="127.0.0.1:0",  # without a port it takes 8787, and warns if that is in use
                 silence_logs=logging.CRITICAL,
             ) as local,
             Client(local) as client,
@@ -217,7 +217,7 @@ def _leave_ctrl_c() -> None:
 
 
 def _read(job: Job) -> _Read | Diagnosed:
-    """Return the recording with its robot, or why it cannot be read."""
+    """Return the recording with its robot, or the reason why it cannot be read."""
     try:
         config = Config.load(job.robot)
     except BodyschemaError as error:
@@ -231,7 +231,7 @@ def _read(job: Job) -> _Read | Diagnosed:
 def _work(read: _Read, asked: Asked, with_report: bool) -> tuple[bytes, ReportedDiagnosis | None] | str:
     """Diagnose on a worker: return diagnosis.json, and the input of the other files if they are written.
 
-    Returns the reason as text if there is none: not every exception of ours can be unpickled.
+    Returns the reason as text if there is none, since not every exception of ours can be unpickled.
     """
     from distributed import get_worker
 

@@ -17,10 +17,10 @@ from bodyschema.robot.limited import read_at_most
 
 
 def descriptions(named: Sequence[Path]) -> list[Path]:
-    """Return descriptions of robots, each once: files, and of a folder those in it and in its subfolders.
+    """Return descriptions of robots, each once: the named files, and those in named folders and their subfolders.
 
-    Of a folder's TOML files, those with a table `[robot]` count, because calibrations and other files are there too. Of
-    a subfolder, its robot.toml counts.
+    In a folder, TOML files with a table `[robot]` count, because calibrations and other files are there too. In a
+    subfolder, only its robot.toml counts.
 
     Raises:
         ConfigError: a folder has none.
@@ -44,7 +44,7 @@ def _describes_a_robot(file: Path) -> bool:
 
 
 def configs_of(files: Sequence[Path], state_dir: Path | None) -> list[Config]:
-    """Return the robots, with their states in `state_dir` if given, in a folder each if there are several.
+    """Return the robots, with their states in `state_dir` if given, each in its own folder if there are several.
 
     Raises:
         ConfigError: a description is wrong, or of a robot that cannot be learnt.
@@ -83,7 +83,7 @@ def spread(configs: Sequence[Config], processes: int, options: Sequence[str]) ->
     """Learn in several processes, each with its share of the robots, until SIGTERM or Ctrl-C.
 
     Raises:
-        ConfigError: they cannot be distributed, or not be served by one process.
+        ConfigError: they cannot be distributed, or one process cannot serve its share.
         BodyschemaError: a process refused to start.
     """
     children: list[Child] = []

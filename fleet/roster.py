@@ -34,7 +34,7 @@ Status = TypeVar("Status", SamplerStatus, LearnerStatus)
 
 @dataclass(frozen=True)
 class Place:
-    """Network route on which robots are looked for."""
+    """Network route that is searched for robots."""
 
     route: Route
     robots: tuple[str, ...] = ()  # names of the expected robots; others are found too if queries for all are permitted
@@ -67,7 +67,7 @@ class Member:
 
     @property
     def health(self) -> list[str]:
-        """Problems, as sentences; empty if all is well."""
+        """Problems, as sentences; empty if there are none."""
         said = [sentence for status in (self.sampler, self.learner) if status is not None for sentence in status.health]
         if not self.alive:
             return ["neither its sampler nor its learner is alive"]
@@ -105,7 +105,7 @@ def places(endpoints: Sequence[str], files: Sequence[Path]) -> list[Place]:
 
 
 class Fleet:
-    """Queries the status of all robots. Use as a context manager; robots and routes may come and go."""
+    """All robots, with queries of their status. Use as a context manager; robots and routes may come and go."""
 
     def __init__(self, places: Sequence[Place]) -> None:
         self._places = places
@@ -133,7 +133,7 @@ class Fleet:
         return [members[name] for name in sorted(members)]
 
     def bus(self, route: Route) -> ZenohSession:
-        """Return the session of a route; BusError if no process answers there."""
+        """Return the session of a route; raise BusError if no process answers there."""
         if route not in self._sessions:
             self._sessions[route] = self._open.enter_context(ZenohSession(connect=route, client=True))
         return self._sessions[route]

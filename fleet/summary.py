@@ -38,7 +38,7 @@ class Row(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Shared(msgspec.Struct, frozen=True):
-    """Cause that more than half of the units of a type have."""
+    """Cause shared by more than half of the units of a type."""
 
     cause: str  # effect and joint
     units: tuple[str, ...]  # the units that have it
@@ -84,7 +84,7 @@ def row(result: Diagnosed) -> Row:
 
 
 def _told(cause: Cause, timed: bool) -> str:
-    """Return a cause with its numbers, as `joint_scale at elbow: scale +2.01 ± 0.03 %`."""
+    """Return a cause with its numbers, such as `joint_scale at elbow: scale +2.01 ± 0.03 %`."""
     numbers = ", ".join(f"{number.label} {number}" for number in telling(numbers_of(cause, timed=timed)))
     return f"{place(cause)}: {numbers}" if numbers else place(cause)
 
@@ -115,7 +115,7 @@ _STYLES = {"explained": "green", "nothing_found": "blue", "undecided": "yellow",
 
 @contextmanager
 def progress(console: Console, count: int) -> Iterator[tuple[Told, Done]]:
-    """Yield the callbacks of `diagnose_all`: progress bars on a terminal, elsewhere one line per recording."""
+    """Yield the callbacks of `diagnose_all`: progress bars on a terminal, otherwise one line per recording."""
     if not console.is_terminal:
         finished = 0
 
@@ -168,7 +168,7 @@ def view(summary: Summary) -> RenderableType:
 
 
 def sentences(one: Type) -> list[str]:
-    """Return sentences on the units of a type that are off, and why."""
+    """Return sentences on the units of a type that are off, with the reason."""
     units = len(one.well) + len(one.off)
     said = [f"{name} is off: {'; '.join(why)}." for name, why in one.off.items()]
     if one.well:

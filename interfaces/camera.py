@@ -16,16 +16,16 @@ LARGEST_SIDE_PX = 16384
 class StereoCalibration:
     """Calibration of one or two rectified eyes.
 
-    The measurement frame is the left optical frame (x right, y down, z forward). One camera alone is
-    the left eye of a pair without a right one: its baseline is 0.
+    The measurement frame is the left optical frame (x right, y down, z forward). A single camera is the left eye of a
+    pair without a right one: its baseline is 0.
 
-    The right eye stands at (+baseline_m, 0, 0) in the left optical frame and looks the same way, so that
+    The right eye is at (+baseline_m, 0, 0) in the left optical frame and looks the same way, so that
     u_left = cx + f·x/z, u_right = cx + f·(x − baseline)/z and v = cy + f·y/z in both.
 
     Attributes:
         focal_px: focal length f of both eyes [px].
         principal_point_px: (cx, cy) of both eyes; integer coordinates are pixel centres.
-        baseline_m: distance of the eyes [m]; 0 where there is one alone.
+        baseline_m: distance of the eyes [m]; 0 for a single camera.
         image_size_px: (width, height).
         pixel_sigma: 1-sigma of a marker centre's image coordinates, per coordinate [px].
     """

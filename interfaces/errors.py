@@ -57,7 +57,7 @@ class SourceEnded(SourceError):
 
 
 class SourceLost(SourceError):
-    """The device was lost. Opening it again may help, after `retry_s` where the source knows that this is cheap.
+    """The device was lost. Opening it again may help, after `retry_s` if the source knows that this is cheap.
 
     `brief` is the message in one sentence, if the full message contains a table.
     """

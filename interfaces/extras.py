@@ -1,4 +1,4 @@
-"""The optional parts of the installation: which packages each brings, and the command that installs it."""
+"""The optional parts of the installation: the packages of each, and the command that installs it."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ _ALONE = {"realsense": "pyrealsense2", "av1": "av"}
 
 
 def require_extra(extra: str, what: str) -> None:
-    """Raise ConfigError with the command to type unless the modules of `extra`, which `what` needs, are installed."""
+    """Raise ConfigError with the install command unless the modules of `extra`, which `what` needs, are installed."""
     for module in MODULES[extra]:
         if find_spec(module) is None:
             raise missing(module, extra, what)
 
 
 def missing_module(error: ModuleNotFoundError) -> ConfigError | None:
-    """Return what to tell of an import that failed; None for a module that no extra brings."""
+    """Return the error to report for a failed import; None for a module that no extra provides."""
     extra = next((extra for extra, modules in MODULES.items() if error.name in modules), None)
     return None if extra is None else missing(str(error.name), extra, "this")
 
@@ -47,7 +47,7 @@ def missing(module: str, extra: str, what: str) -> ConfigError:
 
 
 def install_command(extra: str) -> str:
-    """Return the command that adds an extra to this installation; it needs no published bodyschema."""
+    """Return the command that adds an extra to this installation; it does not need a published bodyschema."""
     pip, python = shutil.which("pip"), Path(this_interpreter())
     own = pip is not None and Path(pip).absolute().parent == python.parent
     what = _ALONE.get(extra, f"'bodyschema[{extra}]'")
@@ -55,7 +55,7 @@ def install_command(extra: str) -> str:
 
 
 def no_pybullet() -> str:
-    """Return what to do where pybullet has no wheel for this Python; empty where it has one."""
+    """Return the remedy if pybullet has no wheel for this Python; empty if it has one."""
     if sys.version_info < (3, 12):
         return ""
     found = f"{sys.version_info.major}.{sys.version_info.minor}"

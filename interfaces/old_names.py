@@ -37,7 +37,7 @@ PLACES = {
 class OldNames(MetaPathFinder):
     """Finder of moved modules, and of `interfaces.camera` as `bodyschema.interfaces.camera`.
 
-    Another package's name stays its own.
+    A package of this name that is not ours is left alone.
     """
 
     def find_spec(

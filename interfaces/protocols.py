@@ -1,4 +1,4 @@
-"""The capabilities that hardware, simulation and recordings share. Each has a contract test in tests/contracts."""
+"""The capabilities shared by hardware, simulation and recordings. Each has a contract test in tests/contracts."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ if TYPE_CHECKING:  # a client that only asks loads no NumPy
 
 
 class Clock(Protocol):
-    """Source of the time stamps."""
+    """Source of timestamps."""
 
     def now(self) -> float:
         """Return the monotonic time [s], the clock of all readings and frames."""
@@ -25,8 +25,8 @@ class Clock(Protocol):
 class Source(Protocol):
     """Something that is opened, read and closed, and may be opened again.
 
-    Opening happens in `__enter__`, never in `__init__`. Closing again does no harm. Reading what is not open raises
-    SourceError. What is read after opening again comes later than what was read before.
+    `__enter__` opens it, never `__init__`. Closing it again does no harm. Reading a source that is not open raises
+    SourceError. Time keeps increasing when a source is closed and opened again.
     """
 
     def __enter__(self) -> Self: ...
@@ -56,7 +56,7 @@ class JointSource(Source, Protocol):
 
 @runtime_checkable
 class StereoEyes(Source, Protocol):
-    """One or two eyes, in one camera or two, as the images come: neither calibrated nor rectified."""
+    """One or two eyes, in one camera or two. Their images are neither calibrated nor rectified."""
 
     @property
     def image_size_px(self) -> tuple[int, int]:
@@ -79,7 +79,7 @@ class StereoEyes(Source, Protocol):
 
 @runtime_checkable
 class StereoCamera(Source, Protocol):
-    """One or two calibrated eyes, on one clock with the encoders; their images are rectified."""
+    """One or two calibrated eyes on one clock with the encoders; their images are rectified."""
 
     @property
     def calibration(self) -> StereoCalibration:
@@ -100,7 +100,7 @@ class MarkerSource(Source, Protocol):
     """The marker's position: a tracked camera, or a recording."""
 
     def read(self, timeout_s: float) -> MarkerFix | MarkerMiss | None:
-        """Return the next fix or the reason for a missing one, in strictly increasing time; None after `timeout_s`.
+        """Return the next fix, or the reason for a missing one, in strictly increasing time; None after `timeout_s`.
 
         Raises:
             SourceEnded: there will be no more.

@@ -25,34 +25,34 @@ def frozen_array(values: ArrayLike) -> FloatArray:
 
 
 class Reason(StrEnum):
-    """Why a frame or a fix did not become a pair. The names are the keys of the counters in `status`."""
+    """Reason why a frame or a fix did not become a pair. The names are the keys of the counters in `status`."""
 
     NO_MARKER = "no_marker"  # nothing of the marker's colour, or too few pixels
     AT_BORDER = "at_border"  # the marker touches the image border
     OCCLUDED = "occluded"  # something covers a part of it
-    NOT_ROUND = "not_round"  # the ball's outline is whole but no ellipse
+    NOT_ROUND = "not_round"  # the ball's outline is whole but not an ellipse
     NOT_STRAIGHT = "not_straight"  # a tag's edges scatter or are bent
-    MIRRORED = "mirrored"  # the tag, printed or seen as in a mirror
+    MIRRORED = "mirrored"  # the tag is mirrored, in print or in view
     OTHER_FAMILY = "other_family"  # a tag of another dictionary
-    LOW_CONTRAST = "low_contrast"  # too little difference from what surrounds it
+    LOW_CONTRAST = "low_contrast"  # too little difference from its surroundings
     BLURRED = "blurred"  # too little detail is left
     SATURATED = "saturated"  # too much of it is over-exposed
-    REFLECTION = "reflection"  # a dimmer copy of the marker, or one at a place that it cannot have
+    REFLECTION = "reflection"  # a dimmer copy of the marker, or one at an impossible place
     EPIPOLAR = "epipolar"  # the two eyes' rows disagree
     SIZE_MISMATCH = "size_mismatch"  # the two eyes' radii, or radius and depth, disagree
     AMBIGUOUS = "ambiguous"  # more than one candidate fits
-    REPROJECTION = "reprojection"  # what is seen does not fit the marker's shape
+    REPROJECTION = "reprojection"  # the detection does not fit the marker's shape
     DISAGREEING = "disagreeing"  # several sources contradict each other
     IMPLAUSIBLE_SPEED = "implausible_speed"  # farther from the last fix than a hand can move it
     NO_JOINTS = "no_joints"  # no encoder readings around the frame's time
     STALE = "stale"  # encoder readings around the frame's time too far apart
     MOVING = "moving"  # joints too fast for the uncertainty of the frame's time
     LATE_JOINTS = "late_joints"  # joints too fast for the uncertainty of the times of their readings
-    TOO_NEAR = "too_near"  # nearer than the smallest step to the predecessor: wait
+    TOO_NEAR = "too_near"  # nearer to the predecessor than the smallest step: wait
     PAUSED = "paused"  # an operator paused the sampler
-    NOT_FINITE = "not_finite"  # the tracker gave a position that is no number
-    NOT_STORED = "not_stored"  # the disk took no pair: full, read-only or failing
-    NOT_BORNE = "not_borne"  # zero-force is to bear the arm, and is off
+    NOT_FINITE = "not_finite"  # the tracker gave a position that is not a number
+    NOT_STORED = "not_stored"  # the disk did not accept the pair: full, read-only or failing
+    NOT_BORNE = "not_borne"  # zero-force should bear the arm, but is off
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,10 +76,10 @@ class StereoFrame:
 
     Attributes:
         t: middle of the exposure on the same clock as the joint readings [s].
-        left, right: images, shape (height, width, 3), uint8, BGR as OpenCV has it. Pixel (i, j) (column, row)
-            covers the square around (i, j): its centre has the image coordinates u = i, v = j. `right` is None
-            where there is one camera alone, whose image is the left one.
-        t_sigma: 1-sigma of `t`, and of the time that lies between the two eyes' exposures [s].
+        left, right: images, shape (height, width, 3), uint8, in OpenCV's order BGR. Pixel (i, j) (column, row) covers
+            the square around (i, j): its centre has the image coordinates u = i, v = j. `right` is None for a single
+            camera, whose image is the left one.
+        t_sigma: 1-sigma of `t`, and of the time between the exposures of the two eyes [s].
     """
 
     t: float
@@ -95,19 +95,19 @@ class StereoFrame:
 
 @dataclass(frozen=True, slots=True)
 class MarkerFix:
-    """The marker's centre, found.
+    """The measured position of the marker's centre.
 
     Attributes:
-        t: time of the image it comes from [s].
+        t: time of the image [s].
         x: position in the measurement frame [m], shape (3,).
-        cov: its covariance [m²], shape (3, 3).
-        centres_px: (ul, vl, ur, vr), where the centre is seen by the left and the right eye, or None
-            when the source measures positions directly (a laser tracker, a recording), or has one eye alone.
+        cov: covariance of x [m²], shape (3, 3).
+        centres_px: (ul, vl, ur, vr), image of the centre in the left and the right eye; None if the source measures
+            positions directly (a laser tracker, a recording) or has only one eye.
         t_sigma: 1-sigma of `t` [s].
-        R: how the marker is turned in the measurement frame: a unit quaternion (x, y, z, w), shape (4,), or None
-            where the marker looks the same from all sides.
-        cov_R: covariance of a small turn of it about the axes of the measurement frame [rad²], shape (3, 3), or None
-            when the source does not tell.
+        R: orientation of the marker in the measurement frame: a unit quaternion (x, y, z, w), shape (4,); None if the
+            marker looks the same from all sides.
+        cov_R: covariance of a small rotation about the axes of the measurement frame [rad²], shape (3, 3); None if the
+            source does not provide it.
     """
 
     t: float
@@ -134,7 +134,7 @@ class Pair:
     Attributes:
         store: identity (UUID) of the store that numbered it.
         seq: sequence number in that store, from 1, without gaps.
-        segment: a run of pairs each one step from its predecessor has one number.
+        segment: number shared by a run of pairs, each one step from its predecessor.
         t: time of the frame on the sampler's monotonic clock [s].
         utc: wall-clock time of the acceptance, ISO 8601.
         q: joint angles interpolated to the frame's time [rad], shape (d,).

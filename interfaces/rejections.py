@@ -75,5 +75,5 @@ REMEDIES: Mapping[Reason, str] = {
 
 
 def words_of(reason: str) -> str:
-    """Return the words for a reason in a status message, also for one of a newer version."""
+    """Return the description of a reason in a status message, also for a reason of a newer version."""
     return WORDS[Reason(reason)] if reason in set(Reason) else reason.replace("_", " ")

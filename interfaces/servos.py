@@ -1,4 +1,4 @@
-"""Joints that are read from encoders and servos, as the processes and commands see them."""
+"""Joints that are read from encoders and servos, as seen by the processes and commands."""
 
 from __future__ import annotations
 
@@ -101,16 +101,16 @@ class FoundServo:
     """A servo that answered.
 
     Attributes:
-        port: the port it is on.
+        port: its port.
         baud: bits per second.
-        protocol: its name, such as "Dynamixel 2.0".
-        id: on the bus.
-        firmware: its version, as its maker writes it.
-        model: its name, or its number where the model is unknown; None when not reported.
-        voltage_v, temperature_c: as measured by the servo; None when not reported.
-        has_torque: True while the motor holds its position; None when not reported.
-        troubles: what is wrong with it, and what to do.
-        is_double: several servos answer to this ID.
+        protocol: name of the protocol, such as "Dynamixel 2.0".
+        id: ID on the bus.
+        firmware: version in the vendor's notation.
+        model: name, or number if the model is unknown; None if not reported.
+        voltage_v, temperature_c: as measured by the servo; None if not reported.
+        has_torque: True if the motor holds its position; None if not reported.
+        troubles: its problems, with the remedies.
+        is_double: True if several servos answer to this ID.
     """
 
     port: str
@@ -131,9 +131,9 @@ class ScannedBus:
     """Result of scanning one port.
 
     Attributes:
-        port: that was scanned.
-        servos: those that answered.
-        trouble: why the scan failed or was cut short, or None.
+        port: the scanned port.
+        servos: the servos that answered.
+        trouble: reason why the scan failed or was cut short, or None.
     """
 
     port: str

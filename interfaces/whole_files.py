@@ -1,4 +1,4 @@
-"""Write files that appear complete or not at all, whatever the disk does."""
+"""Write files that appear complete or not at all, even if the disk fails."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def require_target(
 def writing(
     file: Path, error: type[ConfigError | RecordingError] = ConfigError, *, what: str = "written", remedy: str = ""
 ) -> Iterator[None]:
-    """Raise `error` with the system's reason where `file` cannot be written, or made."""
+    """Raise `error` with the system's reason if `file` cannot be created or written."""
     try:
         yield
     except OSError as failed:
@@ -38,10 +38,10 @@ def writing(
 
 
 def write_whole(contents: Mapping[Path, bytes], *, mode: int | None = None) -> None:
-    """Write files, replacing those that are there: all of them once all are on the disk, else none.
+    """Write files, replacing existing ones: all of them once all are on the disk, otherwise none.
 
     Args:
-        contents: of each file.
+        contents: contents of each file.
         mode: permissions of the files; by default those of new files.
 
     Raises:
@@ -70,9 +70,9 @@ def replace_kept(file: Path, data: bytes, beside: Mapping[str, bytes] | None = N
     The target of a link is replaced, not the link. Permissions stay.
 
     Args:
-        file: to be replaced.
+        file: the file to replace.
         data: its new contents.
-        beside: contents of other files to write with it, by what their names have after the name of the file.
+        beside: contents of other files to write with it, by the suffix that they add to the name of the file.
 
     Raises:
         OSError: one of them cannot be written; nothing was changed.
@@ -86,12 +86,12 @@ def replace_kept(file: Path, data: bytes, beside: Mapping[str, bytes] | None = N
 
 
 def link_target(file: Path) -> Path:
-    """Return the file that a link leads to; any other as it is named."""
+    """Return the target of a link; return any other file unchanged."""
     return file.resolve() if file.is_symlink() else file
 
 
 def free_backup(file: Path) -> Path:
-    """Return a name for the old file that nothing has yet."""
+    """Return an unused name for the old file."""
     count, name = 1, file.with_name(f"{file.name}{BACKUP}")
     while os.path.lexists(name):
         count += 1

@@ -3,8 +3,9 @@
 Needs only numpy and scipy: no I/O, no clock, no logging. Angles [rad], lengths [m], float64. The innermost loops are
 compiled if a C compiler was present at installation: see `kernels_in_use()`. BODYSCHEMA_PURE=1 disables them.
 
-Arrays of a wrong shape raise `ShapeError`, of other things than numbers `NotNumbersError`, not finite `NonFiniteError`,
-orientations that are none `RotationError`, and damaged bytes `ModelFormatError`; docstrings name other errors.
+Arrays of a wrong shape raise `ShapeError`, arrays of anything but numbers `NotNumbersError`, values that are not finite
+`NonFiniteError`, matrices or quaternions that are not rotations `RotationError`, and damaged bytes `ModelFormatError`.
+Docstrings name other errors.
 """
 
 import re

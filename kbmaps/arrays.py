@@ -61,7 +61,7 @@ def matching_rows(q: ArrayLike, x: ArrayLike, joints: int) -> tuple[FloatArray, 
 
 
 def rows_or_vector(name: str, values: ArrayLike, width: int) -> FloatArray:
-    """Return `values` as a finite vector (width,) or finite rows (n, width), whichever they were."""
+    """Return `values` as a finite vector (width,) or finite rows (n, width), keeping its dimensions."""
     array = numbers(name, values)
     if array.ndim == 1:
         return vector(name, array, width)
@@ -94,5 +94,5 @@ def limits(name: str, values: ArrayLike, width: int) -> FloatArray:
 
 
 def evenly_spread(count: int, most: int) -> NDArray[np.intp]:
-    """Return at most `most` of the places 0 ... count − 1, the first and the last among them."""
+    """Return at most `most` of the indices 0 ... count − 1, evenly spread, including the first and the last."""
     return np.linspace(0, count - 1, min(count, most)).round().astype(np.intp)

@@ -36,11 +36,11 @@ class ContestSettings:
 
 
 def shared_by(residuals: FloatArray) -> float:
-    """Return how many neighbouring residuals carry as much information as one independent residual, at least 1.
+    """Return the number of neighbouring residuals, at least 1, that are worth one independent residual.
 
-    This is the integrated autocorrelation time 1 + 2 Σ ρ_k of the residuals (n, 3) in their order. The sum ends at the
-    first pair of neighbouring lags that is not positive (Geyer 1992, initial positive sequence). The series is not
-    centred: a mean is an error too.
+    This is the integrated autocorrelation time 1 + 2 Σ ρ_k of the residuals (n, 3) in order. The sum ends at the first
+    pair of neighbouring lags that is not positive (Geyer 1992, initial positive sequence). The series is not centred: a
+    mean is an error too.
     """
     n = len(residuals)
     longest = int(n * ContestSettings.longest_lag_share)
@@ -73,11 +73,11 @@ class Recent:
 class PrequentialComparison:
     """Squared distances between predictions and measurements, pair by pair, for the last pairs.
 
-    Prequential errors (Dawid 1984), compared in pairs: two models meet the same noise at the same pair, so their
+    Prequential errors (Dawid 1984), compared pair by pair: two models have the same noise at the same pair, so their
     difference is more precise than their own errors.
 
     Args:
-        errors: state to resume: by model, the squared distances (k,) [m²] of the last k pairs, NaN where missing.
+        errors: state to resume: by model, the squared distances (k,) [m²] of the last k pairs, NaN if missing.
         pairs: number of pairs so far.
 
     Raises:
@@ -94,7 +94,7 @@ class PrequentialComparison:
 
     @property
     def errors(self) -> Mapping[str, FloatArray]:
-        """Squared distances (k,) [m²] of the last k pairs by model, NaN where missing."""
+        """Squared distances (k,) [m²] of the last k pairs by model, NaN if missing."""
         return self._errors
 
     @property
@@ -133,7 +133,7 @@ class PrequentialComparison:
     def add_late(self, name: str, squares: ArrayLike) -> None:
         """Add the squared distances (n,) [m²] of a new model for the last pairs, none of which it has learnt.
 
-        They replace those of an older model of this name. NaN where the model had learnt the pair.
+        They replace those of an older model of this name. They are NaN for pairs that the model had learnt.
         """
         late = np.asarray(squares, dtype=np.float64)[-self._length :] if self._length else np.empty(0)
         values = self._errors.setdefault(name, np.full(self._length, math.nan))
@@ -167,10 +167,10 @@ class PrequentialComparison:
         return Recent(pairs, {name: float(np.sqrt(last[name][common]).mean()) for name in listed} if pairs else {})
 
     def best(self, trusted: Sequence[str], present: str) -> str:
-        """Return the model that shall answer: the most trusted one that no other beats.
+        """Return the model that answers: the most trusted one that no other beats.
 
         One beats another if the other's mean error is a fifth larger on the newest pairs of both, or if its squared
-        errors are larger by more than chance on all pairs that are compared.
+        errors are larger by more than chance on all compared pairs.
 
         Args:
             trusted: the models, the most trusted first.
@@ -211,7 +211,7 @@ def _clearly_worse(errors: FloatArray, others: FloatArray) -> bool:
     cap = ContestSettings.cap * max(min(float(np.median(errors)), float(np.median(others))), ContestSettings.least)
     losses = np.minimum(errors, cap) - np.minimum(others, cap)
     mean = float(losses.mean())
-    # Few losses may be alike by chance: their spread is widened accordingly.
+    # Few losses may be similar by chance: their spread is widened accordingly.
     error = float(losses.std(ddof=1)) / math.sqrt(count) * (1.0 + 3.0 / count)
     if mean <= ContestSettings.clearly * error:
         return False

@@ -72,7 +72,7 @@ def lower_solve(lower: FloatArray, rhs: FloatArray) -> FloatArray:
 
 def lower_inverse(lower: FloatArray) -> FloatArray:
     """Return the inverse of a lower triangular matrix without zeros on its diagonal."""
-    # In C order it is the transpose of an upper one in Fortran order, which LAPACK takes without a copy.
+    # In C order it is the transpose of an upper one in Fortran order, which LAPACK accepts without a copy.
     inverse, _ = _routine("dtrtri")(lower.T, lower=0)
     return cast(FloatArray, inverse).T
 

@@ -22,8 +22,8 @@ class Memory:
     Attributes:
         window: number of the last pairs that count; None means all.
         forgetting: factor by which each new pair reduces the weight of all before; 1 forgets nothing. The pairs are
-            then worth about 1 / (1 − forgetting) in all. If that is fewer than the control points that they would have
-            to determine, the evidence keeps to the prior.
+            then worth about 1 / (1 − forgetting) in all. If that is fewer than the control points to be determined, the
+            evidence keeps to the prior.
 
     Raises:
         SettingError: a window below 1, forgetting not within 0..1 or 0 itself.
@@ -41,17 +41,17 @@ class Memory:
             )
 
     def kept(self, pairs: int) -> int:
-        """Return how many of the last pairs count, out of `pairs`."""
+        """Return the number of last pairs that count, out of `pairs`."""
         longest = math.inf if self.forgetting == 1.0 else math.log(_NOTHING) / math.log(self.forgetting) + 1.0
         return int(min(pairs, longest if self.window is None else min(longest, self.window)))
 
     def weights(self, pairs: int) -> FloatArray:
-        """Return weights (pairs,) of pairs in the order in which they came: 1 for the last."""
+        """Return weights (pairs,) of pairs in order of arrival: 1 for the last."""
         return self.forgetting ** np.arange(pairs - 1, -1, -1.0)
 
 
 def describe_memory(memory: Memory) -> dict[str, float | None]:
-    """Return a memory as JSON holds it."""
+    """Return a memory for JSON."""
     return {"window": memory.window, "forgetting": memory.forgetting}
 
 

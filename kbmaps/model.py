@@ -16,7 +16,7 @@ SUPPORT_FACTOR = 2.0
 class Estimate:
     """Marker positions for a batch of configurations, or for one.
 
-    A configuration is in support where the model is about as certain as at its pairs: its variance, summed over the
+    A configuration is in support if the model is about as certain there as at its pairs: its variance, summed over the
     axes, is at most `SUPPORT_FACTOR` times the greatest at any of the learnt pairs, outliers left out. So all inliers
     are in support, and nothing is before the first pair, or the first since a tool change. A model with another rule
     documents it, with the reason, at its `estimate`.
@@ -41,7 +41,7 @@ def near_data(variance: FloatArray, widest: float) -> BoolArray:
     """Return True for each configuration in support (n,), by the rule of `Estimate`.
 
     Args:
-        variance: of each coordinate there (n, 3) [m²].
+        variance: variance of each coordinate there (n, 3) [m²].
         widest: the result of `widest` for the learnt pairs [m²].
     """
     return variance.sum(axis=1) <= SUPPORT_FACTOR * widest
@@ -100,7 +100,7 @@ class Model(PositionModel, Protocol):
         Args:
             q: joint values.
             x: measured positions.
-            sigma: 1-sigma of the positions [m], () or (n,); None where the model has to estimate it.
+            sigma: 1-sigma of the positions [m], () or (n,); None if the model has to estimate it.
 
         Raises:
             ShapeError, NonFiniteError, SettingError (a sigma that is not positive): nothing has changed.

@@ -34,7 +34,7 @@ _LARGEST_COUNT = 2**53
 
 
 def pack(kind: str, fields: Mapping[str, Any], arrays: Mapping[str, FloatArray]) -> bytes:
-    """Return the byte string for a model; `fields` holds JSON values, with None in place of an infinite number."""
+    """Return the byte string for a model; `fields` holds JSON values, with None instead of an infinite number."""
     shapes = {name: list(array.shape) for name, array in arrays.items()}
     content = {"kind": kind, "fields": dict(fields), "arrays": shapes}
     header = json.dumps(content, separators=(",", ":"), allow_nan=False).encode()
@@ -108,7 +108,7 @@ def restoring(what: str) -> Generator[None]:
 
 
 def complete(arrays: Mapping[str, FloatArray], always: Sequence[str], *parts: Sequence[str]) -> None:
-    """Raise ModelFormatError unless `always` and each part, whole or not at all, are exactly the arrays."""
+    """Raise ModelFormatError unless the arrays are exactly `always` plus complete parts."""
     expected = set(always)
     for part in parts:
         expected |= set(part) if any(name in arrays for name in part) else set()
@@ -143,7 +143,7 @@ def flag(value: Any, what: str) -> bool:
 
 
 def unless_infinite(value: float) -> float | None:
-    """Return a number as JSON can hold it: None if it is infinite."""
+    """Return a number for JSON: None if it is infinite."""
     return None if math.isinf(value) else value
 
 

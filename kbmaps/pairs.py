@@ -21,17 +21,17 @@ class Pairs:
     q: FloatArray
     x: FloatArray
     unit: FloatArray  # 1-sigma (n,) of each coordinate [m] up to a common factor; the geometric mean of all directions
-    known: bool  # whether that factor is 1; otherwise it has to be estimated
-    # (n, 3, 3): what makes an error as large in all directions; None where it is. Of determinant 1 if `known`
+    known: bool  # True if that factor is 1; otherwise it has to be estimated
+    # (n, 3, 3): matrices that make the errors isotropic; None if they are. Of determinant 1 if `known`
     shape: FloatArray | None = None
-    # (n, 3, k) [m], the errors that k unknowns shared by all pairs bring at 1 sigma of each; None: none
+    # (n, 3, k) [m], errors caused by k unknowns that all pairs share, at 1 sigma of each; None without any
     common: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.q)
 
     def chosen(self, mask: BoolArray | IntArray) -> Pairs:
-        """Return the pairs selected by the mask (n,), or at these places, in the same units."""
+        """Return the pairs selected by a mask (n,) or by indices, in the same units."""
         shape, common = (None if each is None else each[mask] for each in (self.shape, self.common))
         return Pairs(self.q[mask], self.x[mask], self.unit[mask], self.known, shape, common)
 
@@ -45,7 +45,7 @@ class Pairs:
 def with_units(
     q: FloatArray, x: FloatArray, sigma: FloatArray, shape: FloatArray | None = None, common: FloatArray | None = None
 ) -> Pairs:
-    """Return pairs from their sigma (n,) [m], NaN where unknown, and the rest as in `Pairs`.
+    """Return pairs from their sigma (n,) [m], NaN if unknown, and the rest as in `Pairs`.
 
     As soon as one is unknown, the others count relative to their median, which also replaces the missing ones.
     """
@@ -58,7 +58,7 @@ def with_units(
 
 
 def stored_pairs(arrays: Mapping[str, FloatArray], joints: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return q (n, d), x (n, 3) and sigma (n,), NaN where unknown, from the arrays of a stored model."""
+    """Return q (n, d), x (n, 3) and sigma (n,), NaN if unknown, from the arrays of a stored model."""
     with restoring("pairs"):
         q, x, sigma = rows("q", arrays["q"], joints), rows("x", arrays["x"], 3), arrays["sigma"]
         if not sigma.shape == (len(q),) == (len(x),):

@@ -1,4 +1,4 @@
-"""Robust judgement of residuals: rounding, outliers, and uncertainty from few of them."""
+"""Robust evaluation of residuals: rounding, outliers, and uncertainty from few of them."""
 
 from __future__ import annotations
 
@@ -50,14 +50,14 @@ def student(freedom: float) -> float:
 def claimed_sigma(variance: FloatArray, pairs: Pairs, noise: float, freedom: float) -> FloatArray:
     """Return the 1-sigma against the truth [m] of positions with this posterior variance [m²].
 
-    Where a given noise does not explain the residuals, the excess is added. Where the noise was estimated from few
-    residuals, it is widened, because it may be larger than it seems.
+    If the residuals exceed a given noise, the excess is added. If the noise was estimated from few residuals, it is
+    widened, because it may be larger than estimated.
 
     Args:
         variance: posterior variance of each coordinate [m²].
         pairs: the fitted pairs.
-        noise: that of the fit, in the pairs' units.
-        freedom: residual coordinates minus those that the parameters have used up.
+        noise: noise of the fit, in the pairs' units.
+        freedom: residual coordinates minus the effective number of parameters.
     """
     if pairs.known:
         return np.sqrt(variance + (noise**2 - 1.0) * float(np.square(pairs.unit).mean()))
@@ -71,7 +71,7 @@ def unexplained_variance(residuals: FloatArray, covariances: FloatArray, freedom
 
     Args:
         residuals: (n, 3) [m], without outliers.
-        covariances: of the instrument's errors (n, 3, 3) [m²].
+        covariances: covariances of the instrument's errors (n, 3, 3) [m²].
         freedom: degrees of freedom, that is residual coordinates minus fitted parameters; above 0.
     """
     told, axes = np.linalg.eigh(covariances)

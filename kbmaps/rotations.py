@@ -29,7 +29,7 @@ _CROSS = np.stack([np.cross(unit, _EYE).T.ravel() for unit in _EYE])
 def nearest_rotation(matrices: ArrayLike) -> FloatArray:
     """Return the proper rotations (..., 3, 3) nearest to matrices (..., 3, 3) in the Frobenius norm.
 
-    The orthogonal factor of the polar decomposition, with the smallest singular direction reversed where the matrix is
+    The orthogonal factor of the polar decomposition, with the smallest singular direction reversed if the matrix is
     a reflection. Higham 1986, "Computing the polar decomposition"; Kabsch 1976 for the sign.
 
     Example:
@@ -54,7 +54,7 @@ def nearest_rotation_rates(matrices: FloatArray, derivatives: FloatArray) -> Flo
     """Return the angular velocities ω (..., 3, d) of the rotations R nearest to matrices (..., 3, 3).
 
     dR = [ω_k]× R dq_k. With M = R P, Rᵀ dM − dMᵀ R = Ω P + P Ω, and for [ω]× = Ω this is [(tr P · 1 − P) ω]×: exact,
-    also where M is not orthonormal.
+    even if M is not orthonormal.
 
     Args:
         matrices: M (..., 3, 3).

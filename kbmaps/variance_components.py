@@ -22,7 +22,7 @@ _ROWS, _COLUMNS = [0, 1, 2, 1, 0, 0], [0, 1, 2, 2, 2, 1]
 
 
 def tells_directions(stated: FloatArray) -> bool:
-    """Return True if any of the stated covariances (n, 3, 3), NaN where there is none, is anisotropic."""
+    """Return True if any of the stated covariances (n, 3, 3), NaN if missing, is anisotropic."""
     values = np.linalg.eigvalsh(stated[~np.isnan(stated).any(axis=(1, 2))])
     return bool((values[:, 2] - values[:, 0] > _Settings.alike_share * values[:, 2]).any())
 
@@ -30,13 +30,14 @@ def tells_directions(stated: FloatArray) -> bool:
 def error_covariances(errors: FloatArray, stated: FloatArray, readings: FloatArray) -> FloatArray:
     """Estimate the covariances (n, 3, 3) [m²] of errors, whose stated ones may be wrong in size and in shape.
 
-    Each is a C + c D + r J Jᵀ + b 1, with the shares a, c, r, b ≥ 0 of all that make the errors most probable: D is the
-    part of C along its least sure direction, such as a camera's depth, J the joints' readings, and b what no part
-    explains. What is stated alone would put all weight on directions that nothing else measures as well.
+    Each is a C + c D + r J Jᵀ + b 1, with common factors a, c, r, b ≥ 0 that make the errors most probable. C is the
+    stated covariance, D its part along its least certain direction, such as a camera's depth, J the derivatives by the
+    joints' readings, and b the unexplained part. The stated covariance alone would put all weight on directions that
+    nothing else measures equally well.
 
     Args:
-        errors: of a model's predictions (n, 3) [m].
-        stated: covariances of the measured positions (n, 3, 3) [m²], NaN or 0 where none is stated; one at least is.
+        errors: errors of a model's predictions (n, 3) [m].
+        stated: covariances of the measured positions (n, 3, 3) [m²], NaN or 0 if not stated; at least one is.
         readings: J, derivatives of the positions by the joints (n, 3, d) [m/rad].
     """
     variances = np.trace(stated, axis1=1, axis2=2) / 3.0
@@ -68,10 +69,11 @@ def in_typical_units(spread: FloatArray, off: FloatArray) -> tuple[FloatArray, F
 
 
 def most_probable_shares(spread: FloatArray, off: FloatArray, *, leave_out: bool = False) -> tuple[FloatArray, float]:
-    """Return shares (k,) of covariances (n, k, 3, 3) in that of `off` (n, 3), and their log-likelihood [nats].
+    """Return factors (k,) of covariances (n, k, 3, 3) in that of `off` (n, 3), and their log-likelihood [nats].
 
-    By the MM algorithm of Zhou, Hu, Zhou and Lange (2019, "MM algorithms for variance components models"); far errors
-    are clipped, or left out: from one in sixteen on, clipped ones would make a part that explains them grow and grow.
+    By the MM algorithm of Zhou, Hu, Zhou and Lange (2019, "MM algorithms for variance components models"). Large errors
+    are clipped, or left out: from one in sixteen on, clipped ones would let a part that explains them grow without
+    limit.
     """
     n, k = spread.shape[:2]
     parts = np.ascontiguousarray(spread[:, :, _ROWS, _COLUMNS].transpose(1, 2, 0)).reshape(k, 6 * n)

@@ -39,7 +39,7 @@ class LearnerEvidence:
     pairs: int  # number of learnt pairs with the current tool
     region: FloatArray  # poses (k, d) [rad, m] that represent the data's region
     seen: FloatArray  # poses (n, d) [rad, m] of some of them, evenly spread
-    # q, x: the newest pairs that the solver knows, (m, d) [rad, m] and (m, 3) [m]
+    # q, x: the newest pairs of the solver, (m, d) [rad, m] and (m, 3) [m]
     q: FloatArray
     x: FloatArray
 
@@ -66,13 +66,13 @@ class Scatter:
 
 
 def forecast(known: LearnerEvidence, scatter: Scatter, joints: tuple[str, ...]) -> Outlook:
-    """Return the expected gain of further pairs where the arm has been, for an answering solution.
+    """Return the expected gain of further pairs in the region visited so far, for an answering solution.
 
     The current error is the predicted one there. The forecast gives the factor by which it falls.
 
     Args:
-        scatter: of the newest pairs.
-        joints: their names.
+        scatter: scatter of the newest pairs.
+        joints: names of the joints.
     """
     rng = np.random.default_rng(0)  # the same pairs have the same outlook
     nominal, claim = known.nominal, known.claim

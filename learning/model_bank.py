@@ -32,8 +32,8 @@ TRUSTED = (RIGID, RESIDUAL, EXACT, PRIOR, INSTANT)
 class ModelBank:
     """KB-Maps in the bases of the prior, and a chain with residual.
 
-    Between two solutions, the solved models stay as they are. Instant steps on top of them would follow the newest
-    pairs, and spoil them away from their path: measured, the error a few degrees away grew from 7 to 10 mm within 20
+    Between two solutions, the solved models do not change. Instant steps on top of them would follow the newest pairs
+    and spoil them away from their path: the error a few degrees away was measured to grow from 7 to 10 mm within 20
     pairs.
     """
 

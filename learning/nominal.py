@@ -1,4 +1,4 @@
-"""Nominal model, where learning starts."""
+"""Nominal model, from which learning starts."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class NominalSettings:
 
 @dataclass(frozen=True)
 class NominalModel:
-    """Chain of robot.toml and URDF, with the parts of it that are only roughly known."""
+    """Chain of robot.toml and URDF, with a description of its roughly known parts."""
 
     chain: RigidChain  # measurement frame to marker
     # lower, upper: joint limits, shape (d,) [rad or m]
@@ -102,17 +102,17 @@ class NominalModel:
         return " and ".join(f"{name} = false" for name, known in flags if not known)
 
     def reach(self, angle: float) -> FloatArray:
-        """Return `angle` [rad] for a revolute joint, the same share of its stroke [m] for a prismatic one (d,)."""
+        """Return `angle` [rad] for a revolute joint, the same fraction of its stroke [m] for a prismatic one (d,)."""
         return np.where(self.chain.prismatic, angle * (self.upper - self.lower) / np.pi, angle)
 
     def fingerprint(self, tolerances: ChainTolerances) -> str:
-        """Return a hash of this nominal model with these tolerances; a state only fits the ones it came from."""
+        """Return a hash of this nominal model with these tolerances; a state only fits the ones it was made with."""
         said = f"{self.pose_known} {self.marker_known} {tolerances} {self.prior.digest}"
         return hashlib.blake2b(said.encode(), digest_size=8).hexdigest()
 
     @cached_property
     def prior(self) -> KBMap:
-        """Chain as a map in the learning bases, with the bends of the extended simulation."""
+        """Chain as a map in the learning bases, with the deflections of the extended simulation."""
         prior = self.chain.to_kbmap(self.bases)
         if self.extended is None or (nodes := self._nodes()) is None:
             return prior
@@ -171,6 +171,7 @@ class NominalModel:
         Args:
             kbmap: the learnt map.
             chain: the nominal chain in the frame that the map was learnt in; it gives the hand's orientation.
+
         Raises:
             DegenerateDataError: there are no pairs.
         """

@@ -40,24 +40,25 @@ class OnlineSettings:
 
 
 class OnlineLearner:
-    """Learns the forward kinematics of one robot from pairs.
+    """Online learner of the forward kinematics of one robot from pairs.
 
-    Runs one regime after another, whose models are in `Regimes`; counts, synchronises the two threads, and publishes.
+    It runs one regime after another, whose models are in `Regimes`; it counts, synchronises the two threads, and
+    publishes.
 
     Attributes:
-        nominal: nominal model, where learning starts.
+        nominal: nominal model, from which learning starts.
     """
 
     def __init__(
         self,
-        nominal: NominalModel,  # the nominal model, where learning starts
+        nominal: NominalModel,  # the nominal model, from which learning starts
         settings: LearnerConfig,
-        solver: Solver,  # of the models that need all pairs
+        solver: Solver,  # solver of the models that need all pairs
         *,
-        # maximum wait of pairs to be judged together [s], which costs a fraction of judging each. The instant learner
-        # does not wait.
+        # maximum wait of pairs to be evaluated together [s], at a fraction of the cost of single ones. The instant
+        # learner does not wait.
         together_s: float = 0.0,
-        common: Callable[[FloatArray], FloatArray] | None = None,  # as `Snapshot` has it
+        common: Callable[[FloatArray], FloatArray] | None = None,  # as in `Snapshot`
     ) -> None:
         self.nominal, self._settings, self._common = nominal, settings, common
         self._solving = SolverClient(solver, settings.solve_every)
@@ -104,13 +105,13 @@ class OnlineLearner:
 
     @property
     def curve(self) -> list[CurvePoint]:
-        """Error [m] of the answering model on the last pairs, at some numbers of pairs."""
+        """Error [m] of the answering model on the last pairs, after increasing numbers of pairs."""
         with self._lock:
             return self._curve.points
 
     @property
     def change(self) -> ChangeRecord | None:
-        """Last change, reported or detected; None: there was none, or it was rolled back."""
+        """Last change, reported or detected; None if there was none, or it was rolled back."""
         with self._lock:
             return self._regimes.change
 
@@ -126,7 +127,7 @@ class OnlineLearner:
             return Recent(0, {}) if regime is None else regime.recent
 
     def claimed_error_m(self) -> float | None:
-        """Return the expected mean distance [m] in the data's region to what the cameras see without noise.
+        """Return the expected mean distance [m] in the data's region to noise-free camera measurements.
 
         None while there are too few pairs. The region: within a few degrees (`region_rad` per joint) of the kept pairs.
         """
@@ -141,7 +142,7 @@ class OnlineLearner:
         return snapshot.expected_error_m(region)
 
     def common_error_m(self) -> float | None:
-        """Return the expected mean error [m] in the data's region that all pairs share; None if it is not known."""
+        """Return the expected mean error [m] in the data's region that all pairs share; None if it is unknown."""
         with self._lock:
             regime, snapshot = self._regimes.present, self._snapshot
             if regime is None or len(regime.memory) == 0:
@@ -289,7 +290,7 @@ class OnlineLearner:
             self._publish()
 
     def restart_solver(self) -> None:
-        """Give a solver that has lost its pairs all of them again. For the thread that calls `work`."""
+        """Send all pairs again to a solver that has lost them. For the thread that calls `work`."""
         self._solving.restart()
         with self._lock:
             if self._regimes.present is not None:
@@ -323,15 +324,15 @@ class OnlineLearner:
 
     @property
     def _settled(self) -> bool:
-        """True if all pairs so far have been judged."""
+        """True if all pairs so far have been evaluated."""
         return self._regimes.present is None or not self._regimes.present.met
 
     def _judge_due(self, now: float) -> bool:
-        """Return True if pairs have waited long enough to be judged."""
+        """Return True if pairs have waited long enough to be evaluated."""
         return not self._settled and now - self._met_at >= self._together_s
 
     def _judge(self) -> None:
-        """Process all waiting pairs: compare the models, gate outliers, look for a change, and keep the pairs."""
+        """Evaluate all waiting pairs: compare the models, gate outliers, look for a change, and keep the pairs."""
         while (regime := self._regimes.present) is not None and regime.met:
             self._judged(regime, *regime.judge())
             if self._regimes.present is not None and self._regimes.present is not regime:
@@ -339,7 +340,7 @@ class OnlineLearner:
                     self._regimes.present.meet(pair)
 
     def _judged(self, regime: Regime, pairs: Sequence[Pair], doubted: BoolArray) -> None:
-        """Count the pairs that `regime` has learnt or gated as outliers, and follow a change that they show."""
+        """Count the pairs that `regime` has learnt or gated as outliers, and follow a change detected in them."""
         error_m = regime.recent.means.get(regime.answering)
         first = self._counters.pairs - len(regime.met) - len(pairs) + 1
         if error_m is not None:
@@ -351,7 +352,7 @@ class OnlineLearner:
             self._counters.since_change = self._regimes.memory.count + len(regime.met)
 
     def _followed(self, regime: Regime, pair: Pair, *, learnt: bool) -> bool:
-        """Return True if the pairs up to this one show a change, and another regime has begun with it."""
+        """Return True if the pairs up to this one reveal a change, so that another regime has begun with it."""
         noticed = self._regimes.noticed(regime, pair)
         if noticed is None and (learnt or not regime.gate.perhaps_changed):
             return False
@@ -384,7 +385,7 @@ class OnlineLearner:
         return True
 
     def _fit(self) -> bool:
-        """Fit an unknown frame or a changed tool, when it is due."""
+        """Fit an unknown frame or a changed tool, if it is due."""
         with self._lock:
             memory = self._regimes.memory
             if not self._regimes.fitting.due(memory.count):
@@ -394,13 +395,13 @@ class OnlineLearner:
         fit = fitting.fit(q, x, cov)
         with self._lock:
             self._judge()
-            if memory is self._regimes.memory:  # else another regime has begun
+            if memory is self._regimes.memory:  # otherwise another regime has begun
                 self._counters.doubted += self._regimes.fitted(fit, count)
                 self._publish()
         return True
 
     def _serve_solver(self) -> bool:
-        """Give the solver its pairs, request solutions from time to time, take its results."""
+        """Send the solver its pairs, request solutions at intervals, and take its results."""
         solving = self._solving
         with self._lock:
             if self._regimes.present is None:
@@ -416,7 +417,7 @@ class OnlineLearner:
                 return True
             asking = solving.due and solving.fed == regime.memory.count
             if asking:
-                self._judge()  # the solver shall know everything that the instant learner knows
+                self._judge()  # the solver must know everything that the instant learner knows
                 if self._regimes.present is not regime:
                     return True
                 regime.ask()

@@ -1,4 +1,4 @@
-"""Orientation of the marker: several models side by side, of which the best predictor answers."""
+"""Orientation of the marker: several models side by side, the best predictor of which answers."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class AngleMemory(msgspec.Struct):
         """Add an error of this angle [rad].
 
         Args:
-            angle: of the error [rad].
+            angle: angle of the error [rad].
             noise: expected square of the measurement's noise [rad²].
             claimed: expected square of noise and model error together [rad²].
         """
@@ -124,10 +124,10 @@ class OrientationModel:
 
 
 class Orientations:
-    """Learns the orientation of one marker. Not thread-safe.
+    """Learner of the orientation of one marker. Not thread-safe.
 
     Args:
-        chain: the nominal chain, placed; it predicts orientations before anything is solved.
+        chain: the nominal chain, placed; it predicts orientations before the first solution.
     """
 
     def __init__(self, chain: RigidChain) -> None:
@@ -151,12 +151,12 @@ class Orientations:
         return {name: memory.angle / max(memory.weight, 1.0) for name, memory in self.errors.items() if memory.weight}
 
     def learn(self, q: FloatArray, turn: FloatArray, cov: FloatArray | None, support: SupportSet | None) -> None:
-        """Learn one pair: its orientation is predicted before it is learnt.
+        """Predict the orientation of one pair, then learn it.
 
         Args:
             q: joint angles (d,) [rad].
             turn: unit quaternion x, y, z, w (4,).
-            cov: covariance of it (3, 3) [rad²], if it is known.
+            cov: covariance of the orientation (3, 3) [rad²], if it is known.
             support: support of the data; None without data.
         """
         measured = rotation_matrices("R", turn / np.linalg.norm(turn))

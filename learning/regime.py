@@ -40,23 +40,23 @@ BoolArray = NDArray[np.bool_]
 
 
 class Regime:
-    """Learns the models of one tool side by side, and chooses the one that answers.
+    """Learner of the models of one tool side by side, which chooses the one that answers.
 
     It has no lock of its own. The results of earlier regimes come as `prior`, `arm` and `claims`.
     """
 
     def __init__(
         self,
-        prior: KBMap,  # the map to learn on top of
+        prior: KBMap,  # the map on top of which to learn
         arm: KnownArm,  # prior of the arm before the first pair
-        claims: UncertaintyTracker,  # uncertainties of the models; updated here while the regime lasts
+        claims: UncertaintyTracker,  # uncertainties of the models; updated here during the regime
         settings: LearnerConfig,
         task_numbers: Iterator[int],  # numbers for the solver's tasks that no other regime has
     ) -> None:
         self.models = ModelBank(prior)
         self.memory = PairMemory(prior.joints, settings.replay_capacity)  # the pairs with this tool
         self.gate = OutlierGate(prior.joints)
-        self.orientations = Orientations(arm.chain.chain)  # models of the marker's orientation, where pairs have one
+        self.orientations = Orientations(arm.chain.chain)  # models of the marker's orientation, if pairs have one
         self.monitor = ChangeMonitor()
         self.arm = arm  # or with the last solutions if these stand for pairs that are no longer kept
         self.answering = self._answering_map = PRIOR  # the model that answers
@@ -68,7 +68,7 @@ class Regime:
         self._replays_due = 0.0
         self._solver_prior: KBMap | None = None
         self._task_numbers = task_numbers
-        self.task_number = next(task_numbers)  # of the solver's current task
+        self.task_number = next(task_numbers)  # number of the solver's current task
 
     @property
     def model(self) -> LearntModel:
@@ -76,7 +76,7 @@ class Regime:
 
     @property
     def map(self) -> KBMap:
-        """Answering model if it is a KB-Map, else the best one."""
+        """Answering model if it is a KB-Map, otherwise the best KB-Map."""
         return self.models.map(self._answering_map)
 
     @property
@@ -99,7 +99,7 @@ class Regime:
 
     @property
     def met(self) -> Sequence[Pair]:
-        """Pairs that the instant learner has learnt and that are not judged yet."""
+        """Pairs that the instant learner has learnt and that are not evaluated yet."""
         return [pair for pair, _ in self._met]
 
     def limit_m(self, pair: Pair) -> float:
@@ -109,7 +109,7 @@ class Regime:
         return float(self._limits_m(where, predicted, np.diag(pair.cov)[None])[0])
 
     def learn(self, pair: Pair) -> bool:
-        """Learn one pair, and judge it; return False if it is an outlier."""
+        """Learn one pair and evaluate it; return False if it is an outlier."""
         predicted = self.models.predict(INSTANT, pair.q)
         doubted = self._judged([pair], predicted[None])[0]
         # An outlier gets a step no longer than any other pair.
@@ -121,8 +121,8 @@ class Regime:
     def meet(self, pair: Pair) -> None:
         """Teach one pair to the instant learner alone; `judge` teaches the other models.
 
-        Whether it is an outlier is not known yet. If it seems one by the pairs before, its step is no longer than any
-        other.
+        It is not yet known if it is an outlier. If it looks like one compared with the pairs before, its step is
+        limited to that of any other pair.
         """
         predicted = self.models.predict(INSTANT, pair.q)
         if not math.isfinite(self._limit_m):
@@ -132,9 +132,9 @@ class Regime:
         self._met.append((pair, predicted))
 
     def judge(self) -> tuple[Sequence[Pair], BoolArray]:
-        """Learn the pairs met, as `learn` does; return them with True for each outlier (n,).
+        """Learn the pairs met, as `learn` does; return them with the mask of outliers (n,).
 
-        Stops at an outlier with which a change may have begun: the pairs after it are still `met`.
+        Stop at an outlier with which a change may have begun: the pairs after it are still `met`.
         """
         pairs = self.met
         doubted = self._judged(pairs, np.array([predicted for _, predicted in self._met]))
@@ -142,9 +142,9 @@ class Regime:
         return pairs[: len(doubted)], doubted
 
     def _judged(self, pairs: Sequence[Pair], instant: FloatArray) -> BoolArray:
-        """Learn pairs except with the instant learner, which predicted `instant` (n, 3) [m]; return the outliers (k,).
+        """Teach pairs to all but the instant learner, which predicted `instant` (n, 3) [m]; return the outliers (k,).
 
-        It ends, k < n, with an outlier with which a change may have begun.
+        If a change may have begun with an outlier, stop there: k < n.
         """
         q, x = np.array([pair.q for pair in pairs]), np.array([pair.x for pair in pairs])
         variances = np.array([pair.cov.diagonal() for pair in pairs])
@@ -193,10 +193,10 @@ class Regime:
     def learn_waiting(
         self, q: FloatArray, x: FloatArray, cov: FloatArray, turns: FloatArray, belief: ChainBelief
     ) -> None:
-        """Learn pairs, q (n, d) and x (n, 3), that waited for the prior: each once, in their order.
+        """Learn pairs, q (n, d) and x (n, 3), that waited for the prior: each once, in order.
 
         Args:
-            cov, turns: as `PairMemory.append` takes them.
+            cov, turns: as in `PairMemory.append`.
             belief: posterior of the chain from them.
         """
         self._claims.fitted(belief)
@@ -229,7 +229,7 @@ class Regime:
         return len(places)
 
     def set_aside(self, prior: KBMap) -> int:
-        """Drop those of the first pairs that `prior`, a robust fit to them, contradicts; return their number.
+        """Drop those of the first pairs that contradict `prior`, a robust fit to them; return their number.
 
         They may still belong to the old tool.
         """
@@ -272,7 +272,7 @@ class Regime:
             self._offer(fed)
 
     def _offer(self, known: int) -> None:
-        """Offer the answering model, of `known` pairs, as the reference of the change monitor."""
+        """Offer the answering model, learnt from `known` pairs, as the reference of the change monitor."""
         belief, wide = self._claims.belief, self._claims.wide
         if belief is None or wide is None:
             return
@@ -288,7 +288,7 @@ class Regime:
         return self.orientations.model(self._claims.support)
 
     def solve_from_what_is_known(self) -> None:
-        """Use the last solutions in place of the pairs before them, if pairs are no longer kept."""
+        """Use the last solutions instead of the pairs before them, if pairs are no longer kept."""
         if EXACT in self.models.names and not self.memory.complete:
             self._solver_prior = self.models.map(EXACT)
             self.arm = self.arm.updated(self._claims.wide, self._claims.residual)

@@ -30,14 +30,14 @@ from kbmaps import ChainBelief, ChainTolerances, DegenerateDataError, Explanatio
 class Fit:
     """Prior that was fitted to pairs."""
 
-    prior: KBMap  # the map to learn on top of
+    prior: KBMap  # the map on top of which to learn
     # the nominal chain, placed; after a tool change, the chain that gives the orientation of the hand
     chain: RigidChain
     belief: ChainBelief | None = None  # posterior of the chain; None after a tool change, where only the tool is fitted
 
 
 class Fitting:
-    """Schedules and makes the fits: at first after few pairs, then whenever they have doubled."""
+    """Scheduler of the fits: the first after few pairs, the others whenever the number of pairs has doubled."""
 
     def __init__(self, nominal: NominalModel, tolerances: ChainTolerances) -> None:
         self._nominal, self._tolerances = nominal, tolerances
@@ -46,7 +46,7 @@ class Fitting:
         self._before: KBMap | None = None
         # number of pairs at the next fit; None if nothing is to be fitted
         self.due_at = None if nominal.frame_known else nominal.pairs_to_align
-        self.is_first = True  # true if nothing has been fitted yet
+        self.is_first = True  # True if nothing has been fitted yet
 
     def due(self, pairs: int) -> bool:
         """Return True if it is time to fit."""
@@ -63,7 +63,7 @@ class Fitting:
         self._before, self.chain, self.due_at, self.is_first = before, hand, first_at, True
 
     def rest(self, hand: RigidChain) -> None:
-        """Stop fitting. `hand`: a chain that gives the orientation of the hand."""
+        """Stop fitting. `hand` is a chain that gives the orientation of the hand."""
         self._before, self.chain, self.due_at, self.is_first = None, hand, None, False
 
     def fit(self, q: FloatArray, x: FloatArray, cov: FloatArray) -> Fit | None:
@@ -104,11 +104,11 @@ EXPECTED_M = 0.1  # ordinary RMS distance between a nominal model and reality [m
 
 
 class Regimes:
-    """Begins the first regime when the frame is known, and another one with each change.
+    """Sequence of regimes: the first begins when the frame is known, and another one with each change.
 
     Args:
-        nominal: the nominal model, where learning starts.
-        settings: of the learner.
+        nominal: the nominal model, from which learning starts.
+        settings: settings of the learner.
         task_numbers: numbers for the solver's tasks that were never used.
     """
 
@@ -120,7 +120,7 @@ class Regimes:
         self.fitting = Fitting(nominal, chain_tolerances(settings))  # fits of the frame or the tool as a whole
         self.waiting = PairMemory(nominal.joints, settings.replay_capacity)  # the pairs that wait for the first regime
         self.present: Regime | None = None  # the current regime; None before the frame is known
-        self.change: ChangeRecord | None = None  # the last change; None: there was none
+        self.change: ChangeRecord | None = None  # the last change; None if there was none
         self._origin: Origin | None = None
         self._look_at = 0
 
@@ -136,7 +136,7 @@ class Regimes:
     def restored(
         cls, state: LearningState, nominal: NominalModel, settings: LearnerConfig, task_numbers: Iterator[int]
     ) -> Regimes:
-        """Return the regimes as they were when `state` was taken.
+        """Return the regimes as they were at the time of `state`.
 
         Raises:
             StateError: it belongs to another nominal model, or to other tolerances, or has impossible numbers.
@@ -187,7 +187,7 @@ class Regimes:
         return self.waiting if self.present is None else self.present.memory
 
     def state_before(self, first: int, counters: Counters, curve: Curve) -> LearningState:
-        """Return the state as if the pairs from number `first` of the current regime had not come."""
+        """Return the state without the pairs from number `first` of the current regime on."""
         state = self.state(counters, curve)
         kept = self.memory.place_of(first)
         arrays = {name: each[:kept] if name in PAIRS else each for name, each in state.arrays.items()}
@@ -198,11 +198,11 @@ class Regimes:
         return LearningState(state.header, arrays)
 
     def change_tool(self, regime: Regime) -> None:
-        """Begin the regime of another tool, of which nothing is known, after `regime`."""
+        """Begin the regime of another, unknown tool after `regime`."""
         self.present, self._origin = self._next(regime, EXPECTED_M), None
 
     def follow_change(self, regime: Regime, pair: Pair) -> bool:
-        """Begin the regime of another tool if the outliers of `regime` in a row, up to `pair`, are its first pairs."""
+        """Begin the regime of another tool if the consecutive outliers of `regime` up to `pair` are its first pairs."""
         gate = regime.gate
         if not (
             gate.changed
@@ -221,7 +221,7 @@ class Regimes:
         return True
 
     def noticed(self, regime: Regime, pair: Pair) -> DetectedChange | None:
-        """Return the change that the pairs of `regime` show, `pair` the last of them; None if they show none."""
+        """Return the change detected in the pairs of `regime`, the last of which is `pair`; None if there is none."""
         if not regime.monitor.ready:
             return None
         gate = regime.gate
@@ -263,7 +263,7 @@ class Regimes:
         return self._origin is not None and self.memory.count >= self._look_at
 
     def look_again(self) -> bool:
-        """Identify the change by all pairs since; return True if a different part of the arm is relearnt now."""
+        """Identify the change by all pairs since; return True if a different part of the arm is now relearnt."""
         if self._origin is None or self.change is None or self.present is None:
             return False
         origin, was, (q, x) = self._origin, self.change.named, self.memory.all()
@@ -302,7 +302,7 @@ class Regimes:
         return doubted
 
     def _begin_first(self, fit: Fit, belief: ChainBelief) -> int:
-        """Learn the pairs that waited for the frame, except those that the fit contradicts."""
+        """Learn the pairs that waited for the frame, except those that contradict the fit."""
         (q, x), cov, turns = self.waiting.all(), self.waiting.cov_since(0), self.waiting.turns_since(0)
         belongs = sound(np.linalg.norm(x - fit.prior.predict(q), axis=1), self.claims.noise_m)
         self.waiting.clear()
@@ -321,7 +321,7 @@ class Regimes:
         """Return True if one other position of the marker on the hand explains the consecutive outliers."""
         q, x = regime.gate.run()
         answer = regime.model.predict(q)
-        # Without the answering model's terms beyond the map: they hold for any tool.
+        # Without the answering model's terms beyond the map, which hold for any tool.
         of_map = x - (answer - regime.map.predict(q))
         moved = self._nominal.with_other_tool(regime.map, self._hand, q, of_map)
         left = np.linalg.norm(of_map - moved.predict(q), axis=1)

@@ -13,7 +13,7 @@ RUN = 20  # number of neighbours that are sampled together
 
 
 class PairMemory:
-    """Newest `capacity` pairs, in arrays. Pairs are counted from the last `clear`, kept or not: `count`."""
+    """Newest `capacity` pairs, in arrays. `count` is the number of all pairs since the last `clear`, kept or not."""
 
     def __init__(self, joints: int, capacity: int) -> None:
         self._q = np.empty((capacity, joints))
@@ -36,7 +36,7 @@ class PairMemory:
         """Keep pairs, q (n, d) and x (n, 3); drop the oldest to make room.
 
         Args:
-            cov: their covariances (n, 3, 3) [m²], NaN where a pair has none; None: none has any.
+            cov: their covariances (n, 3, 3) [m²], NaN for a pair without one; None if none has any.
             turns: their orientations, quaternions (n, 4), likewise.
         """
         places = np.arange(self.count, self.count + len(q)) % len(self._q)
@@ -64,11 +64,11 @@ class PairMemory:
         return self._q[places], self._x[places], max(count, self._oldest) + len(places)
 
     def cov_since(self, count: int, limit: int | None = None) -> FloatArray:
-        """Return covariances (n, 3, 3) [m²] of the pairs of `since`: NaN where a pair has none."""
+        """Return covariances (n, 3, 3) [m²] of the pairs of `since`: NaN for a pair without one."""
         return self._cov[self._places_since(count, limit)]
 
     def turns_since(self, count: int, limit: int | None = None) -> FloatArray:
-        """Return orientations (n, 4) of the pairs of `since`: quaternions x, y, z, w, NaN where a pair has none."""
+        """Return orientations (n, 4) of the pairs of `since`: quaternions x, y, z, w, NaN for a pair without one."""
         return self._turns[self._places_since(count, limit)]
 
     def _places_since(self, count: int, limit: int | None) -> IntArray:
@@ -81,9 +81,9 @@ class PairMemory:
         return q, x
 
     def some(self, end: int, limit: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return at most `limit` of the kept pairs before the one numbered `end`, in order, as `append` takes them.
+        """Return at most `limit` of the kept pairs before the one numbered `end`, in order, as in `append`.
 
-        They come in evenly spread runs of `RUN` neighbours, which show the errors that neighbours on a path share.
+        They are evenly spread runs of `RUN` neighbours, which show the errors that neighbours on a path share.
         """
         kept = max(end - self._oldest, 0)
         begins = np.linspace(self._oldest, end - RUN, max(limit // RUN, 1)).astype(np.intp)
@@ -105,7 +105,7 @@ class PairMemory:
 
 
 class Permutations:
-    """Places to replay: in each epoch every place once, in a random order determined by seed and epoch."""
+    """Order of replay: in each epoch every place once, in a random order determined by seed and epoch."""
 
     def __init__(self, seed: int) -> None:
         self._seed = seed

@@ -22,7 +22,7 @@ IN_SUPPORT = 0.25  # with a larger share of the prior's variance remaining, join
 
 
 class NoFrameError(RequestError):
-    """There is no model yet: the frame of the positions is not known."""
+    """There is no model yet: the frame of the positions is unknown."""
 
 
 @dataclass(frozen=True)
@@ -49,14 +49,14 @@ class Snapshot:
     support: SupportSet | None  # support of the data with the current tool; None without data
     pairs: int  # number of pairs it had learnt
     newest_utc: str | None  # storage time of the last of them, ISO 8601; None before any since the learner started
-    waiting_for: str  # what is missing while there is no model
+    waiting_for: str  # missing information while there is no model
     orientation: OrientationModel | None = None  # the model of the marker's orientation; None if none was learnt
     # variance (n, 3) [m²] at positions (n, 3) [m] of errors that all pairs share, so that no pair shows them
     common: Callable[[FloatArray], FloatArray] | None = None
 
     @cached_property
     def digest(self) -> str:
-        """Hash of the model, empty while there is none."""
+        """Hash of the model; empty without one."""
         return self.model.digest if self.model is not None else ""
 
     def require_model(self) -> LearntModel:
@@ -90,11 +90,11 @@ class Snapshot:
         return Prediction(x, sigma, in_support, quaternions(rotations), np.sqrt(variance))
 
     def expected_error_m(self, q: FloatArray) -> float:
-        """Return the expected mean distance [m] to what the cameras see without noise, at q (n, d) [rad]."""
+        """Return the expected mean distance [m] to noise-free camera measurements, at q (n, d) [rad]."""
         return MEAN_OVER_RMS * float(np.sqrt(self.claim.variance(q).sum(axis=1)).mean())
 
     def common_error_m(self, q: FloatArray) -> float | None:
-        """Return the expected mean error [m] that all pairs share, at q (n, d) [rad]; None if not known."""
+        """Return the expected mean error [m] that all pairs share, at q (n, d) [rad]; None if unknown."""
         if self.common is None:
             return None
         return MEAN_OVER_RMS * float(np.sqrt(self.common(self.require_model().predict(q)).sum(axis=1)).mean())

@@ -57,7 +57,7 @@ class LearningHeader(msgspec.Struct, kw_only=True):
     answering: str = PRIOR  # the model that answers
     doubted_in_a_row: int = 0  # number of consecutive outliers up to now
     replays_due: float = 0.0  # replay steps that are still due
-    # where replay is: epochs begun, number of pairs of the current epoch, and number of these that were replayed
+    # position of the replay: epochs begun, number of pairs of the current epoch, and number of these that were replayed
     replay_position: tuple[int, int, int] = (0, 0, 0)
     # prior of the chain before the first of these pairs, as bytes; None before the alignment
     belief: bytes | None = None
@@ -96,7 +96,7 @@ class LearningState:
         return LearningState(header, {**self.arrays, **{BEFORE + name: each for name, each in before.arrays.items()}})
 
     def poisoned(self) -> str | None:
-        """Return the name of a net, or of an array of pairs, with impossible values; None if all is well."""
+        """Return the name of a net, or of an array of pairs, with impossible values; None if all are valid."""
         nets = dict.fromkeys((name for name in self.arrays if name.startswith(NET)), np.inf)
         limits = {**nets, "q": LARGEST_Q, "x": FARTHEST_M}
         for name, limit in limits.items():

@@ -23,7 +23,7 @@ class LearntFigure(msgspec.Struct, frozen=True):
 
 
 class JointZero(msgspec.Struct, frozen=True):
-    """Offset of a joint [rad, of a prismatic joint m]."""
+    """Offset of a joint [rad; m for a prismatic joint]."""
 
     value: float  # to be added to the reading
     half_width: float  # of its 95 % interval
@@ -46,7 +46,7 @@ class ChainCalibration(msgspec.Struct, frozen=True, kw_only=True):
     points_m: float | None
     noise_m: float  # 1-sigma of a measured coordinate [m]
     outliers: int  # among the last 500 pairs: too far from the chain for this noise
-    hand_eye: HandEye | None = None  # the camera's pose as ROS takes it; null from a learner of an earlier version
+    hand_eye: HandEye | None = None  # the camera's pose for ROS; null from a learner of an earlier version
     marker_covariance: list[float] | None = None  # of the marker in its link, 3 × 3 row by row [m²]; null likewise
 
 
@@ -117,7 +117,7 @@ class ChangeRecord(msgspec.Struct, frozen=True, kw_only=True):
     def alike(self, kind: KindOfChange) -> str | None:
         """Return the kind that no motion can separate from this one.
 
-        An offset of the last joint equals a displacement of the marker; one of the first joint equals a turn of the
+        An offset of the last joint equals a displacement of the marker; one of the first joint equals a rotation of the
         camera.
         """
         joints = [each.joint for each in self.kinds if each.joint is not None]
@@ -131,7 +131,7 @@ class ChangeRecord(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def unnamed(cls, first_seq: int, noticed_seq: int, joints: int) -> ChangeRecord:
-        """Return the record of a change detected when the arm was too poorly known to identify its kind."""
+        """Return the record of a change detected before the arm was known well enough to identify its kind."""
         kinds = [KindOfChange(name, None, 1.0 / 3.0) for name in (TOOL, CAMERA)]
         kinds += [KindOfChange(JOINT, joint, 1.0 / (3.0 * joints)) for joint in range(joints)]
         return cls._begun(first_seq, noticed_seq, True, kinds)

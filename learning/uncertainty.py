@@ -42,12 +42,12 @@ class ErrorMemory(msgspec.Struct):
     ratio: float = 0.0  # sum of their squares over the predicted ones
 
     def add(self, errors: FloatArray, variances: FloatArray, ratios: FloatArray | float = 1.0) -> None:
-        """Add errors, in their order.
+        """Add errors, in order.
 
         Args:
-            errors: prediction against measurement (n, 3) [m].
-            variances: the measurements', per axis (n, 3), or (3,) of all [m²].
-            ratios: the errors' squares over the predicted squares of prediction and measurement (n,), or of all.
+            errors: prediction minus measurement (n, 3) [m].
+            variances: variances of the measurements per axis, (n, 3), or (3,) for all [m²].
+            ratios: squared errors divided by the predicted squares of prediction and measurement (n,), or one for all.
         """
         count = len(errors)
         kept, faded = self.discount**count, self.discount ** np.arange(count - 1.0, -1.0, -1.0)
@@ -128,7 +128,7 @@ class UncertaintyState(msgspec.Struct, kw_only=True):
 
 
 class UncertaintyTracker:
-    """Tracks the errors and the data support of all models since the prior was made.
+    """Tracker of the errors and the data support of all models since the prior was made.
 
     Args:
         bases: bases of the learnt maps.
@@ -136,7 +136,7 @@ class UncertaintyTracker:
 
     Attributes:
         belief: posterior of the chain from the pairs with the current tool; None before a solution was requested.
-        wide: posterior without the selection of narrower tolerances: the one to update with pairs of another tool.
+        wide: posterior without the selection of narrower tolerances, to be updated with pairs of another tool.
         residual: posterior of the arm as a chain with residual, with the current tool; None before its first solution.
     """
 
@@ -161,15 +161,15 @@ class UncertaintyTracker:
         self.residual: ResidualModel | None = None
 
     def best(self, present: str) -> str:
-        """Return the model that shall answer; `present` while there is nothing to compare."""
+        """Return the best model; `present` if there is nothing to compare."""
         return self._contest.best(self._trusted, present)
 
     def best_map(self, present: str) -> str:
-        """Return the best of the models that are KB-Maps; `present` while there is nothing to compare."""
+        """Return the best of the models that are KB-Maps; `present` if there is nothing to compare."""
         return self._contest.best([name for name in self._trusted if name != RESIDUAL], present)
 
     def recent(self, answering: str) -> Recent:
-        """Return the models' errors on the last pairs, each as old as the newest solution."""
+        """Return the models' errors on the last pairs, each of the age of the newest solution."""
         return self._contest.recent(answering)
 
     @property
@@ -212,13 +212,13 @@ class UncertaintyTracker:
         variances: FloatArray,
         delayed: FloatArray | None = None,
     ) -> None:
-        """Record pairs, in their order, each of which was predicted before it was learnt.
+        """Record pairs, in order, each of which was predicted before it was learnt.
 
         Args:
             where: their q (n, d) [rad].
             x: measured positions (n, 3) [m].
-            predictions: of it (n, 3) [m] by model.
-            variances: the measurements' (n, 3) [m²].
+            predictions: predictions of x (n, 3) [m] by model.
+            variances: variances of the measurements (n, 3) [m²].
             delayed: predictions of the instant learner as old as the solutions (n, 3) [m]. On a path, a few pairs make
                 a difference, so the models are compared at the same age.
         """
@@ -255,11 +255,11 @@ class UncertaintyTracker:
 
         Args:
             name: the model.
-            errors: its errors (n, 3) [m] at pairs that it knows, in their order.
-            belief: new posterior of the arm; None: unchanged.
-            wide: of a chain, the same without the selection of narrower tolerances.
+            errors: its errors (n, 3) [m] at pairs that it has learnt, in order.
+            belief: new posterior of the arm; None if unchanged.
+            wide: for a chain, its posterior without the selection of narrower tolerances.
             neighbours: True if these pairs follow a path.
-            variances: of these measurements (n, 3) [m²], NaN where unknown; None: as usual.
+            variances: variances of these measurements (n, 3) [m²], NaN if unknown; None for the usual ones.
         """
         self.errors.setdefault(name, ErrorMemory(self._expected_m))
         self._solved[name] = self._asked
@@ -281,10 +281,10 @@ class UncertaintyTracker:
         Args:
             name: the model.
             predict: its positions (n, 3) [m] at q (n, d) [rad].
-            q: configurations (n, d) [rad], in their order.
+            q: configurations (n, d) [rad], in order.
             errors: measured minus predicted (n, 3) [m].
-            instant: the same of the instant learner as it was when the solution was requested. NaN where it had already
-                learnt the pair, which would be an unfair advantage.
+            instant: the same errors of the instant learner at the time of the request. NaN if it had already learnt the
+                pair, which would be an unfair advantage.
             anew: True if it knows so much more than the last solution that the latter's errors no longer apply.
         """
         if anew:
@@ -297,7 +297,7 @@ class UncertaintyTracker:
         self.errors[name].add(errors, noise, np.square(errors).sum(axis=1) / claimed.sum(axis=1))
 
     def forget_contest(self) -> None:
-        """Drop the comparison, because some pairs turned out not to belong to this tool."""
+        """Drop the comparison, because some pairs do not belong to this tool."""
         self._contest = PrequentialComparison()
 
     def prior_changed(self, errors: FloatArray) -> None:
@@ -325,7 +325,7 @@ class UncertaintyTracker:
                 self._misfits.get(name, none), (ChainTerm(chain), self._rest(name)), memory.surprise
             )
         if name == PRIOR:
-            # The prior is a chain too, or was learnt with the last tool; it has the discrepancy of such a chain.
+            # The prior is a chain too, or was learnt with the last tool, so it has such a chain's discrepancy.
             inside = self._misfits.get(RIGID, self._misfits_before.get(RIGID, none))
             departure = DepartureTerm(predict, belief)
         else:
@@ -334,7 +334,7 @@ class UncertaintyTracker:
         return PredictiveUncertainty(inside, (ChainTerm(belief), departure, self._rest(RIGID)), memory.surprise)
 
     def _rest(self, name: str) -> VarianceTerm:
-        """Return the layer for the arm's deviation from the chain away from data: as large as seen at the data."""
+        """Return the term for the arm's deviation from the chain away from data: as large as at the data."""
         missed = self._misfits.get(RESIDUAL if name == RESIDUAL else RIGID, np.zeros(3))
         return VarianceTerm(self._solved.get(name), float(np.sqrt(np.square(missed).mean())))
 
@@ -384,13 +384,13 @@ def model_discrepancy(
 ) -> FloatArray:
     """Return the model discrepancy, 1-sigma per axis (3,) [m], without the measurements' noise; 0 if due to chance.
 
-    On a path, neighbours have the same discrepancy and, mostly, noise of their own: the shared part is the discrepancy,
-    whatever noise the measurements claim. For poses far apart, only the claimed noise is available. There the errors
-    are too small, because the solution was fitted to these pairs.
+    On a path, neighbours have the same discrepancy and mostly independent noise: the shared part is the discrepancy,
+    independent of the claimed noise. For distant poses, only the claimed noise is available. There the errors are too
+    small, because the solution was fitted to these pairs.
 
     Args:
         errors: measured minus solved (n, 3) [m], in the pairs' order.
-        noise_variance: of the measurements (n, 3), or (3,) of all [m²].
+        noise_variance: variance of the measurements, (n, 3), or (3,) for all [m²].
         before: discrepancy of the same arm with another tool (3,) [m].
         neighbours: True if the pairs follow a path.
         scatter: 1-sigma of a coordinate around the solution [m], corrected for its degrees of freedom; 0 if unknown.

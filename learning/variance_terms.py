@@ -1,4 +1,4 @@
-"""Variance that the data leave in predictions."""
+"""Variance of predictions that remains after the data."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class QueryPoints:
         self._chains: dict[int, tuple[ChainBelief | ResidualModel, tuple[FloatArray, FloatArray]]] = {}
 
     def at(self, rows: IntArray) -> QueryPoints:
-        """Return the rows' configurations, with the results computed there."""
+        """Return the configurations of some rows, with the results computed there."""
         part = QueryPoints(self.q[rows])
         part._left_open = {k: (of, left[rows]) for k, (of, left) in self._left_open.items()}
         part._chains = {k: (of, (x[rows], variance[rows])) for k, (of, (x, variance)) in self._chains.items()}
@@ -54,7 +54,7 @@ class VarianceTerm:
     sigma: float  # 1-sigma of a coordinate far from all data [m]
 
     def variance(self, where: QueryPoints) -> FloatArray:
-        """Return the variance of a coordinate there, shape (n, 1) [m²]."""
+        """Return the variance of a coordinate at these points, shape (n, 1) [m²]."""
         return where.unexplained(self.support)[:, None] * self.sigma**2
 
 
@@ -65,7 +65,7 @@ class ChainTerm:
     belief: ChainBelief | ResidualModel
 
     def variance(self, where: QueryPoints) -> FloatArray:
-        """Return the variance of each coordinate there, shape (n, 3) [m²]."""
+        """Return the variance of each coordinate at these points, shape (n, 3) [m²]."""
         return where.chain(self.belief)[1]
 
 
@@ -78,18 +78,18 @@ class DepartureTerm:
     support: SupportSet | None = None  # support of the model's own data; None without data
 
     def variance(self, where: QueryPoints) -> FloatArray:
-        """Return the squared difference of each coordinate there, shape (n, 3) [m²]."""
+        """Return the squared difference of each coordinate at these points, shape (n, 3) [m²]."""
         departure = self.predict(where.q) - where.chain(self.belief)[0]
         return where.unexplained(self.support)[:, None] * np.square(departure)
 
 
 def unexplained(support: SupportSet | None, q: FloatArray) -> FloatArray:
-    """Return the share of the prior's variance that remains at q (n, d) [rad], shape (n,), 0 to 1."""
+    """Return the fraction of the prior's variance that remains at q (n, d) [rad], shape (n,), 0 to 1."""
     return np.ones(len(q)) if support is None else np.asarray(support.unexplained(q))
 
 
 class GrowingSupport:
-    """Support of the data. Queries read it while it grows, so they get a copy, made ever more rarely.
+    """Support of the data. Queries read it while it grows, so they get a copy, renewed at growing intervals.
 
     Args:
         bases: bases of the learnt maps.
@@ -97,7 +97,7 @@ class GrowingSupport:
 
     def __init__(self, bases: Sequence[JointBasis]) -> None:
         self._growing = SupportSet(bases)
-        self.view: SupportSet | None = None  # copy that later pairs do not change; None before any
+        self.view: SupportSet | None = None  # copy that later pairs do not change; None before the first
 
     @property
     def configurations(self) -> FloatArray:

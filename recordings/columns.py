@@ -88,7 +88,7 @@ def extra_columns(joints: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def check_joints(joints: tuple[str, ...]) -> None:
-    """Raise Fault when a joint's name cannot be the name of a column."""
+    """Raise Fault if a joint's name cannot be the name of a column."""
     for joint in joints:
         if "," in joint or joint != joint.strip() or not joint.isprintable():
             raise Fault(f"a joint called {joint!r} cannot name a column", remedy="Rename the joint")

@@ -28,7 +28,7 @@ def read_csv_table(file: Path, joints: tuple[str, ...]) -> Table:
     """Return the numbers in `file`, all finite, under a checked header.
 
     Raises:
-        Fault: something is wrong with the text; rows count from 0 below the header.
+        Fault: the text is invalid; rows count from 0 below the header.
         OSError: the file cannot be read.
     """
     blocks: list[FloatArray] = []
@@ -138,7 +138,7 @@ def _check_header_line(names: tuple[str, ...], joints: tuple[str, ...]) -> None:
 
 
 def _numbers(lines: list[str], names: tuple[str, ...], whole: bool) -> FloatArray:
-    """Parse all rows at once. Only when that fails, look at the fields one by one."""
+    """Parse all rows at once. If that fails, examine the fields one by one."""
     strict = all(line.isascii() and "_" not in line for line in lines)  # float() accepts "1_0" and non-ASCII digits
     if strict and all(_width(line) == len(names) for line in lines):
         fields = chain.from_iterable(line.split(",") for line in lines)

@@ -33,7 +33,7 @@ _WRITERS: dict[str, Callable[[Recording, Path, Sequence[Devices], Scene | None],
 
 
 def from_pairs(pairs: Sequence[Pair], joints: tuple[str, ...], file: Path | None = None) -> Recording:
-    """Return the recording of `pairs`, at least one; with pixel centres and orientations where every pair has them.
+    """Return the recording of one or more `pairs`, with pixel centres and orientations if every pair has them.
 
     Args:
         file: their origin, for messages.
@@ -83,7 +83,7 @@ def stored_pairs(file: Path) -> StoredPairs:
 
 
 def devices_of(store: Path) -> list[Devices]:
-    """Return the encoders that the joints of a store's pairs were read with. StoreError if it cannot be read."""
+    """Return the encoders that a store's joints were read with; raise StoreError if it cannot be read."""
     with PairReader(store) as reader:
         return reader.devices()
 
@@ -104,7 +104,7 @@ def opened(source: Path, joints: tuple[str, ...] | None = None) -> Recording:
 
 
 def of_robot(recording: Recording, joints: tuple[str, ...], file: Path) -> Recording:
-    """Return the recording. RecordingError if its joints are not these in this order."""
+    """Return the recording; raise RecordingError if its joints are not these in this order."""
     if recording.joints != joints:
         raise RecordingError(
             f"the pairs are of other joints: {', '.join(recording.joints)}",
@@ -115,7 +115,7 @@ def of_robot(recording: Recording, joints: tuple[str, ...], file: Path) -> Recor
 
 
 def between(recording: Recording, first: int, last: int | None, file: Path) -> Recording:
-    """Return the rows `first` to `last`, counted from 1. RecordingError if there are none."""
+    """Return the rows `first` to `last`, counted from 1; raise RecordingError if there are none."""
     numbers = np.arange(1, len(recording) + 1)
     chosen = (numbers >= first) & (numbers <= (last or len(recording)))
     if not chosen.any():
@@ -139,7 +139,7 @@ def write(recording: Recording, out: Path, devices: Sequence[Devices] = (), scen
     """Write `recording` in the format of the ending of `out`. The file appears once it is complete.
 
     Args:
-        devices: what the joints were read with; only MCAP stores it.
+        devices: the encoders of the joints; only MCAP stores them.
         scene: the robot and its cameras; only Rerun's files show it.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The joints of a LeRobotDataset (Parquet, layouts 2.1 and 3.0), and where its videos are.
+"""The joints of a LeRobotDataset (Parquet, layouts 2.1 and 3.0), and the location of its videos.
 
 Needs the extra `export`. Times are those of the dataset, which start at 0 in each episode.
 """
@@ -98,7 +98,7 @@ def read_lerobot_dataset(source: Path, units: LeRobotUnits, marker: MarkerTrack)
 
 
 def video_parts(source: Path, camera: str) -> list[VideoPart]:
-    """Return where each episode is in the videos of `camera`, such as `observation.images.front`.
+    """Return the location of each episode in the videos of `camera`, such as `observation.images.front`.
 
     Raises:
         RecordingError: the dataset has no such camera, or cannot be read.
@@ -164,7 +164,7 @@ def _info(source: Path) -> _Info:
 
 
 def _motor_names(info: _Info, source: Path) -> list[str]:
-    """Return the motors in the order of the state, without `.pos` behind them."""
+    """Return the motors in the order of the state, without the suffix `.pos`."""
     feature = info.features.get(STATE)
     names: Any = None if feature is None else feature.names
     if isinstance(names, Mapping):

@@ -3,10 +3,10 @@
 | topic | schema | content |
 | --- | --- | --- |
 | /pair | bodyschema.Row | every column of the row under its own name, exactly |
-| /marker | foxglove.PoseInFrame | the marker, for the 3-D panel; unrotated where no orientation was recorded |
+| /marker | foxglove.PoseInFrame | the marker, for the 3-D panel; unrotated if no orientation was recorded |
 
-Metadata `bodyschema` has the joints and the number of rows; `devices/1`, `devices/500` … of each joint what it was read
-with from that pair on: servo, firmware, homing offset and so on, as JSON.
+Metadata `bodyschema` has the joints and the number of rows. Metadata `devices/1`, `devices/500` … describe as JSON the
+device of each joint from that pair on: servo, firmware, homing offset and so on.
 """
 
 from __future__ import annotations
@@ -48,10 +48,10 @@ _POSE_IN_FRAME = {
 
 
 def write_mcap(recording: Recording, file: Path, devices: Sequence[Devices] = ()) -> None:
-    """Write `recording` to `file`; message times are `Recording.play_times`, moved to begin at 0 if negative.
+    """Write `recording` to `file`; message times are `Recording.play_times`, shifted to begin at 0 if negative.
 
     Args:
-        devices: what its joints were read with; it becomes metadata.
+        devices: the encoders of its joints, for the metadata.
 
     Raises:
         RecordingError: the extra `export` is not installed, or a time does not fit nanoseconds.

@@ -25,7 +25,7 @@ def read_parquet_table(file: Path, joints: tuple[str, ...]) -> Table:
 
     Raises:
         RecordingError: the extra `export` is not installed.
-        Fault: something is wrong with the file.
+        Fault: the content of the file is invalid.
         OSError: the file cannot be read.
     """
     arrow, _ = arrow_modules(file, "Parquet, unlike CSV,")
@@ -54,7 +54,7 @@ def parquet_columns(file: Path) -> tuple[str, ...]:
 
 
 def _read(arrow: Any, parquet: Any) -> Any:
-    """Read all columns. Raise Fault when there are too many numbers, even if the metadata claims fewer.
+    """Read all columns; raise Fault if there are too many numbers, even if the metadata claims fewer.
 
     A file of some kilobytes can hold billions of equal numbers.
     """
@@ -75,7 +75,7 @@ def _check_rows(rows: int, most: int) -> None:
 
 @contextmanager
 def _opened(file: Path) -> Iterator[Any]:
-    """Open the Parquet file. Raise Fault where the content read inside the with block is damaged."""
+    """Open the Parquet file; raise Fault if the content read inside the with block is damaged."""
     arrow, parquet = arrow_modules(file, "Parquet, unlike CSV,")
     with bounded_memory(FileLimits.memory_bytes), opened(file, MOST_BYTES) as stream:
         try:
@@ -111,12 +111,12 @@ def _column(name: str, column: Any) -> np.ndarray:
 
 
 def arrow_modules(file: Path, what: str) -> tuple[Any, Any]:
-    """Return pyarrow and pyarrow.parquet, which `what` needs. RecordingError if they are not installed."""
+    """Return pyarrow and pyarrow.parquet, which `what` needs; raise RecordingError if they are not installed."""
     return imported("pyarrow", "export", what, file), imported("pyarrow.parquet", "export", what, file)
 
 
 def imported(module: str, extra: str, what: str, file: Path) -> Any:
-    """Return a module of an optional package, which `what` needs. RecordingError if it is not installed."""
+    """Return a module of an optional package, which `what` needs; raise RecordingError if it is not installed."""
     try:
         return importlib.import_module(module)
     except ImportError as error:

@@ -49,7 +49,7 @@ class Recording:
     """Many pairs, in the order in which they were measured.
 
     Raises:
-        RecordingError: a value cannot be; the message names row (of a CSV file: line) and column.
+        RecordingError: a value is impossible; the message names row (of a CSV file: line) and column.
         ValueError: the arrays' shapes do not fit each other.
     """
 
@@ -91,8 +91,8 @@ class Recording:
     def play_times(self) -> FloatArray:
         """Strictly increasing times to play the rows at [s], shape (n,).
 
-        The recording's own; where it has none a thirtieth of a second apart; where its clock was reset between
-        segments, moved on.
+        They are the recording's own times, shifted where its clock was reset between segments. Without times the rows
+        are a thirtieth of a second apart.
         """
         if self.t is None:
             return frozen_array(np.arange(len(self)) * RecordingSettings.row_interval_s)
@@ -144,7 +144,7 @@ class Recording:
         )
 
     def to_table(self) -> Table:
-        """All columns; covariances always as their upper triangle, so that they come back exactly."""
+        """All columns; covariances always as their upper triangle, so that they are restored exactly."""
         blocks: list[tuple[tuple[str, ...], FloatArray]] = []
         if self.t is not None:
             blocks.append((("t",), self.t[:, None]))
@@ -162,7 +162,7 @@ class Recording:
         return Table(names, np.hstack([values for _, values in blocks]))
 
     def write_csv(self, file: Path) -> None:
-        """Write CSV; reading it gives every number back exactly.
+        """Write CSV; reading it restores every number exactly.
 
         Raises:
             RecordingError: the file cannot be written.
@@ -178,7 +178,7 @@ class Recording:
         write_csv_rows(out, table.values.tolist(), integers)
 
     def write_parquet(self, file: Path) -> None:
-        """Write Parquet; reading it gives every number back exactly.
+        """Write Parquet; reading it restores every number exactly.
 
         Raises:
             RecordingError: the file cannot be written, or the extra `export` is not installed.
@@ -250,10 +250,10 @@ def joints_in(file: Path) -> tuple[str, ...]:
 
 @contextmanager
 def _explained(file: Path) -> Iterator[None]:
-    """Convert errors of reading `file` to RecordingError, after a look at its ending."""
+    """Convert errors of reading `file` to RecordingError, after a check of its ending."""
     try:
         if file.suffix.lower() not in (CSV, PARQUET):
-            file.stat()  # a wrong path is the likelier mistake
+            file.stat()  # a wrong path is more likely than a damaged file
             raise RecordingError(f"recordings end in {CSV} or {PARQUET}", file=file, remedy="Rename or convert it")
         yield
     except Fault as fault:

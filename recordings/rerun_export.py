@@ -3,13 +3,13 @@
 | entity | archetype | content |
 | --- | --- | --- |
 | /robot/<link> | Transform3D, LineStrips3D | the link at the row's readings, in the root link's frame |
-| /robot/<link>/mesh_<number> | Asset3D, Transform3D | the meshes of the link that are there |
+| /robot/<link>/mesh_<number> | Asset3D, Transform3D | the meshes of the link that were found |
 | /measurement_frame | ViewCoordinates, Transform3D | x right, y down, z forward; its pose on the robot |
 | /measurement_frame/left, right | Pinhole | the cameras of robot.toml |
-| /measurement_frame/marker | Points3D | the marker of the row, and with an orientation its Transform3D |
-| /measurement_frame/predicted | Points3D | the marker that the robot's description predicts |
+| /measurement_frame/marker | Points3D | the marker of the row, and its Transform3D if it has an orientation |
+| /measurement_frame/predicted | Points3D | the marker predicted by the robot's description |
 | /measurement_frame/path | LineStrips3D | all positions, a strip for each segment; on no timeline |
-| /joints/<name> | Scalars | the joint's angle [rad], or m where it slides |
+| /joints/<name> | Scalars | the joint's angle [rad], or position [m] of a prismatic joint |
 
 Timelines: `pair`, counted from 1, and `time` [s], which is `Recording.play_times`. Without a robot there are no links,
 no cameras and no prediction.
@@ -49,7 +49,7 @@ class LinkMesh:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What stands around the markers of a recording."""
+    """The surroundings of a recording's markers."""
 
     robot: RobotDescription  # the description, with camera and marker where they are
     predicted: FloatArray  # the marker positions that it predicts in the measurement frame (n, 3) [m]
@@ -119,14 +119,14 @@ def _send_scene(rr: Any, stream: Any, recording: Recording, scene: Scene, rows: 
     for name, place in zip(("left", "right"), eyes.eyes_m, strict=False):
         lens = rr.Pinhole(
             focal_length=eyes.focal_px,
-            principal_point=np.array(eyes.principal_point_px) + 0.5,  # to Rerun integers are corners of pixels
+            principal_point=np.array(eyes.principal_point_px) + 0.5,  # in Rerun integers are corners of pixels
             resolution=eyes.image_size_px,
         )
         stream.log(f"{FRAME}/{name}", rr.Transform3D(translation=place), lens, static=True)
 
 
 def _send_poses(rr: Any, stream: Any, entity: str, poses: FloatArray, rows: list[Any]) -> None:
-    """Send poses (n, 4, 4), on no timeline where they are all the same."""
+    """Send poses (n, 4, 4); equal poses are sent once, on no timeline."""
     turns = quaternions(poses[:, :3, :3])
     if (poses == poses[0]).all():
         stream.log(entity, rr.Transform3D(translation=poses[0, :3, 3], quaternion=turns[0]), static=True)
@@ -145,7 +145,7 @@ def _lines(robot: RobotDescription) -> dict[str, list[FloatArray]]:
 
 
 def _layout(scene: Scene | None) -> Any:
-    """Return how the viewer shows the file at first: space beside the joints."""
+    """Return the viewer's initial layout: space beside the joints."""
     views = importlib.import_module("rerun.blueprint")
     space = views.Spatial3DView(origin=FRAME if scene is None else "/")
     joints = views.TimeSeriesView(origin=JOINTS)

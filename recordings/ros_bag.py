@@ -51,13 +51,13 @@ class _Settings:
 
 @dataclass(frozen=True)
 class BagTopics:
-    """Topics and names to read from a bag; None where the bag leaves no choice."""
+    """Topics and names to read from a bag; None if the bag leaves no choice."""
 
     joints: str | None = None  # topic of the joint states
     marker: str | None = None  # topic of the marker's positions
     frame: str | None = None  # the marker's frame, where it comes by TF
     names: Mapping[str, str] = field(default_factory=dict)  # the joints' names in the bag, where they differ
-    delay_s: float = 0.0  # delay of the time stamps of the marker's positions [s]
+    delay_s: float = 0.0  # delay of the timestamps of the marker's positions [s]
 
 
 def is_bag(source: Path) -> bool:
@@ -69,7 +69,7 @@ def read_bag(source: Path, joints: tuple[str, ...], topics: BagTopics, marker: M
     """Read joint states and positions of the marker, with the joints interpolated to the marker's times.
 
     Args:
-        marker: positions from elsewhere; the bag's are not read then.
+        marker: positions from elsewhere, instead of the bag's.
 
     Raises:
         RecordingError: rosbags is not installed, the bag cannot be read, or its topics are ambiguous.
@@ -235,7 +235,7 @@ def _asked(bag: _Bag, topic: str, known: Sequence[str], option: str, what: str) 
 
 
 def _joint_track(bag: _Bag, topic: str, names: Sequence[str]) -> JointTrack:
-    """Read all messages that have every joint; the places of the names are looked up once for each order of them."""
+    """Read all messages that have every joint; indices of the names are looked up once for each order of them."""
     t: list[float] = []
     q: list[list[float]] = []
     places: dict[tuple[str, ...], list[int] | None] = {}
@@ -281,7 +281,7 @@ def _marker_track(bag: _Bag, topic: str, frame: str | None) -> MarkerTrack:
     table = table[finite]
     turns = table[:, 4:]
     lengths = np.linalg.norm(turns, axis=1)
-    # A tracker of a ball fills in one turn for all: no arm keeps its hand so.
+    # A tracker of a ball sends a constant rotation; no arm keeps its hand at a constant orientation.
     turned = bool((np.abs(lengths - 1.0) < 1e-3).all() and np.ptp(turns, axis=0).max() > 0)
     return MarkerTrack(
         t=table[:, 0],
@@ -305,7 +305,7 @@ def _fixes(bag: _Bag, topic: str, frame: str | None) -> Iterator[tuple[float, st
 
 
 def _covariances(found: Sequence[Any], finite: np.ndarray) -> np.ndarray | None:
-    """Return the positions' covariances (m, 3, 3), where all messages have one that is not zero."""
+    """Return the positions' covariances (m, 3, 3) if all messages have a nonzero one."""
     if any(cov is None for cov in found):
         return None
     whole = np.array(found, dtype=np.float64).reshape(-1, 6, 6)[finite, :3, :3]
@@ -318,5 +318,5 @@ def _child(transform: Any) -> str:
 
 
 def _stamp(header: Any, received: float) -> float:
-    """Return the time of a header [s]; that of the bag where the header has none."""
+    """Return the time of a header [s], or that of the bag if the header has none."""
     return header.stamp.sec + header.stamp.nanosec / _NANO if header.stamp.sec or header.stamp.nanosec else received

@@ -1,4 +1,4 @@
-"""Joint readings and marker positions with times of their own, brought together into a recording."""
+"""Combine joint readings and marker positions with separate timestamps into a recording."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class _Settings:
 class JointTrack:
     t: FloatArray  # times (n,) [s]
     q: FloatArray  # (n, d) [rad, m]
-    # which readings belong together (n,): nothing is interpolated between two runs, whose clocks differ
+    # number of the run of each reading (n,): nothing is interpolated between two runs, whose clocks differ
     run: NDArray[np.int64]
 
 
@@ -46,15 +46,15 @@ class MarkerTrack:
     orientation: FloatArray | None = None  # unit quaternions (m, 4), x, y, z, w, or None
 
     def earlier(self, delay_s: float) -> MarkerTrack:
-        """Return the track whose times are `delay_s` earlier: the positions were stamped that late."""
+        """Return the track with all times `delay_s` earlier, to correct positions that were stamped late."""
         return replace(self, t=self.t - delay_s)
 
 
 def joined(names: tuple[str, ...], joints: JointTrack, marker: MarkerTrack, file: Path) -> Recording:
     """Return a recording with a row for each marker position that lies between two joint readings.
 
-    The joints are interpolated linearly. How sure that is, is estimated by leaving out each reading in turn; rows
-    where it is worse than `max_sigma` are left out, and counted in the log.
+    The joints are interpolated linearly. The error is estimated by leaving out each reading in turn; rows whose error
+    exceeds `max_sigma` are dropped, and counted in the log.
 
     Raises:
         RecordingError: no marker position lies between two joint readings.
@@ -92,7 +92,7 @@ def joined(names: tuple[str, ...], joints: JointTrack, marker: MarkerTrack, file
 
 
 def _ascending(t: FloatArray, chosen: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return the chosen rows in the order of time, of equal times the first."""
+    """Return the chosen rows in the order of time; of equal times only the first."""
     rows = np.flatnonzero(chosen)
     _, first = np.unique(t[rows], return_index=True)
     return rows[first]
@@ -101,7 +101,7 @@ def _ascending(t: FloatArray, chosen: NDArray[np.bool_]) -> NDArray[np.int64]:
 def _interpolated(
     t: FloatArray, q: FloatArray, at: FloatArray, rows: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
-    """Return those of `rows` that lie between two readings, the joints there, and 1-sigma of the worst joint."""
+    """Return those of `rows` that lie between two readings, the joints there, and the 1-sigma of the worst joint."""
     after = np.searchsorted(t, at[rows], side="left")
     exact = (after < len(t)) & (t[np.minimum(after, len(t) - 1)] == at[rows])
     after = np.where(exact & (after == 0), 1, after)
@@ -116,7 +116,7 @@ def _interpolated(
 
 
 def _bend(t: FloatArray, q: FloatArray) -> FloatArray:
-    """Return how far a chord between neighbouring readings is off, at each reading (n,)."""
+    """Return the error of the chord between neighbouring readings at each reading (n,)."""
     bend = np.zeros(len(t))
     if len(t) > 2:
         share = ((t[1:-1] - t[:-2]) / (t[2:] - t[:-2]))[:, None]

@@ -1,6 +1,6 @@
 """Express a learnt chain in terms of the robot's files: joint origins, camera pose, marker position.
 
-A chain is a product of transforms, of which a camera sees only the whole. How it is split into parts is a convention:
+A chain is a product of transforms, and a camera sees only the product. Its split into parts is a convention:
 
 - the camera's pose and the joint offsets are those of the learner;
 - each link moves with the axis of its own joint only, while all joints are at zero; so a mesh stays on the part that it
@@ -38,7 +38,7 @@ class CalibratedGeometry:
     def of(
         cls, robot: RobotDescription, chain: RigidChain, *, T_measured_nominal: FloatArray, zeros: FloatArray
     ) -> Self:
-        """Return the geometry of `chain`, split as the module describes.
+        """Return the geometry of `chain`, split by the convention of this module.
 
         Args:
             T_measured_nominal: camera displacement (4, 4), as in `kbmaps.ChainReport`.
@@ -47,15 +47,15 @@ class CalibratedGeometry:
         way = _Way.of(robot)
         joints = zip(chain.axes, chain.prismatic, zeros, strict=True)
         at_zero = [joint_motion(axis, bool(prismatic), value) for axis, prismatic, value in joints]
-        # Of the joints and the marker, with all joints at zero, in the nominal measurement frame.
+        # Frames of the joints and the marker, with all joints at zero, in the nominal measurement frame.
         moved = [inverse(zero) @ fixed for zero, fixed in zip(at_zero, chain.fixed[1:], strict=True)]
         frames = _frames([inverse(T_measured_nominal) @ chain.fixed[0], *moved])
         drawn = _frames(robot.chain.fixed)
         T_camera_parent = T_measured_nominal @ inverse(robot.camera.pose)
         if way.upward[0]:
             T_camera_parent = chain.fixed[0] @ inverse(way.between[0])
-        # The pose reached on the path, with all joints at zero and before the camera has moved. The link above a joint
-        # that is walked upward is the next joint's own if that leads up too; the topmost one keeps its nominal pose.
+        # The pose reached on the path, with all joints at zero and before the camera has moved. On an upward path, the
+        # link above a joint is that of the next joint if its path leads up too; the topmost keeps its nominal pose.
         reached = inverse(T_measured_nominal) @ T_camera_parent @ way.between[0]
         origins: dict[str, FloatArray] = {}
         for k, joint in enumerate(way.joints):

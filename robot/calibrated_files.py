@@ -1,7 +1,7 @@
-"""A calibrated robot on disk: a URDF and a robot.toml that take the place of the nominal ones.
+"""A calibrated robot on disk: a URDF and a robot.toml that replace the nominal ones.
 
-The URDF is the nominal file with the learnt joints' origins replaced, and two frames more: `CAMERA_LINK`, the
-measurement frame, and `MARKER_LINK`. So a program that knows nothing of robot.toml has the whole chain.
+The URDF is the nominal file with the learnt joints' origins replaced, and with two more frames: `CAMERA_LINK`, the
+measurement frame, and `MARKER_LINK`. So the URDF alone contains the whole chain, without robot.toml.
 """
 
 from __future__ import annotations
@@ -40,20 +40,20 @@ STATE_DIR = "state"
 def write_calibrated(
     robot: RobotDescription, geometry: CalibratedGeometry, folder: Path, heading: str, *, replace: bool = False
 ) -> Path:
-    """Write `robot` with another geometry as a URDF and a robot.toml into `folder`, which is made if need be.
+    """Write `robot` with another geometry as a URDF and a robot.toml into `folder`, which is created if necessary.
 
-    Meshes stay where they are; their relative names are made to lead there, names with a scheme are left. Store and
-    checkpoint will be kept in a folder of their own.
+    Meshes stay in place: their relative names are adapted, and names with a scheme are kept. Store and checkpoint will
+    be kept in a separate folder.
 
     Args:
-        heading: one line for the top of both files: where they come from.
-        replace: overwrite files that are there, but for those that the robot was read from.
+        heading: one line for the top of both files that states their origin.
+        replace: overwrite existing files, except those that the robot was read from.
 
     Returns:
         The path of the robot.toml.
 
     Raises:
-        ConfigError: one of the files is there already, or they cannot be written.
+        ConfigError: one of the files exists already, or they cannot be written.
     """
     urdf, toml = folder / robot.tree.file.name, folder / ROBOT_FILE
     texts = {
@@ -131,7 +131,7 @@ def _relative(path: str | Path, old: Path, new: Path) -> str:
 
 
 def tables_elsewhere(robot: RobotDescription, folder: Path) -> dict[str, Any]:
-    """Return the tables of a robot.toml in `folder` with the same URDF and a store of its own.
+    """Return the tables of a robot.toml in `folder` with the same URDF and its own store.
 
     Raises:
         ConfigError: the original robot.toml can no longer be read.
@@ -148,7 +148,7 @@ def tables_elsewhere(robot: RobotDescription, folder: Path) -> dict[str, Any]:
 
 
 def _tables(robot: RobotDescription, geometry: CalibratedGeometry, folder: Path) -> dict[str, Any]:
-    """Return the tables of the nominal robot.toml with the calibrated values in place of the nominal ones."""
+    """Return the tables of the nominal robot.toml with calibrated values instead of the nominal ones."""
     tables = tables_elsewhere(robot, folder)
     for added in EXTENSIONS:  # the geometry was learnt without them
         tables.pop(added, None)

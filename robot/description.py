@@ -1,4 +1,4 @@
-"""robot.toml and its URDF: which joints, which camera, which marker."""
+"""robot.toml and its URDF: joints, camera and marker."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class RobotSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class CameraSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The table [camera]: the measurement frame, and the stereo geometry where there is one."""
+    """The table [camera]: the measurement frame, and the stereo geometry if there is one."""
 
     # the link that the cameras are mounted on: the base, a head, a flange. Joints between it and the marker belong into
     # `joints`.
@@ -75,7 +75,7 @@ class CameraSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True)
 class RobotDescription:
-    """A robot as its files describe it: the nominal model."""
+    """The nominal model of a robot, from its files."""
 
     file: Path  # robot.toml
     robot: RobotSection
@@ -89,7 +89,7 @@ class RobotDescription:
 
     @classmethod
     def load(cls, file: Path) -> RobotDescription:
-        """Read robot.toml and its URDF; the tables other than [robot] and [camera] are the daemon's to check.
+        """Read robot.toml and its URDF; the daemon checks the tables other than [robot] and [camera].
 
         Raises:
             ConfigError: robot.toml cannot be read, or has an unknown, missing or wrong key (with its line).
@@ -159,7 +159,7 @@ class RobotDescription:
 
     @property
     def limits(self) -> list[tuple[float, float]]:
-        """Lower and upper limit of each joint [rad, of a prismatic joint m]."""
+        """Lower and upper limit of each joint [rad; m for a prismatic joint]."""
         return list(zip(self.lower.tolist(), self.upper.tolist(), strict=True))
 
     @property
@@ -169,7 +169,7 @@ class RobotDescription:
 
 
 def _tree(file: Path, robot: RobotSection, text: str) -> UrdfTree:
-    """Read the URDF; an error names the line of robot.toml that names the file, too."""
+    """Read the URDF; an error also names the line of robot.toml that refers to the file."""
     try:
         return UrdfTree.load(file.parent / robot.urdf)
     except RobotError as error:
@@ -192,7 +192,7 @@ def _chain(tree: UrdfTree, robot: RobotSection, camera: CameraSection) -> RigidC
 
 
 def _check_name(table: Any, text: str, file: Path) -> None:
-    """ConfigError with words in the place of a pattern."""
+    """Raise ConfigError in plain words instead of a pattern."""
     name = table.get("name") if isinstance(table, dict) else None
     if isinstance(name, str) and not re.match(NAME, name):
         raise ConfigError(
@@ -261,7 +261,7 @@ def _blamed_on(file: Path, text: str, *keys: str, naming: str | None = None) -> 
 def link_poses(robot: RobotDescription, q: FloatArray) -> dict[str, FloatArray]:
     """Return the poses (n, 4, 4) of all links in the root link's frame at readings q (n, d), parents first.
 
-    Joints that are not among the robot's stand where robot.toml holds them, else at 0.
+    Joints that are not among the robot's are at the position that robot.toml holds them at, otherwise at 0.
     """
     columns = dict(zip(robot.joints, q.T, strict=True))
     below: dict[str, list[UrdfJoint]] = {link: [] for link in robot.tree.links}

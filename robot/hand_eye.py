@@ -1,4 +1,4 @@
-"""The camera's pose as ROS takes it: in SI, as quaternion and matrix, with a covariance, as a static transform."""
+"""The camera's pose for ROS: in SI units, as quaternion and matrix, with a covariance, as a static transform."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class HandEye(msgspec.Struct, frozen=True):
 
     @classmethod
     def of(cls, parent: str, child: str, T_parent_child: FloatArray, covariance: FloatArray | None = None) -> Self:
-        """Return a pose (4, 4) with its covariance (6, 6) as ROS has them."""
+        """Return a pose (4, 4) with its covariance (6, 6) in ROS's order."""
         from kbmaps.rotations import quaternions
 
         quaternion, place = quaternions(T_parent_child[None, :3, :3])[0].tolist(), T_parent_child[:3, 3].tolist()
@@ -102,25 +102,25 @@ class MarkerPose(msgspec.Struct, frozen=True):
 
 
 def _covariances(of: FloatArray) -> FloatArray:
-    """Return covariances (n, 3, 3) as they are, or from their 1-sigma (n, 3)."""
+    """Return covariances (n, 3, 3), unchanged or from their 1-sigma (n, 3)."""
     import numpy as np
 
     return of if of.ndim == 3 else np.square(of)[:, :, None] * np.eye(3)
 
 
 def in_shell_lines(pose: HandEye) -> str:
-    """Return the command in lines that fit a terminal and can be pasted together."""
+    """Return the command split into lines that fit a terminal and can be pasted together."""
     command, *options = pose.static_transform_publisher.split(" --")
     rows = [options[:3], options[3:5], options[5:7], *([option] for option in options[7:])]
     return " \\\n".join([command, *("   " + "".join(f" --{option}" for option in row) for row in rows)])
 
 
 def pose_covariance(pose: Callable[[FloatArray], FloatArray], values: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Return the covariance (6, 6) of a pose's place [m] and turns about the parent's axes [rad].
+    """Return the covariance (6, 6) of a pose's position [m] and rotation about the parent's axes [rad].
 
     Args:
-        pose: the pose (4, 4) for values such as `values` (p,).
-        covariance: of the values, shape (p, p).
+        pose: returns the pose (4, 4) for values such as `values` (p,).
+        covariance: covariance of the values, shape (p, p).
     """
     import numpy as np
 

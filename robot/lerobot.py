@@ -1,15 +1,14 @@
 """LeRobot's conventions: motors of its arms, calibration files, and the units of its readings.
 
-LeRobot (huggingface/lerobot, `motors/motors_bus.py`, v0.3 and later) keeps one JSON file an arm. For each motor it has
-the number that is written to the servo's homing offset register, and the two ends of its range as the servo then
-reports them:
+LeRobot (huggingface/lerobot, `motors/motors_bus.py`, v0.3 and later) keeps one JSON file for each arm. It contains for
+each motor the servo's homing offset register, and the two ends of its range as the servo then reports them:
 
 - Feetech: Present_Position = encoder − homing_offset. Dynamixel: Present_Position = encoder + homing_offset.
-- degrees = (ticks − (range_min + range_max) / 2) · 360 / (ticks of a turn − 1), whatever `drive_mode` says.
-- −100…100 and 0…100 are linear between the ends of the range and clipped there. With Feetech servos `drive_mode = 1`
-  turns them round; Dynamixel servos turn themselves round.
+- degrees = (ticks − (range_min + range_max) / 2) · 360 / (ticks of a turn − 1), for any `drive_mode`.
+- −100…100 and 0…100 are linear between the ends of the range and clipped there. `drive_mode = 1` reverses them for
+  Feetech servos; Dynamixel servos reverse their own positions.
 
-So 0° is the middle of the recorded range, and its place in the arm is moved by the homing offset alone.
+So 0° is the middle of the recorded range, and only the homing offset moves its physical position.
 """
 
 from __future__ import annotations
@@ -89,7 +88,7 @@ class MotorCalibration(msgspec.Struct, frozen=True):
         return self.range_min + (1.0 - share if turned else share) * (self.range_max - self.range_min)
 
     def readings(self, ticks: FloatArray, unit: Unit, make: Make) -> FloatArray:
-        """Return what LeRobot reads in `unit` where the servos are at `ticks`: the inverse of `ticks`."""
+        """Return LeRobot's readings in `unit` at servo positions `ticks`: the inverse of `ticks`."""
         if unit == "degrees":
             return (ticks - self.middle) * 360.0 / (TURN_TICKS - 1)
         share = (np.clip(ticks, self.range_min, self.range_max) - self.range_min) / (self.range_max - self.range_min)
@@ -97,9 +96,9 @@ class MotorCalibration(msgspec.Struct, frozen=True):
         return 200.0 * share - 100.0 if unit == "range_m100_100" else 100.0 * share
 
     def moved(self, ticks: int, make: Make) -> MotorCalibration:
-        """Return the calibration with which the servo reports `ticks` more where it stands; the range stays.
+        """Return the calibration with which the servo reports `ticks` more at the same position; the range stays.
 
-        Homing offsets of whole turns more or less are the same to a servo that counts one turn.
+        Homing offsets that differ by whole turns are equivalent for a servo that counts one turn.
         """
         offset = self.homing_offset - ticks if make == "feetech" else self.homing_offset + ticks
         largest = LARGEST_OFFSET[make]
@@ -115,7 +114,7 @@ def read_calibration(file: Path, motors: Sequence[str] = ()) -> dict[str, MotorC
     """Read LeRobot's calibration of an arm, by motor.
 
     Raises:
-        ConfigError: it cannot be read, is of an older LeRobot, or a number in it cannot be.
+        ConfigError: it cannot be read, is of an older LeRobot, or contains an impossible number.
     """
     again = "Let `lerobot-calibrate` write it again"
     try:
@@ -150,7 +149,7 @@ def calibration_json(calibrations: Calibrations) -> str:
 
 
 def where_calibrations_are() -> str:
-    """Return a sentence that tells where LeRobot keeps its calibration files."""
+    """Return a sentence on where LeRobot keeps its calibration files."""
     return "LeRobot keeps them in ~/.cache/huggingface/lerobot/calibration, in robots/ and teleoperators/"
 
 
@@ -164,13 +163,13 @@ class JointServo:
     zero_ticks: float
 
     def angles(self, ticks: FloatArray) -> FloatArray:
-        """Return the joint's angles [rad] where its servo is at `ticks`."""
+        """Return the joint's angles [rad] at servo positions `ticks`."""
         return self.direction * (ticks - self.zero_ticks) * RAD_PER_TICK
 
 
 @dataclass(frozen=True, slots=True)
 class Correction:
-    """A joint offset put into a motor's calibration."""
+    """A joint offset written into a motor's calibration."""
 
     motor: str
     offset_rad: float  # to be added to the joint's readings
@@ -182,9 +181,10 @@ class Correction:
 def corrections(
     calibrations: Calibrations, servos: Sequence[JointServo], offsets_rad: Mapping[str, float]
 ) -> list[Correction]:
-    """Return what becomes of the homing offsets when `offsets_rad` are added to the joints' readings.
+    """Return the new homing offsets that add `offsets_rad` to the joints' readings.
 
-    The ends of the ranges stay, and so do LeRobot's 0° and −100…100: their places in the arm move by the offset.
+    The ends of the ranges keep their numbers, and so do LeRobot's 0° and −100…100; their physical positions move by the
+    offset.
 
     Raises:
         KeyError: a joint of `servos` with an offset is not among the motors.

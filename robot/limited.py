@@ -29,11 +29,11 @@ _KINDS = (
 
 
 class UnfitFile(OSError):
-    """A file that is not read: a device or a pipe, or larger than plausible for its kind."""
+    """A file that is refused: a device or a pipe, or larger than plausible for its kind."""
 
 
 def check_regular(file: Path) -> None:
-    """Check that `file` can be given to a library that reads it to its end.
+    """Check that a library can read `file` to its end.
 
     Raises:
         UnfitFile: it is a device, a pipe or a socket, which may have no end.
@@ -77,8 +77,8 @@ def read_at_most(file: Path, most: int = FileLimits.text_bytes) -> bytes:
 def bounded_memory(most: int) -> Iterator[None]:
     """Limit a library that unpacks a file to `most` bytes of additional memory, and to files of as many bytes.
 
-    Beyond that allocations fail in the whole process: MemoryError, or what the library makes of it. A limit that is
-    lower already stays; where the system tells no sizes, memory is not limited.
+    Beyond that, allocations fail in the whole process, with MemoryError or the library's own error. A lower existing
+    limit stays. If the system does not report sizes, memory is not limited.
     """
     limits = {resource.RLIMIT_FSIZE: most}
     try:

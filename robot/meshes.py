@@ -1,7 +1,7 @@
-"""Meshes that a URDF names: found, read from bytes that anybody may have written, scaled, and made coarser.
+"""Meshes of a URDF: found, read from untrusted bytes, scaled, and simplified.
 
-STL, OBJ and COLLADA are read as triangles. pybullet ends its process on a malformed file, so it never sees one: it gets
-what was read here.
+STL, OBJ and COLLADA are read as triangles. pybullet ends its process on a malformed file, so it only gets triangles
+that were read here.
 """
 
 from __future__ import annotations
@@ -63,11 +63,11 @@ class MeshSet:
         self._numbers: dict[tuple[str, tuple[float, ...]], int] = {}
         self._names: list[str] = []
         self.shapes: list[FloatArray] = []
-        self.missing: list[str] = []  # names of those that are not there
-        self.unusable: dict[str, str] = {}  # why others cannot be used, by name
+        self.missing: list[str] = []  # names of missing meshes
+        self.unusable: dict[str, str] = {}  # reasons why others cannot be used, by name
 
     def number_of(self, name: str, scale: tuple[float, ...]) -> int | None:
-        """Return the number of the mesh `name` with factors of x, y and z; None when it cannot be used."""
+        """Return the number of the mesh `name` with scale factors of x, y and z; None if it cannot be used."""
         key = (name, scale)
         if key not in self._numbers:
             triangles = self._triangles(name)
@@ -90,10 +90,10 @@ class MeshSet:
         return self._numbers[key]
 
     def coarser(self, numbers: list[int]) -> tuple[dict[int, FloatArray], int]:
-        """Return triangles (n, 3, 3) by number, few enough together, and how many the files have.
+        """Return triangles (n, 3, 3) by number, few enough together, and the number of triangles in the files.
 
         Args:
-            numbers: of the meshes to draw; one that is drawn twice counts twice.
+            numbers: meshes to draw; one that is drawn twice counts twice.
         """
         drawn, cell = {number: self.shapes[number] for number in numbers}, 0.0
         while sum(len(drawn[number]) for number in numbers) > self._most:
@@ -132,7 +132,7 @@ class MeshSet:
 
 
 def merged(triangles: FloatArray, cell: float) -> FloatArray:
-    """Return triangles (n, 3, 3) with all corners in one cell [m] of a grid merged into one, without those that vanish.
+    """Merge all corners of triangles (n, 3, 3) in one cell [m] of a grid, and remove the triangles that vanish.
 
     Rossignac & Borrel 1993, Multi-resolution 3D approximations for rendering complex scenes.
     """
@@ -149,7 +149,7 @@ def merged(triangles: FloatArray, cell: float) -> FloatArray:
 
 
 def _keys(points: FloatArray, cell: float) -> np.ndarray:
-    """Return the number of the cell of a grid that each of the points (n, 3) is in, shape (n,)."""
+    """Return the number of the grid cell that contains each of the points (n, 3), shape (n,)."""
     cells = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
     sizes = cells.max(axis=0) + 1
     return (cells[:, 0] * sizes[1] + cells[:, 1]) * sizes[2] + cells[:, 2]
@@ -235,7 +235,7 @@ def _obj(data: bytes) -> FloatArray:
 
 
 def _obj_index(word: bytes, count: int) -> int:
-    """Return the place of a face's corner `v`, `v/vt` or `v/vt/vn`, counted from 1, or back from the last vertex."""
+    """Return the index of a face's corner `v`, `v/vt` or `v/vt/vn`, counted from 1, or back from the last vertex."""
     number = int(word.partition(b"/")[0])
     if number == 0:
         raise ValueError("a face names the vertex 0; they count from 1")
@@ -243,7 +243,7 @@ def _obj_index(word: bytes, count: int) -> int:
 
 
 def _picked(vertices: FloatArray, corners: np.ndarray) -> FloatArray:
-    """Return the triangles whose corners (n, 3) are given as places among the vertices."""
+    """Return the triangles whose corners (n, 3) are given as indices of vertices."""
     if corners.min() < 0 or corners.max() >= len(vertices):
         raise ValueError("a face names a vertex that is not there")
     return vertices[corners]
@@ -261,9 +261,9 @@ def _collada(data: bytes) -> FloatArray:
 
 
 class _Collada:
-    """The geometry of a COLLADA document, placed as its scene says.
+    """The geometry of a COLLADA document, placed by its scene.
 
-    As ROS does it, its unit is heeded and its up axis is not.
+    Like ROS, it applies the document's unit and ignores its up axis.
     """
 
     def __init__(self, root: Any) -> None:
@@ -312,7 +312,7 @@ class _Collada:
         return np.concatenate([np.zeros((0, 3, 3)), *parts])
 
     def _once(self, read: Callable[[Any], FloatArray], element: Any) -> FloatArray:
-        """Return what `read` makes of an element; a file may name one thousands of times."""
+        """Return `read(element)`, computed once: a file may refer to an element thousands of times."""
         if element not in self._read:
             self._read[element] = read(element)
         return self._read[element]

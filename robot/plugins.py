@@ -29,10 +29,10 @@ class PluginConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     settings: dict[str, Any] = {}  # passed to it unchanged
     # the files in /dev that it opens; the service grants access to no others
     devices: tuple[Annotated[str, msgspec.Meta(pattern=r"^/dev/.+\Z")], ...] = ()
-    network: bool = False  # True if it uses the network; the service grants access only then
+    network: bool = False  # True if it uses the network, to which the service otherwise grants no access
 
     def check(self, _: Sequence[str], file: Path, text: str) -> None:
-        """Raise ConfigError when no installed package has such a driver."""
+        """Raise ConfigError if no installed package has such a driver."""
         try:
             _entry("bodyschema.drivers", self.name)
         except ConfigError as error:

@@ -32,7 +32,7 @@ def rotation_of(rpy: FloatArray) -> FloatArray:
 
 
 def pose_of(xyz: FloatArray, rpy: FloatArray) -> FloatArray:
-    """Return the pose (4, 4) at a place (3,) [m] with these angles (3,) [rad]."""
+    """Return the pose (4, 4) at a position (3,) [m] with these angles (3,) [rad]."""
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = rotation_of(rpy), xyz
     return T

@@ -23,11 +23,11 @@ class Shape:
     sizes: tuple[float, ...]  # edges of a box; radius; radius and length [m]; of a mesh the factors of x, y and z
     T_link_shape: FloatArray  # its pose (4, 4)
     rgba: tuple[float, ...] | None  # its colour; None where the URDF gives none
-    mesh: str = ""  # name of the mesh's file, as the URDF has it; empty for other kinds
+    mesh: str = ""  # name of the mesh's file in the URDF; empty for other kinds
 
 
 def link_shapes(root: Any) -> dict[str, list[Shape]]:
-    """Return the shapes of all links of a parsed URDF, without those that are malformed: none is needed."""
+    """Return the shapes of all links of a parsed URDF; malformed ones are skipped, since none is required."""
     colours = {material.get("name"): rgba for material in root.iter("material") if (rgba := rgba_of(material))}
     return {
         link.get("name"): [shape for each in link.iterfind("visual") if (shape := _shape(each, colours)) is not None]
@@ -52,14 +52,14 @@ def _shape(visual: Any, colours: dict[str, tuple[float, ...]]) -> Shape | None:
 
 
 def rgba_of(material: Any) -> tuple[float, ...] | None:
-    """Return the colour of a <material>, each part from 0 to 1; None where it has none, or a malformed one."""
+    """Return the colour of a <material>, each part from 0 to 1; None if it is missing or malformed."""
     colour = material.find("color")
     values = None if colour is None else floats(colour.get("rgba", ""), 4)
     return None if values is None else tuple(np.clip(values, 0.0, 1.0).tolist())
 
 
 def floats(text: str | None, count: int) -> tuple[float, ...] | None:
-    """Return the `count` finite numbers in a text; None if it is anything else."""
+    """Return the `count` finite numbers in a text; None if it contains anything else."""
     try:
         values = tuple(float(word) for word in (text or "").split())
     except ValueError:

@@ -22,13 +22,13 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
 
 
 def first_few(names: Sequence[str], between: str = ", ") -> str:
-    """Return the first three names, and how many more there are."""
+    """Return the first three names, and the number of the others."""
     more = f" and {len(names) - 3} more" if len(names) > 3 else ""
     return between.join(names[:3]) + more
 
 
 def with_choices(message: str, kind: Any) -> str:
-    """Return msgspec's message about an unknown value, with the known ones added."""
+    """Return msgspec's message about an unknown value, with the known values added."""
     wrong = _CHOICE.match(message)
     if wrong is None:
         return message
@@ -46,7 +46,7 @@ def key_path(path: str) -> tuple[str, ...]:
 
 
 def hint_at(kind: Any, keys: Sequence[str]) -> Any:
-    """Return the type of the value under `keys` in the struct `kind`; None when there is no such field."""
+    """Return the type of the value under `keys` in the struct `kind`; None if there is no such field."""
     for key in keys:
         struct = struct_in(kind)
         fields = {} if struct is None else {field.encode_name: field.type for field in msgspec.structs.fields(struct)}

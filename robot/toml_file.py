@@ -101,7 +101,7 @@ def line_of_endless_key(text: str) -> int | None:
 
 
 def _unusable(value: object, keys: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Yield the keys of values that no table may have, each with the reason."""
+    """Yield the keys of values that are not allowed in any table, each with the reason."""
     if isinstance(value, float) and not math.isfinite(value):
         yield keys, "not a finite number"
     elif isinstance(value, str) and "\0" in value:
@@ -146,8 +146,8 @@ def convert(tables: object, kind: type[T], *, file: Path, text: str, prefix: tup
 def line_in_entry(text: str, name: str, place: int, key: str | None = None) -> int | None:
     """Return the line (from 1) of `key` in the entry `place` (from 0) of the array of tables [[name]].
 
-    `name` may be dotted. Return the line of the entry's heading if it has no such key, and that of the array if it is
-    written in another way.
+    `name` may be dotted. If the entry has no such key, return the line of its heading; if the array is written in
+    another way, return the line of the array.
     """
     lines, wanted = text.splitlines(), _dotted(name)
     entries = ((k, _HEADER.match(line)) for k, line in enumerate(lines) if line.lstrip().startswith("[["))
@@ -164,7 +164,7 @@ def line_in_entry(text: str, name: str, place: int, key: str | None = None) -> i
 
 
 def line_of(text: str, keys: tuple[str, ...]) -> int | None:
-    """Return the line (from 1) of the longest leading part of the key path `keys`; None when no line has any."""
+    """Return the line (from 1) of the longest leading part of the key path `keys`; None if no line has any."""
     best: int | None = None
     longest = 0
     table: tuple[str, ...] = ()

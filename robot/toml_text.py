@@ -1,4 +1,4 @@
-"""Write TOML: whole files, and values in a file that people have written, whose other text stays as it is."""
+"""Write TOML: whole files, and values in a hand-written file, whose other text stays unchanged."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ def toml_value(value: object) -> str:
 
 
 def with_values(file: Path, table: str, values: Mapping[str, Any]) -> str:
-    """Return the text of a TOML file with values in a table, which has to be there; in the first of several.
+    """Return the text of a TOML file with values set in an existing table (the first one, if there are several).
 
-    Each line keeps its end, a new one takes that of the line before; a byte order mark stays.
+    Each line keeps its line ending, and a new one takes that of the line before; a byte order mark stays.
 
     Raises:
         ConfigError: the file cannot be read, has no such table, or is written in a way that cannot be edited.
@@ -61,9 +61,9 @@ def with_values(file: Path, table: str, values: Mapping[str, Any]) -> str:
 
 
 def _with_line_ends(edited: str, text: str) -> str:
-    """Return an edited text, whose lines end in LF, with the line ends of the text that it was made from."""
+    """Return an edited text, whose lines end in LF, with the line endings of the original text."""
     ends = ["\r" * line.endswith("\r") for line in text.split("\n")]
-    ends[-1] = ends[max(len(ends) - 2, 0)]  # the last line has none: what follows it takes that of the line before
+    ends[-1] = ends[max(len(ends) - 2, 0)]  # the last line has no ending: lines after it take that of the line before
     old, new = text.replace("\r\n", "\n").split("\n"), edited.split("\n")
     for _, first, last, begin, end in difflib.SequenceMatcher(None, old, new).get_opcodes():
         for k in range(begin, min(end, len(new) - 1)):

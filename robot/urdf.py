@@ -97,7 +97,7 @@ class UrdfTree:
         return self.joints[name]
 
     def require_link(self, name: str) -> None:
-        """Raise RobotError with a suggestion when there is no link called `name`."""
+        """Raise RobotError with a suggestion if there is no link called `name`."""
         if name not in self.links:
             raise RobotError(f"there is no link {name!r} in {self.file.name}", remedy=did_you_mean(name, self.links))
 
@@ -164,15 +164,15 @@ def chain_between(
 
     Args:
         joints: names in the order of q; each has to lie between the two links.
-        held_at: positions [rad or m] of the other joints on the path; 0 where not named.
+        held_at: positions [rad or m] of the other joints on the path; 0 if not named.
         T_start_camera: pose of the measurement frame in `start`, shape (4, 4).
-        marker_xyz: the marker in `end` [m], shape (3,).
+        marker_xyz: position of the marker in `end` [m], shape (3,).
 
     Returns:
         A chain whose joints are `joints`, in this order, which is also their order along the path.
 
     Raises:
-        RobotError: a joint does not lie between the links, or the order along the path is another one.
+        RobotError: a joint does not lie between the links, or their order along the path differs.
     """
     way = tree.path(start, end)
     mimicking = next((joint for joint, _ in way if joint.mimics), None)
@@ -308,11 +308,11 @@ def _limits(joint: Any, kind: str, file: Path) -> tuple[float, float]:
 
 
 def _origin(element: Any, file: Path) -> FloatArray:
-    """Return the pose (4, 4) of the <origin> in `element`, the identity where there is none."""
+    """Return the pose (4, 4) of the <origin> in `element`; the identity if there is none."""
     origin = element.find("origin")
     T = np.eye(4)
     rpy = _numbers(origin, "rpy", (0.0, 0.0, 0.0), file)
-    if np.abs(rpy).max() > LARGEST_Q:  # nothing is left of its part of a turn
+    if np.abs(rpy).max() > LARGEST_Q:  # no digits are left of its part of a turn
         what = f"the <origin> of {_owner(origin)} is turned by {np.abs(rpy).max():.3g} rad"
         raise _wrong(origin, file, what, "Give radians")
     T[:3, :3] = rotation_of(rpy)

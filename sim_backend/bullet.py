@@ -24,7 +24,7 @@ class PhysicsUrdf(msgspec.Struct, frozen=True):
 
     text: str  # the URDF
     meshes: dict[str, bytes] = {}  # files by name
-    said: tuple[str, ...] = ()  # what is not as the robot's own URDF has it, in sentences
+    said: tuple[str, ...] = ()  # differences from the robot's own URDF, in sentences
 
 
 def load_pybullet() -> Any:
@@ -40,7 +40,7 @@ class Body:
     """One robot in its own pybullet world. All angles are true angles of the named joints.
 
     Args:
-        joints: names of the joints that `set_angles` and `angles` are about.
+        joints: names of the joints of `set_angles` and `angles`.
         gravity: downward acceleration [m/s²].
         dt: length of one step [s].
     """

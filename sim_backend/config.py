@@ -25,7 +25,7 @@ class EncoderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
 
 class SimTag(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One of [[sim.camera.tags]]: a tag in the hand in the place of the ball."""
+    """One of [[sim.camera.tags]]: a tag in the hand instead of the ball."""
 
     id: Annotated[int, Meta(ge=0)]  # its number
     xyz: tuple[float, float, float]  # its centre in the marker's frame [m]
@@ -38,7 +38,7 @@ class SimTag(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=Tr
 
     @property
     def half_sheet_m(self) -> tuple[float, float]:
-        """Half the sides of the sheet that it is printed on."""
+        """Half the sides of the printed sheet [m]."""
         columns, rows = self.squares or (0.25, 0.25)
         return 0.5 * (columns + 1) * self.side_m, 0.5 * (rows + 1) * self.side_m
 
@@ -66,7 +66,7 @@ class CameraConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
     @property
     def marker_radius_m(self) -> float:
-        """Radius of the smallest ball around the marker's origin that holds it [m]."""
+        """Radius of the smallest sphere around the marker's origin that contains the marker [m]."""
         if not self.tags:
             return self.ball_radius_m or BALL_RADIUS_M
         return max(math.hypot(*tag.xyz, *tag.half_sheet_m) for tag in self.tags)

@@ -22,7 +22,7 @@ def rotation(turn: FloatArray) -> FloatArray:
 
 
 def turn_of_z(direction: FloatArray) -> FloatArray:
-    """Return a rotation matrix (3, 3) that turns the z axis into a unit vector (3,)."""
+    """Return a rotation matrix (3, 3) that rotates the z axis to a unit vector (3,)."""
     across = np.eye(3)[np.abs(direction).argmin()]
     x = np.cross(across, direction)
     x /= np.linalg.norm(x)

@@ -51,7 +51,7 @@ class GuidePath:
         waypoints: visible postures (n, d) between which the path runs; it begins at the first.
 
     Raises:
-        ConfigError: the ball is visible at hardly any posture.
+        ConfigError: hardly any posture has a visible ball.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class GuidePath:
         return self._at_even_steps(np.vstack([start, curve]))
 
     def replan(self, posture: FloatArray) -> None:
-        """Draw new visible postures (the tool has changed) and go on from `posture` (d,) to the nearest."""
+        """Sample new visible postures after a tool change, and continue from `posture` (d,) to the nearest."""
         self.waypoints = self._visible_postures()
         self._unvisited = list(range(len(self.waypoints)))
         self._at = self._before = posture
@@ -110,7 +110,7 @@ class GuidePath:
         return np.column_stack([np.interp(wanted, along, column) for column in points.T])
 
     def _choose(self, start: FloatArray) -> FloatArray:
-        """Return the nearest unvisited posture with a free view all along the hop, else that with the best view."""
+        """Return the nearest unvisited posture with a free view all along the hop, or else that with the best view."""
         if not self._unvisited:
             self.waypoints = self._visible_postures()
             self._unvisited = list(range(len(self.waypoints)))
@@ -150,7 +150,7 @@ class GuidePath:
 
 
 class Goals(NamedTuple):
-    """Targets of the hand, step by step: wrist poses in the world (n, 4, 4), and places of the elbow (n, 3) [m]."""
+    """Targets of the hand, step by step: wrist poses in the world (n, 4, 4), and positions of the elbow (n, 3) [m]."""
 
     wrist: FloatArray
     elbow: FloatArray
@@ -160,7 +160,7 @@ class VirtualHand:
     """Springs that pull a body's guided joints towards a posture.
 
     Args:
-        postures: typical postures (n, d) by reported angles; the stiffness suits the smallest inertia among them.
+        postures: typical postures (n, d) by reported angles, whose smallest inertia determines the stiffness.
     """
 
     def __init__(

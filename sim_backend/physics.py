@@ -99,7 +99,7 @@ class _Settings:
 
 
 class TorqueFreeArm:
-    """Drives a body's joints: what is guided gets gravity compensation at most.
+    """A body's joints, of which the guided ones get gravity compensation at most.
 
     Args:
         friction: viscous friction of each joint [N·m·s or N·s/m], shape (d,).
@@ -121,7 +121,7 @@ class TorqueFreeArm:
             )
 
     def step(self, gaze_target: FloatArray) -> None:
-        """One step of physics with the gazing joints' servos at the true angles `gaze_target` (g,) [rad]."""
+        """Take one step of physics with the gazing joints' servos at the true angles `gaze_target` (g,) [rad]."""
         body = self._body
         if self._compensate:
             torques = body.gravity_torques(body.angles())

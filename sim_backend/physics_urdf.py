@@ -1,6 +1,6 @@
 """The true robot as a URDF that pybullet can load from anywhere.
 
-pybullet is given what was understood here, and nothing else of the file: malformed numbers and meshes end its process.
+pybullet only gets the parts that were parsed here, since malformed numbers and meshes end its process.
 """
 
 from __future__ import annotations
@@ -50,12 +50,12 @@ _SIZES = {"box": ("size",), "sphere": ("radius",), "cylinder": ("radius", "lengt
 def physics_urdf(truth: TrueRobot) -> PhysicsUrdf:
     """Return the URDF of `truth`: joint frames replaced by the true ones, joints that are not learnt locked.
 
-    Meshes have few triangles. What cannot be drawn is left out, and links whose meshes are missing or malformed are
-    rods between their joints. Links that state no inertia get a small one. Textures are left out: no other file of the
-    machine's is read because a URDF names it.
+    Meshes have few triangles. Shapes that cannot be drawn are left out, and links whose meshes are missing or malformed
+    become rods between their joints. Links without an inertia get a small one. Textures are left out: no other file of
+    the machine is read because a URDF names it.
 
     Raises:
-        RobotError: the robot has more links than pybullet takes, or joints too far apart.
+        RobotError: the robot has more links than pybullet accepts, or joints too far apart.
     """
     return _Writer(truth).written()
 
@@ -114,7 +114,7 @@ class _Writer:
         files, coarser = self._meshes.files()
         self._drop_vanished(robot, files)
         said = tuple(sentence for sentence in (*self._said(), coarser) if sentence)
-        ElementTree.indent(robot)  # pybullet breaks lines of more than 8 KiB, wherever that is
+        ElementTree.indent(robot)  # pybullet breaks lines of more than 8 KiB at any place
         return PhysicsUrdf(ElementTree.tostring(robot, encoding="unicode"), files, said)
 
     def _add_link(self, robot: ElementTree.Element, source: ElementTree.Element) -> None:
@@ -211,7 +211,7 @@ class _Writer:
             ElementTree.SubElement(element, "limit", limits)
 
     def _drop_vanished(self, robot: ElementTree.Element, files: dict[str, bytes]) -> None:
-        """Drop what shows meshes of which nothing is left with few triangles: screws."""
+        """Drop the shapes of meshes that have no triangles left after simplification: screws."""
         for link in robot.iterfind("link"):
             for shape in link.findall("visual"):
                 mesh = shape.find("geometry/mesh")
@@ -243,11 +243,11 @@ class Meshes(MeshSet):
         self._drawn: list[int] = []
 
     def add(self, name: str, scale: tuple[float, ...], *, drawn: bool) -> str | None:
-        """Return the name of the file that will show the mesh `name`, or its hull; None when it cannot be used.
+        """Return the name of the file that will show the mesh `name`, or its hull; None if it cannot be used.
 
         Args:
             scale: factors of x, y and z.
-            drawn: as it looks; else its convex hull, which is what pybullet makes of any mesh that may be touched.
+            drawn: True for its appearance, False for its convex hull, which pybullet uses for collisions.
         """
         number = self.number_of(name, scale)
         if number is None:
@@ -257,7 +257,7 @@ class Meshes(MeshSet):
         return f"{'drawn' if drawn else 'hull'}_{number}.stl"
 
     def files(self) -> tuple[dict[str, bytes], str]:
-        """Return the files by name, and a sentence on how much coarser than the meshes they are, if they are."""
+        """Return the files by name, and a sentence on their simplification, if any."""
         drawn, before = self.coarser(self._drawn)
         files = {}
         for number, triangles in enumerate(self.shapes):
@@ -279,9 +279,9 @@ def _directions() -> FloatArray:
 
 
 def _hull(triangles: FloatArray) -> FloatArray:
-    """Return about the convex hull of triangles as triangles (m, 3, 3); of what is flat its box, 1 mm thick.
+    """Return roughly the convex hull of triangles as triangles (m, 3, 3); for flat ones their box, 1 mm thick.
 
-    It tells what is in the way, and is that of the outermost points in some directions.
+    It is used for collisions, and is the hull of the outermost points in some directions.
     """
     from scipy.spatial import ConvexHull, QhullError  # only large meshes need it, and it takes half a second
 
@@ -297,7 +297,7 @@ def _hull(triangles: FloatArray) -> FloatArray:
 
 
 def _moved(tree: UrdfTree) -> set[str]:
-    """Return the links that hang on a moving joint, or that one hangs on."""
+    """Return the child links of moving joints, and the links between them and the root."""
     moved = {joint.child for joint in tree.joints.values() if joint.kind in MOVING}
     above = {joint.child: joint.parent for joint in tree.joints.values()}
     for link in tuple(moved):
@@ -328,7 +328,7 @@ def _numbers(values: Sequence[float] | FloatArray) -> str:
 
 
 def _sizes(text: str | None, count: int) -> tuple[float, ...] | None:
-    """Return the `count` lengths [m] in a text, each possible for a link; None if it is anything else."""
+    """Return the `count` lengths [m] in a text, each possible for a link; None if the text is anything else."""
     values = floats(text, count)
     return values if values is not None and all(0.0 < value <= MeshLimits.largest_m for value in values) else None
 
@@ -350,7 +350,7 @@ def _rgba(material: ElementTree.Element) -> str | None:
 
 
 def _inertia(inertial: ElementTree.Element) -> _Inertia | None:
-    """Return what an <inertial> says, a small one where it is all zero; None where no body has such."""
+    """Return the content of an <inertial>, a small one if it is all zero; None if it is physically impossible."""
     mass, tensor, pose = inertial.find("mass"), inertial.find("inertia"), _origin(inertial)
     kilograms = (0.0,) if mass is None else floats(mass.get("value"), 1)
     moments = floats(" ".join("0" if tensor is None else tensor.get(key, "0") for key in _MOMENTS), 6)

@@ -47,9 +47,9 @@ class PosedWorld:
     Each posture gives one reading and one frame with the same time. The same arguments reproduce them bit by bit.
 
     Args:
-        robot: the robot as described; it needs a stereo calibration.
+        robot: the described robot; it needs a stereo calibration.
         postures: reported joint angles (n, d) [rad or m] to go to; encoders report them in whole ticks.
-        extension: the robot with effects, to which the random errors are added; None: no effects. Camera latency has
+        extension: the robot with effects, to which the random errors are added; None for no effects. Camera latency has
             no influence on a robot that stands still.
 
     Raises:
@@ -121,7 +121,7 @@ class PosedWorld:
         return JointReading(self._read * _Settings.period_s, frozen_array(q))
 
     def next_frame(self, timeout_s: float) -> StereoFrame | None:
-        """Return the next posture's frame, None if it is not rendered in time.
+        """Return the next posture's frame; None if it is not rendered in time.
 
         Raises:
             SourceEnded: there are no more.
@@ -151,14 +151,15 @@ class PosedWorld:
 def visible_postures(
     robot: RobotDescription, config: SimConfig, count: int, extension: Simulation | None = None
 ) -> FloatArray:
-    """Postures (count, d) [rad or m], as encoders report them: guided joints uniform over their ranges, the head about
-    where it would look at the marker, uniform as well, as far as the true cameras see the marker.
+    """Return postures (count, d) [rad or m], as encoders report them, in which the true cameras see the marker.
+
+    Guided joints are uniform over their ranges; the head is uniform about the direction to the marker.
 
     Args:
-        extension: the robot with effects; those that no chain has in it are not counted.
+        extension: the robot with effects; those that a chain cannot have are ignored in it.
 
     Raises:
-        ConfigError: the cameras see the marker in too few of the postures that were drawn.
+        ConfigError: the cameras see the marker in too few of the sampled postures.
     """
     calibration, truth = stereo_calibration(robot), TrueRobot.draw(robot, config, extension)
     roles, rng = JointRoles.of(robot), generator(config.seed, Stream.WAYPOINTS)

@@ -1,4 +1,4 @@
-"""Check that both cameras truly see the marker at a posture, and that the arm is clear of the body there."""
+"""Check that both cameras truly see the marker at a posture, and that the arm does not collide with the body there."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ class Sight:
         return cosines.max(axis=1) > np.cos(_Settings.most_oblique)
 
     def clear(self, q: FloatArray) -> bool:
-        """Return True if, at one posture (d,), nothing hides the ball from the eyes and the arm touches nothing."""
+        """Return True if, at one posture (d,), the ball is not hidden from the eyes and the arm touches nothing."""
         body = self._body
         body.set_angles(q - self._truth.offsets)
         body.bullet.performCollisionDetection(physicsClientId=body.client)

@@ -96,7 +96,7 @@ class Encoders:
 
     Args:
         offsets: reported minus true angle [rad or m], shape (d,).
-        prismatic: which joints slide, shape (d,).
+        prismatic: True for each prismatic joint, shape (d,).
     """
 
     def __init__(

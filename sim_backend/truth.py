@@ -36,7 +36,7 @@ class TrueRobot:
         """Sample the true robot; the same arguments give the same robot.
 
         Args:
-            extension: the robot with effects, to which the random errors are added; None: no effects.
+            extension: the robot with effects, to which the random errors are added; None for no effects.
         """
         extension = Simulation(robot) if extension is None else extension
         rng = generator(config.seed, Stream.ERRORS)

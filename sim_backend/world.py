@@ -55,8 +55,8 @@ class SimWorld:
     readings and frames bit by bit. Open both sources before the first read.
 
     Args:
-        robot: the robot as described; it needs a stereo calibration.
-        extension: the robot with effects, to which the random errors are added; None: no effects.
+        robot: the described robot; it needs a stereo calibration.
+        extension: the robot with effects, to which the random errors are added; None for no effects.
 
     Raises:
         ConfigError: [camera] has no stereo calibration, or pybullet is not installed (both on entering).
@@ -105,7 +105,7 @@ class SimWorld:
         return self._physics.steps / self._physics.rate_hz
 
     def change_tool(self, marker_xyz: tuple[float, float, float] | FloatArray) -> float:
-        """Put another tool into the hand, its marker described to be at `marker_xyz` [m] in the marker link.
+        """Put another tool into the hand, with its described marker at `marker_xyz` [m] in the marker link.
 
         May be called from any thread. The guide chooses new postures for it and the gaze follows it at once.
 

@@ -21,7 +21,7 @@ ColourName = Literal["red", "orange", "yellow", "green", "cyan", "blue", "magent
 
 
 class HueBand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A band of hues, and how colourful and bright a pixel has to be."""
+    """A band of hues with the least saturation and brightness of a pixel."""
 
     # centre of the band on the colour circle [deg]; red 0, green 120, blue 240
     hue_deg: Annotated[float, Meta(ge=0, lt=360)]
@@ -54,7 +54,7 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     min_brightness: Annotated[float, Meta(gt=0, le=1)] = 0.6
     cameras: CamerasConfig | None = None  # where images come from; without it there are none
     further_cameras: tuple[FurtherCameras, ...] = ()  # others that see the same marker; their positions are fused
-    tag: TagConfig = TagConfig()  # the tag, or what the tags of a cluster have in common
+    tag: TagConfig = TagConfig()  # the tag, or the properties common to the tags of a cluster
     cluster: ClusterConfig = ClusterConfig()  # where on the marker which tag is
     chessboard: ChessboardConfig | None = None  # the squares of a chessboard
     plugin: PluginConfig | None = None  # the tracker of another package
@@ -66,7 +66,7 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def board(self) -> ChessboardConfig:
-        """The chessboard. ConfigError if there is none."""
+        """The chessboard; raises ConfigError if there is none."""
         if self.chessboard is None:
             raise ConfigError(
                 '[vision] marker = "chessboard" names none',
@@ -76,7 +76,7 @@ class VisionConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def readout(self) -> tuple[float, float]:
-        """The cameras' readout of the rows and what is not known of it, as they have it; images of none are global."""
+        """Readout time of the cameras' rows and its 1-sigma [s]; 0 without [vision.cameras], for a global shutter."""
         return (0.0, 0.0) if self.cameras is None else self.cameras.readout
 
     @property

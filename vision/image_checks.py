@@ -40,7 +40,7 @@ def _described(image: ImageArray) -> str:
 
 
 def check_calibration(calibration: StereoCalibration) -> None:
-    """Raise ConfigError if the calibration describes neither a stereo pair nor one camera."""
+    """Raise ConfigError unless the calibration describes a stereo pair or one camera."""
     width, height = calibration.image_size_px
     if not (math.isfinite(calibration.focal_px) and calibration.focal_px > 0):
         raise ConfigError(f"[camera] focal_px is {calibration.focal_px}", remedy="It has to be a number above 0")

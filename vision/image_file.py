@@ -15,15 +15,15 @@ MOST_BYTES = 2**28
 
 
 def read_image(file: Path, flags: int = cv2.IMREAD_COLOR) -> ImageArray | None:
-    """Return the image (height, width, 3) in `file`; None if there is no readable image.
+    """Return the image (height, width, 3) in `file`; None if it is not a readable image.
 
     Args:
-        flags: of `cv2.imdecode`; those of a colour image.
+        flags: flags of `cv2.imdecode`; by default those of a colour image.
     """
     try:
         data = np.frombuffer(read_at_most(file, MOST_BYTES), np.uint8)
         image = cv2.imdecode(data, flags) if len(data) else None
-    except (OSError, cv2.error):  # of OpenCV: more pixels than it is allowed to make of a file
+    except (OSError, cv2.error):  # raised by OpenCV for more pixels than it allows
         return None
     return None if image is None else np.asarray(image, np.uint8)
 

@@ -22,7 +22,7 @@ class Linearised(Protocol):
 
     @property
     def squares(self) -> float:
-        """The sum of squares there."""
+        """The sum of squares at this point."""
         ...
 
 
@@ -30,10 +30,10 @@ P = TypeVar("P", bound=Linearised)
 
 
 def minimised(problem: P, stepped: Callable[[P, float], P | None]) -> P:
-    """Return the problem where its sum of squares is smallest.
+    """Return the problem at the minimum of its sum of squares.
 
     Args:
-        problem: at the start.
+        problem: the problem at the start.
         stepped: returns the problem after a step with the given damping; None if there is no such step.
     """
     damping = _Settings.first_damping
@@ -50,7 +50,7 @@ def minimised(problem: P, stepped: Callable[[P, float], P | None]) -> P:
 
 
 def damped_step(jacobian: FloatArray, residuals: FloatArray, damping: float) -> FloatArray:
-    """Return the step (p,) for residuals (n,) and their negative derivative (n, p) by what is sought."""
+    """Return the step (p,) for residuals (n,) and their negative derivative (n, p) by the unknowns."""
     normal = jacobian.T @ jacobian
     normal.flat[:: len(normal) + 1] *= 1.0 + damping
     return np.asarray(np.linalg.solve(normal, jacobian.T @ residuals), np.float64)

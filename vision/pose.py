@@ -40,7 +40,7 @@ class Pose:
 
 @dataclass(frozen=True, slots=True)
 class _Linearised:
-    """Residuals at a pose, and their derivative by turn and place, in units of sigma."""
+    """Residuals at a pose, and their derivative by rotation and position, in units of sigma."""
 
     rotation: FloatArray
     x: FloatArray
@@ -53,10 +53,10 @@ class _Linearised:
 
 
 class PoseEstimator:
-    """Maximum likelihood over all pixels of both eyes; their errors are Gaussian.
+    """Maximum-likelihood estimator over the pixels of all eyes, with Gaussian errors.
 
-    `pixel_sigma` of the calibration is what rectification gets wrong around the body: one shift for each eye, which
-    all its points share.
+    `pixel_sigma` of the calibration is the error of rectification near the body: one shift for each eye, which all its
+    points share.
     """
 
     def __init__(self, calibration: StereoCalibration, sightings: Sequence[Sighting]) -> None:
@@ -69,9 +69,9 @@ class PoseEstimator:
         self._shrink = 1.0 / (square + math.sqrt(square))
 
     def refine(self, rotation: FloatArray, x: FloatArray) -> Pose | None:
-        """Return the least-squares pose near a first one; None if the body is not in front of the eyes.
+        """Return the least-squares pose near an initial one; None if the body is not in front of the eyes.
 
-        Levenberg-Marquardt on the turn about the origin of the body and the origin's place.
+        Levenberg-Marquardt on the rotation about the origin of the body and on the origin's position.
         """
         first = self._linearised(rotation, x)
         if first is None:
@@ -99,13 +99,13 @@ class PoseEstimator:
         return float((cov @ full.T @ there.residuals)[6]), math.sqrt(cov[6, 6])
 
     def bent(self, pose: Pose, heights: FloatArray) -> Pose:
-        """Return the pose of a plate that may be bent, and claims that contain what cannot be told from a bend.
+        """Return the pose of a plate that may be bent, with a covariance that includes its confusion with a bend.
 
-        One more Gauss-Newton step with its bends free, each with its second moment by what the residuals show.
+        It takes one more Gauss-Newton step with free bends, whose prior variances are their estimated second moments.
 
         Args:
-            pose: that of a flat plate.
-            heights: each bend's heights (k, m) [m] at the points, as every eye sees them all.
+            pose: pose of a flat plate.
+            heights: each bend's heights (k, m) [m] at the points, all of which every eye sees.
         """
         there = self._linearised(pose.rotation, pose.x)
         if there is None:
@@ -153,7 +153,7 @@ class PoseEstimator:
         return _Linearised(rotation, x, self._whitened(residuals), self._whitened(jacobians))
 
     def _whitened(self, eyes: Sequence[FloatArray]) -> FloatArray:
-        """Return all eyes' values with independent errors of sigma 1: by C^-1/2 of C = 1 + what they share."""
+        """Return all eyes' values with independent errors of sigma 1: by C^-1/2 with C = 1 + their common part."""
         values = np.concatenate([root @ each for root, each in zip(self._roots, eyes, strict=True)])
         return values - np.multiply.outer(self._shrink * self._shared, self._shared @ values)
 
@@ -180,7 +180,7 @@ def whitening(cov_px: FloatArray, pixel_sigma: float) -> FloatArray:
 
     Args:
         cov_px: their own covariance (2k, 2k) [px²].
-        pixel_sigma: of a shift of each coordinate that they all share [px].
+        pixel_sigma: 1-sigma of a shift of each coordinate that they all share [px].
     """
     shared = np.tile(np.eye(2), (len(cov_px) // 2, 1))
     cov = cov_px + pixel_sigma**2 * shared @ shared.T
@@ -188,7 +188,7 @@ def whitening(cov_px: FloatArray, pixel_sigma: float) -> FloatArray:
 
 
 def turned(arms: FloatArray) -> FloatArray:
-    """Return matrices (k, 3, 3) with ω × arm = −[arm]× ω for arms (k, 3) under a small turn ω."""
+    """Return matrices (k, 3, 3) with ω × arm = −[arm]× ω for arms (k, 3) under a small rotation ω."""
     matrices = np.zeros((len(arms), 3, 3))
     x, y, z = arms.T
     matrices[:, 0, 1], matrices[:, 0, 2] = z, -y
@@ -198,15 +198,15 @@ def turned(arms: FloatArray) -> FloatArray:
 
 
 def angle_between(one: FloatArray, other: FloatArray) -> float:
-    """Return the angle [rad] of the turn from one rotation (3, 3) to another."""
+    """Return the angle [rad] of the rotation from one orientation (3, 3) to another."""
     return 2.0 * math.asin(min(float(np.linalg.norm(one - other)) / math.sqrt(8.0), 1.0))
 
 
 def mirrored(rotation: FloatArray, x: FloatArray) -> FloatArray:
     """Return the other rotation (3, 3) under which a small plane at x (3,) looks nearly the same.
 
-    A plane's image without perspective does not tell towards which side it is tilted: half a turn about the line of
-    sight and half a turn about the plane's own normal.
+    A plane's image without perspective does not show to which side it is tilted: a rotation by 180° about the line of
+    sight and by 180° about the plane's own normal gives nearly the same image.
     """
     sight = x / np.linalg.norm(x)
     about_sight = 2.0 * np.outer(sight, sight) - np.eye(3)
@@ -214,7 +214,7 @@ def mirrored(rotation: FloatArray, x: FloatArray) -> FloatArray:
 
 
 def fitted_motion(body: FloatArray, seen: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return rotation (3, 3) and origin (3,) that take points of the body (k, 3) to their observed places (k, 3).
+    """Return rotation (3, 3) and origin (3,) that best map points of the body (k, 3) to observed points (k, 3).
 
     Kabsch 1976.
     """

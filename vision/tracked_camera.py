@@ -17,8 +17,10 @@ class MarkerTracker(Protocol):
     """Interface of a tracker that finds the marker in stereo images, frame by frame."""
 
     def track(self, frame: StereoFrame) -> MarkerFix | MarkerMiss:
-        """Return the marker in `frame`, in the left optical frame, or the reason for a miss; SourceError for unfit
-        images.
+        """Return the marker in `frame`, in the left optical frame, or the reason for a miss.
+
+        Raises:
+            SourceError: the images are unsuitable.
         """
         ...
 
@@ -27,7 +29,7 @@ class MarkerTracker(Protocol):
 
 
 class Draws(Protocol):
-    """Interface of what draws a tracker's result into its frame."""
+    """Interface of an annotator, which draws a tracker's result into its frame."""
 
     def drawn(self, frame: StereoFrame, seen: MarkerFix | MarkerMiss) -> ImageArray:
         """Return all images side by side, with annotations."""
@@ -68,8 +70,7 @@ class TrackedCamera:
         return jpeg(shrunk(self._annotator.drawn(*newest), widest_px=1280))  # beside other panels of a page
 
     def read(self, timeout_s: float) -> MarkerFix | MarkerMiss | None:
-        """Return the marker in the next frame, or the reason for a miss; None if no frame came within `timeout_s`
-        [s].
+        """Return the marker in the next frame, or the reason for a miss; None if no frame came within `timeout_s` [s].
 
         Raises:
             SourceEnded: there will be no more.

@@ -1,4 +1,4 @@
-"""The tracker for the marker that [vision] names."""
+"""Create the tracker for the marker of [vision]."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ def tracker_of(calibration: StereoCalibration, config: VisionConfig) -> MarkerTr
     """Create a tracker for rectified images of `calibration`, of two eyes or one.
 
     Raises:
-        ConfigError: that describes no cameras, or the marker cannot be.
+        ConfigError: the calibration does not describe cameras, or the marker is impossible.
     """
     match config.marker:
         case "ball" | "bright_ball":
             return (StereoTracker if calibration.is_stereo else OneEyeBallTracker)(calibration, config)
         case "tag" | "cluster" | "chessboard":
-            # They import scipy, which takes half a second, and a ball is found without it.
+            # They import scipy, which takes half a second; tracking a ball does not need it.
             from bodyschema.vision.tags.body import TagBody
             from bodyschema.vision.tags.chessboard import ChessboardFinder
             from bodyschema.vision.tags.tracker import TagTracker

@@ -15,18 +15,18 @@ from bodyschema.vision.ball.sphere import Pinhole
 
 @dataclass(frozen=True, slots=True)
 class Location:
-    """A ball, located."""
+    """The measured position of a ball."""
 
     x: FloatArray  # its centre in the left optical frame, shape (3,) [m]
     cov: FloatArray  # covariance of x, shape (3, 3) [m²]
     centres_px: FloatArray  # image of its centre as (ul, vl, ur, vr), shape (4,) [px]
     variances_px: FloatArray  # variances of `centres_px`, shape (4,) [px²]
-    level: float  # how bright the marker's colour is on it, mean of the eyes [grey levels]
-    # how far the limbs leave their ellipses, geometric mean of the two discs', in variances of their samples
+    level: float  # brightness of the marker's colour on it, mean of the eyes [grey levels]
+    # deviation of the limbs from their ellipses, geometric mean of the two discs', in variances of their samples
     unrest: float
     radii_px: FloatArray  # of the two discs, shape (2,) [px]
-    # sizes, size_sigmas: the radii as parts of what they have to be at this depth, and the 1-sigma of that which the
-    # images leave, shape (2,) each
+    # sizes, size_sigmas: the radii relative to those expected at this depth, and the 1-sigma of that due to the images,
+    # shape (2,) each
     sizes: FloatArray
     size_sigmas: FloatArray
 
@@ -38,7 +38,7 @@ def triangulate(
 
     Returns:
         The most likely point (3,) [m] in the left optical frame and its covariance (3, 3) [m²], to first order;
-        None when the rays do not meet before the eyes.
+        None if the rays do not meet in front of the eyes.
     """
     ul, vl, ur, vr = centres_px.tolist()
     disparity = ul - ur
@@ -64,8 +64,8 @@ def locate(calibration: StereoCalibration, radius_m: float, left: Disc, right: D
 
     Return None if the rays do not meet far enough in front of the eyes for both to see the ball.
 
-    The shift between the sphere's centre and the ellipse's depends on the distance: first the one from the size is
-    used, then the triangulated one.
+    The shift between the sphere's centre and the ellipse's depends on the distance: the distance from the size is used
+    first, then the triangulated one.
     """
     eye = Pinhole(calibration.focal_px, calibration.principal_point_px)
     variances = np.concatenate([left.cov_px.diagonal(), right.cov_px.diagonal()]) + calibration.pixel_sigma**2

@@ -1,9 +1,9 @@
 """Table of all goals and measured figures: `python -m benchmarks.goals [--rows NAME ...] [--seeds N] [--json FILE]`.
 
-Every seed is kept in the JSON file as soon as it is measured and not measured again, so a long run may be split
-and several may run at once. Seeds begin at 1000: constants were chosen looking at lower ones. A figure is a mean
-over the seeds with its standard error, or a rate, unless it says otherwise. Where there is a bound (the posterior
-error of the right model with the right prior), the goal is 1.15 times the bound or the number, whichever is larger.
+Every seed is saved in the JSON file as soon as it is measured and not measured again. So a long run may be split, and
+several may run at once. Seeds begin at 1000, because constants were chosen on lower ones. Unless stated otherwise, a
+figure is a rate, or a mean over the seeds with its standard error. Where there is a bound (the posterior error of the
+right model with the right prior), the goal is the number or 1.15 times the bound, whichever is larger.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def main() -> None:
 
 
 def measure(chosen: Sequence[Row], results: Results, most_seeds: int | None, deadline: float) -> None:
-    """Run the missing studies, row after row, until the deadline on the monotonic clock [s]."""
+    """Run the missing studies, row by row, until the deadline on the monotonic clock [s]."""
     for row in chosen:
         for study in row.studies:
             try:

@@ -1,4 +1,4 @@
-"""Rows about time and memory."""
+"""Rows on time and memory."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def _speed_rows() -> list[Row]:
 
 def _growth(seed: int) -> Values:
     """Return the growth factors of time and memory between sizes, relative to theory."""
-    del seed  # sizes have their own arms
+    del seed  # each size has its own arms
     entries = {(e.what, e.competitor, e.size): (e.seconds, e.mebibytes) for e in measure([], lambda: False)}
     values: dict[str, float] = {}
     for name, what, competitor, small, large, theory in _GROWTHS:

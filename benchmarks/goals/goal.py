@@ -1,4 +1,4 @@
-"""Goals, the figures that are held against them, and the rows of the table."""
+"""Goals, the figures compared with them, and the rows of the table."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ class Figure:
     """One number of a row.
 
     Attributes:
-        what: what is measured.
-        studies: where it comes from.
+        what: the measured quantity.
+        studies: studies that measure it.
         bound: the posterior of the right model, from the same seeds.
     """
 
@@ -76,8 +76,8 @@ class Row:
     """One row of the table.
 
     Attributes:
-        name: as on the command line.
-        what: what is to be reached.
+        name: name on the command line.
+        what: the aim.
     """
 
     name: str
@@ -86,18 +86,18 @@ class Row:
 
     @property
     def studies(self) -> tuple[Study, ...]:
-        """Each study once."""
+        """Return the row's studies, each once."""
         return tuple({study.key: study for figure in self.figures for study in figure.studies}.values())
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A figure as measured so far.
+    """A figure from the seeds measured so far.
 
     Attributes:
-        seeds, wanted: fewest seeds of its studies that ran, and how many should.
-        goal: with the bound.
-        in_doubt: the goal is within two standard errors.
+        seeds, wanted: numbers of seeds measured (the smallest of its studies) and required.
+        goal: the goal, bound included.
+        in_doubt: True if the goal is within two standard errors.
     """
 
     figure: Figure
@@ -122,7 +122,7 @@ class Cell:
 
 
 def judged(figure: Figure, results: Mapping[str, Sequence[Values]]) -> Cell:
-    """Judge a figure over all measured seeds of its studies."""
+    """Compare a figure with its goal, over all measured seeds of its studies."""
     samples = [results.get(study.key, ()) for study in figure.studies]
     seeds, wanted = min(map(len, samples)), min(study.seeds for study in figure.studies)
     if not seeds:
@@ -132,7 +132,7 @@ def judged(figure: Figure, results: Mapping[str, Sequence[Values]]) -> Cell:
 
 
 def number(value: float) -> str:
-    """Format with three digits; infinity is "never"."""
+    """Format with three digits; format infinity as "never"."""
     if math.isinf(value):
         return "never"
     if value != 0.0 and abs(value) < 1e-3:

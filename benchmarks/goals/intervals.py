@@ -1,4 +1,4 @@
-"""The row about what the models claim."""
+"""The row on the models' claimed uncertainty."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rows without noise: how many pairs give an arm back exactly."""
+"""Rows without noise: numbers of pairs that determine an arm exactly."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def _full_net(seed: int) -> Values:
 
 
 def _net_error(chain: RigidChain, alpha: float, rng: np.random.Generator, times: float = 1.0) -> tuple[float, float]:
-    """Return the mean error [m] over the whole turn of the solution as a net of this alpha, and its CPU time [s]."""
+    """Return the mean error [m] over full turns of the solution as a net with this alpha, and its CPU time [s]."""
     reach = np.where(chain.prismatic, _SLIDE_M, _REACH)
     turn = np.where(chain.prismatic, _SLIDE_M, np.pi)
     net = tuple(

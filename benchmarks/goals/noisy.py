@@ -103,7 +103,7 @@ def _few_rows() -> list[Row]:
 
 
 def _stream(seed: int) -> Values:
-    """Run figure 6's walk: the arm is known, its marker was moved by 250 mm."""
+    """Run figure 6's walk: the arm is known, and its marker was moved by 250 mm."""
     rng = np.random.default_rng(seed)
     known = arm(7)
     true = longer_tool(known, MOVED_M)

@@ -1,4 +1,4 @@
-"""Rows about arms that are not quite rigid: simulated ones, and a measured one."""
+"""Rows on arms that are not quite rigid: simulated ones, and a measured one."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def _ladder_row() -> Row:
 
 
 def _split(data: Path | None, pairs: int | None, seed: int) -> Values:
-    """Return held-out mean errors of a random split; None learns four fifths of the rows."""
+    """Return held-out mean errors of a random split; None means to learn four fifths of the rows."""
     if data is None:
         raise NotHereError(f"no folder with recordings is given (--data FOLDER or {DATA_VARIABLE})")
     folder = data / _RECORDING

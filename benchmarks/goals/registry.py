@@ -9,7 +9,11 @@ from benchmarks.goals.goal import Row
 
 
 def rows(data: Path | None) -> list[Row]:
-    """Args: data: folder with recordings; None: rows about them cannot be measured."""
+    """Return all rows.
+
+    Args:
+        data: folder with recordings; if None, rows that need them cannot be measured.
+    """
     return [
         *noise_free.rows(),
         *noisy.rows(),

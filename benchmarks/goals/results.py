@@ -14,7 +14,7 @@ class Results:
     """Values by study and seed.
 
     Args:
-        path: the file; it need not exist.
+        path: the file, which need not exist.
     """
 
     def __init__(self, path: Path) -> None:

@@ -15,7 +15,7 @@ Values = Mapping[str, float]
 
 
 class NotHereError(Exception):
-    """Something that a study needs is missing; the message gives the remedy."""
+    """Something that a study needs is missing; the message tells how to get it."""
 
 
 @dataclass(frozen=True)
@@ -23,9 +23,9 @@ class Study:
     """One set-up.
 
     Attributes:
-        key: what its seeds are kept under.
+        key: key under which its seeds are saved.
         run: measures one seed.
-        seeds: how many are wanted.
+        seeds: required number of seeds.
     """
 
     key: str
@@ -46,7 +46,7 @@ Estimate = Callable[[Sequence[Sequence[Values]]], Measured]
 
 
 def mean(name: str) -> Estimate:
-    """Estimate the mean over all seeds; for zeros and ones it is a rate."""
+    """Estimate the mean over all seeds, or the rate if the values are zeros and ones."""
     return lambda samples: _mean(_all(name, samples))
 
 

@@ -1,4 +1,4 @@
-"""Rows about another tool, through the daemon's learner without its processes."""
+"""Rows on a tool change, with the daemon's learner but without its processes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _PERCENT = 100.0
 
 @dataclass(frozen=True)
 class _Arm:
-    """An arm, the noise of its pairs, and the learner that gets them, in their order."""
+    """An arm, the noise of its pairs, and the learner that learns them in order."""
 
     arm: RoughArm
     sigma: float
@@ -74,10 +74,10 @@ class _Arm:
 
 
 def _found(on_path: bool, seed: int) -> Values:
-    """Run an unannounced tool change: pairs until detected, and the error over +-80 degrees after ten pairs.
+    """Run an unannounced tool change; return the pairs until detection, and the error within +-80° after ten pairs.
 
     Args:
-        on_path: seven joints on a guided path, else six at poses drawn independently.
+        on_path: True for seven joints on a guided path, False for six at independent poses.
     """
     rng = np.random.default_rng(seed)
     before = _Arm.new(7 if on_path else _JOINTS, ROUGH, _SIGMA_M, rng)
@@ -105,10 +105,10 @@ def _bound_mm(arm: RoughArm, q: FloatArray, q_after: FloatArray, test: FloatArra
     """Return the posterior error [mm] of the right model when the change is known.
 
     Args:
-        arm: with the new tool.
+        arm: the arm with the new tool.
         q: poses with the old tool (n, d) [rad].
-        q_after: with the new one.
-        test: where errors are asked for.
+        q_after: poses with the new tool.
+        test: poses at which the error is computed.
     """
     reach = np.full(arm.drawing.joints, np.pi)
     before, after = (
@@ -133,7 +133,7 @@ def _told(seed: int) -> Values:
 
 
 def _demo(seed: int) -> Values:
-    """Run the demo on a guided path: an announced tool change, then errors near the poses visited since."""
+    """Run the demo on a guided path: an announced tool change; return errors near the poses visited since."""
     rng = np.random.default_rng(seed)
     before = _Arm.new(7, _DEMO_TOLERANCES, _DEMO_SIGMA_M, rng)
     q, q_after = np.split(guided_path(_DEMO_BEFORE + _DEMO_STAGES[-1], rng).q, [_DEMO_BEFORE])

@@ -1,1 +1,1 @@
-"""Our learners beside those of others: same arms, same pairs, same split, one page."""
+"""Comparison of our learners with others on one page: same arms, same pairs, same split."""

@@ -1,7 +1,7 @@
 """All learners side by side: `python -m benchmarks.peers [--tasks ...] [--models ...] [--seeds N] [--budget-s S]`.
 
-Results are added to the JSON file as they come and taken up by the next run, so a long run may go in pieces. A seed of
-all tasks with up to 300 pairs takes some four minutes on a busy machine of two cores; the whole page, 50 seeds:
+Results are added to the JSON file as they come, and the next run continues from it; so a long run may be split. A seed
+of all tasks with up to 300 pairs takes some four minutes on a busy machine of two cores. The whole page, 50 seeds:
 
     python -m benchmarks.peers --seeds 50 --data FOLDER --json peers.json --out peers.html
 """

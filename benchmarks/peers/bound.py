@@ -1,4 +1,4 @@
-"""The error that the posterior of the right model with the right prior leaves, linearised at the truth."""
+"""Posterior error of the right model with the right prior, linearised at the truth."""
 
 from __future__ import annotations
 

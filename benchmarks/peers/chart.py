@@ -37,7 +37,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Chart:
-    """Lines, a floor that nothing can be expected below, goals as points, and whose names are at their lines' ends."""
+    """Lines with their names at their ends, a floor below which nothing can be expected, and goals as points."""
 
     x_label: str
     y_label: str
@@ -117,7 +117,7 @@ class _Axes:
         return f'<g data-model="{line.key}">{title}<polyline fill="none" {style}{dashes} points="{path}"/>{marks}</g>'
 
     def names(self, lines: Sequence[Line]) -> str:
-        """Titles beside the last points, moved apart where they would overlap."""
+        """Return titles beside the last points, moved apart where they would overlap."""
         ends = sorted(((self.at(*line.points[-1]), line) for line in lines), key=lambda end: end[0][1])
         heights = apart([y for (_, y), _ in ends])
         parts = []
@@ -157,7 +157,7 @@ class _Axes:
 
 
 def apart(heights: Sequence[float]) -> list[float]:
-    """Return ascending heights, a name's height apart at least and within the chart."""
+    """Return ascending heights within the chart, at least a name's height apart."""
     placed: list[float] = []
     for height in heights:
         placed.append(max(height, placed[-1] + _NAME_HEIGHT) if placed else height)

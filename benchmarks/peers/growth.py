@@ -28,7 +28,7 @@ Law = Callable[[float], float]
 
 @dataclass(frozen=True)
 class Series:
-    """A learner that grows with the joints, or with the pairs, and the laws that theory gives, up to a factor."""
+    """A learner measured at growing numbers of joints or pairs, and theoretical laws of its cost, up to a factor."""
 
     what: Literal["joints", "pairs"]
     competitor: str

@@ -1,4 +1,4 @@
-"""The part of the page that shows how time and memory grow."""
+"""The section of the page that shows the growth of time and memory."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _LABELS = {"joints": "joints d", "pairs": "pairs n"}
 
 
 def growth_section(results: Results, competitors: Sequence[Competitor], looks: dict[str, Style]) -> str:
-    """Return charts of time and memory against joints and pairs; nothing where they were not measured."""
+    """Return charts of time and memory against joints and pairs; empty without measurements."""
     if not results.growth:
         return ""
     titles = {competitor.key: competitor.title for competitor in competitors}

@@ -1,4 +1,4 @@
-"""One self-contained HTML page: curves, tables, what was run and where."""
+"""One self-contained HTML page: curves, tables, and a description of the runs and the machine."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _GOAL_FACTOR = 1.15
 
 
 def styles(competitors: Sequence[Competitor]) -> dict[str, Style]:
-    """Return one look for each competitor: ours solid, heavy and in a colour of their own, peers dashed and light."""
+    """Return a style for each competitor: ours solid, heavy and each in its own colour, peers dashed and light."""
     ours, calibrated, learnt = (
         [competitor.key for competitor in competitors if _group(competitor) == group] for group in _GROUPS
     )
@@ -65,12 +65,12 @@ def write_page(path: Path, results: Results, tasks: Sequence[Task], competitors:
 
 
 def tests_of(task: Task, results: Results) -> list[str]:
-    """Return names of the tests that a task has results for, in the order met."""
+    """Return the names of the tests that a task has results for, in order of appearance."""
     return list(dict.fromkeys(t for key, o in results.outcomes.items() if key[0] == task.key for t in o.errors))
 
 
 def counts_of(task: Task, results: Results) -> list[int]:
-    """Return pairs that a task has results at."""
+    """Return the numbers of pairs that a task has results at."""
     return sorted({key[2] for key in results.outcomes if key[0] == task.key})
 
 
@@ -187,7 +187,7 @@ def _panel(
 
 
 def _best(lines: Sequence[Line], competitors: Sequence[Competitor]) -> list[str]:
-    """Return keys of the best few of each group after the most pairs."""
+    """Return the keys of the best few of each group at the largest number of pairs."""
     last = max(line.points[-1][0] for line in lines)
     ended = sorted((line for line in lines if line.points[-1][0] == last), key=lambda line: line.points[-1][1])
     group = {competitor.key: _group(competitor) for competitor in competitors}

@@ -16,7 +16,7 @@ Measure = Callable[[FloatArray, FloatArray], FloatArray]
 
 
 class Fitted(Protocol):
-    """Something that has learnt."""
+    """A fitted model."""
 
     def predict(self, q: FloatArray, /) -> FloatArray:
         """Return positions (n, 3) [m] at q (n, d) [rad]."""
@@ -30,13 +30,12 @@ class Problem:
     Attributes:
         q, x: pairs, (n, d) [rad] and (n, 3) [m].
         low, high: the joints' working range (d,) [rad]; the pairs may cover only part of it.
-        rng: for what the competitor draws.
+        rng: random generator for the competitor.
         sigma: noise of a coordinate [m]; None if unknown (recordings).
         drawing: the nominal chain; None if there is no prior model.
-        tolerances: how far the real arm may be from it.
-        measure: takes readings at poses of the competitor's own choice; None where
-            the poses are given.
-        tool_move: by how far the marker was moved since an earlier fit [m]; None: there was none.
+        tolerances: possible deviation of the real arm from it.
+        measure: takes readings at poses that the competitor chooses; None if the poses are given.
+        tool_move: distance by which the marker was moved since an earlier fit [m]; None if it was not.
     """
 
     q: FloatArray
@@ -75,10 +74,10 @@ class Competitor:
         key: short name, as on the command line.
         title: name on the page.
         family: "ours" or "peer".
-        learn: fits a problem; the second argument is what it had learnt before the tool was changed.
-        refuses: why it cannot run on a problem, or None.
-        calibrates: fits the numbers of the drawing all at once, or takes them as they are.
-        about: what was implemented, for the page.
+        learn: fits a problem; the second argument is its earlier fit, from before the tool change.
+        refuses: returns the reason why it cannot run on a problem, or None.
+        calibrates: True if it fits the parameters of the nominal model all at once, or keeps them.
+        about: description of the implementation, for the page.
     """
 
     key: str
@@ -92,7 +91,7 @@ class Competitor:
 
 @dataclass(frozen=True)
 class Offset:
-    """A start (nothing, a drawing, or the model before a tool change) that a black box learns the errors of."""
+    """A start (nothing, a nominal model, or the model before a tool change) whose errors a black box learns."""
 
     start: Fitted | None
     mean: FloatArray

@@ -1,4 +1,4 @@
-"""All competitors, in the order of the page. Another one is a `Competitor` of its own module, named here."""
+"""All competitors, in the order of the page. To add one, write a module with a `Competitor` and list it here."""
 
 from __future__ import annotations
 

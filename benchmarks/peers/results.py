@@ -23,8 +23,8 @@ class Outcome:
 
     Attributes:
         errors: mean error [m] of each test; empty unless the status is "ok".
-        learn_s, predict_us: of the processor, to learn all pairs [s], and to predict one row of a batch [µs].
-        reason: why there are no errors.
+        learn_s, predict_us: CPU time to learn all pairs [s], and to predict one row of a batch [µs].
+        reason: reason why there are no errors.
     """
 
     task: str
@@ -44,7 +44,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Growth:
-    """Time and memory of one learner at one size: `what` grows to `size`."""
+    """Time and memory of one learner at one size; `what` names the quantity that has this size."""
 
     what: Literal["joints", "pairs"]
     competitor: str
@@ -55,11 +55,11 @@ class Growth:
 
 @dataclass
 class Results:
-    """Everything so far.
+    """All results so far.
 
     Attributes:
         bounds: (task, pairs, seed, test) -> the Bayesian bound [m].
-        runs: when and where, newest last.
+        runs: time and machine of each run, newest last.
     """
 
     outcomes: dict[tuple[str, str, int, int], Outcome] = field(default_factory=dict)
@@ -115,9 +115,9 @@ class Cell:
     """All seeds of one competitor on a task with n pairs.
 
     Attributes:
-        mean, standard_error: over the seeds that came to an end [m]; None where none did.
-        ran, failed: seeds that came to an end, and that broke down or diverged.
-        reason: why nothing ran.
+        mean, standard_error: over the seeds that finished [m]; None if none did.
+        ran, failed: numbers of seeds that finished, and that failed or diverged.
+        reason: reason why nothing ran.
     """
 
     mean: float | None
@@ -130,7 +130,7 @@ class Cell:
 
 
 def cell(outcomes: list[Outcome], test: str) -> Cell:
-    """Return the summary of the outcomes for one test."""
+    """Summarise the outcomes for one test."""
     good = [outcome for outcome in outcomes if outcome.status == "ok" and test in outcome.errors]
     failed = sum(outcome.status == "failed" for outcome in outcomes)
     reasons = [outcome.reason for outcome in outcomes if outcome.reason]

@@ -1,4 +1,4 @@
-"""Runs competitors on tasks until the seeds or the time are used up."""
+"""Run competitors on tasks until all seeds are done or the time is up."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from kbmaps import KBMapsError
 
 
 class TooSlow(Exception):
-    """A fit took longer than it may."""
+    """A fit exceeded its time limit."""
 
 
 @dataclass(frozen=True)
@@ -28,10 +28,10 @@ class Plan:
     """Plan of a run.
 
     Attributes:
-        seeds: how many, from 0.
-        deadline_s: when to stop, on the clock; the fit under way is finished.
-        fit_limit_s: a fit that takes the processor longer is given up.
-        clock: seconds.
+        seeds: number of seeds, from 0.
+        deadline_s: time on the clock at which to stop; the current fit is finished.
+        fit_limit_s: CPU time after which a fit is abandoned.
+        clock: returns seconds.
     """
 
     tasks: Sequence[Task]
@@ -52,7 +52,7 @@ class Job:
 
 
 def jobs(plan: Plan) -> Iterator[Job]:
-    """Yield every task at few pairs first, then the next seed; costlier sizes come after the cheap ones."""
+    """Yield every task at few pairs first, then the next seed; expensive sizes follow the cheap ones."""
     counts = sorted({n for task in plan.tasks for n in task.counts if plan.fewest_pairs <= n <= plan.most_pairs})
     for cheap in (True, False):
         for seed in range(plan.seeds):
@@ -97,7 +97,7 @@ def _outcome(job: Job, competitor: Competitor, trial: Trial, plan: Plan, results
     try:
         with _time_limit(plan.fit_limit_s), warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore", RuntimeWarning)
-            # A generator of its own, so that a competitor's draws do not depend on who ran before.
+            # A separate generator, so that a competitor's random numbers do not depend on those that ran before.
             return _measured(blank, competitor, trial)
     except TooSlow:
         return replace(blank, status="too slow", reason=f"over {plan.fit_limit_s:.0f} s at n = {job.pairs}")
@@ -106,7 +106,7 @@ def _outcome(job: Job, competitor: Competitor, trial: Trial, plan: Plan, results
 
 
 def _slower_size(results: Results, blank: Outcome) -> str | None:
-    """Return the reason of an abandoned fit of as many or fewer pairs, or None."""
+    """Return the reason of an abandoned fit of at most as many pairs, or None."""
     for outcome in results.outcomes.values():
         same = (outcome.task, outcome.competitor) == (blank.task, blank.competitor)
         if same and outcome.status == "too slow" and outcome.pairs <= blank.pairs:
@@ -131,7 +131,7 @@ def _own(problem: Problem, seed: int) -> Problem:
 
 
 def _tested(fitted: Fitted, trial: Trial) -> tuple[dict[str, float], float]:
-    """Return the mean error of each test [m], and the processor's best time a row [µs], once warm."""
+    """Return the mean error of each test [m], and the best CPU time of a row [µs], once warm."""
     errors: dict[str, float] = {}
     rates: list[float] = []
     for name, (q, x) in trial.tests.items():

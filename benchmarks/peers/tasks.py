@@ -1,4 +1,4 @@
-"""The tasks: which arm, which pairs, which poses are asked for."""
+"""The tasks: arm, pairs and test poses."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ ZONE_CENTRE_DEG = 60.0
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One seed of a task: what is learnt, before a tool change too, and what is asked.
+    """One seed of a task: pairs to learn, also those before a tool change, and tests.
 
     Attributes:
         tests: name -> (poses (k, d) [rad], true positions (k, 3) [m]).
-        arm: the drawing and how it was built; None for recordings.
+        arm: the nominal model and the true arm; None for recordings.
     """
 
     problem: Problem
@@ -46,10 +46,10 @@ class Task:
 
     Attributes:
         key, title: short and long name.
-        trial: draws the seed's trial with n pairs, None where there are not so many.
-        counts: how many pairs.
-        goals: pairs -> figure to reach [m]; the goal is that or 1.15 times the bound, whichever is larger.
-        note: what is special.
+        trial: samples the seed's trial with n pairs; returns None if there are fewer.
+        counts: numbers of pairs.
+        goals: pairs -> target figure [m]; the goal is that or 1.15 times the bound, whichever is larger.
+        note: special features.
     """
 
     key: str
@@ -65,11 +65,11 @@ class Setting:
     """Distribution of simulated trials; angles in degrees.
 
     Attributes:
-        joints: up to 7 the humanoid arm without its last joints, above that a random chain.
-        drawn: whether the learner gets the nominal model.
-        zone: half the range that the pairs come from, about a random centre; None: the whole range.
-        effect: draws what is not rigid about the arm.
-        tool_move: by how far the marker moves after 600 pairs [m].
+        joints: number of joints; up to 7 the humanoid arm without its last joints, above that a random chain.
+        drawn: True if the learner gets the nominal model.
+        zone: half the range of the pairs about a random centre; None for the whole range.
+        effect: samples the arm's non-rigid effect.
+        tool_move: distance by which the marker moves after 600 pairs [m].
     """
 
     joints: int = 6
@@ -94,7 +94,7 @@ class Setting:
             tests = {"drawn alike": rng.uniform(centre - half, centre + half, tests["drawn alike"].shape)} | {
                 "extrapolated": tests["drawn alike"]
             }
-        # The pairs of one seed are a prefix of one another, and the noise of readings asked for is another stream.
+        # Fewer pairs of a seed are a prefix of more; the noise of requested readings has its own stream.
         before = None
         if self.tool_move is not None:
             before = self._problem(arm, built, PAIRS_BEFORE, centre, half, reach, seed)

@@ -1,6 +1,6 @@
-"""Arms as they are: what a marker does in the world, built by physics and independent of every learner.
+"""True arms: marker positions from physics, independent of every learner.
 
-Only the numbers of a chain come in; forward kinematics, gravity, encoders and lens are computed here.
+Only the parameters of a chain are imported; forward kinematics, gravity, encoders and lens are computed here.
 """
 
 from __future__ import annotations
@@ -35,11 +35,11 @@ class CameraEffect(Protocol):
 
 @dataclass(frozen=True)
 class Arm:
-    """A chain of turning joints and what bends it.
+    """A chain of revolute joints with non-rigid effects.
 
     Attributes:
         fixed: transforms F_0 .. F_d (d+1, 4, 4); axes: in each joint's frame (d, 3).
-        joint_effect, camera_effect: None: rigid, and seen without error.
+        joint_effect, camera_effect: None if the arm is rigid or seen without error.
     """
 
     fixed: FloatArray
@@ -79,7 +79,7 @@ class Arm:
 
 @dataclass(frozen=True)
 class Eccentric:
-    """Encoder discs that sit off their axes: an error of `size` [rad] · sin(q + phase)."""
+    """Encoder discs mounted off their axes: an error of `size` [rad] · sin(q + phase)."""
 
     size: float
     phases: FloatArray
@@ -91,7 +91,7 @@ class Eccentric:
 
 @dataclass(frozen=True)
 class GearGain:
-    """A reduction that is not the one in the data sheet: the joints turn by `gains` (d,) times the reading."""
+    """A gear ratio that differs from the data sheet: the joints turn by `gains` (d,) times the reading."""
 
     gains: FloatArray
 
@@ -102,15 +102,15 @@ class GearGain:
 
 @dataclass(frozen=True)
 class Sag:
-    """Joints that give way under the arm's own weight.
+    """Joints that deflect under the arm's own weight.
 
     The torso stands still and the camera turns on it, so gravity is constant in the frame after the neck. One point
-    mass at the end of each link, falling off towards the hand. Each joint behind the neck is a spring behind its
-    encoder, so stiff that the arm's weight turns it by about `most` [rad] when held out; the springs' angles are the
+    mass is at the end of each link, decreasing towards the hand. Each joint behind the neck has a spring behind its
+    encoder, so stiff that the arm's weight turns it by about `most` [rad] when held out. The deflections are the
     equilibrium of the bent arm.
 
     Attributes:
-        most: deflection of a joint under the largest static torque that the rigid arm puts on it [rad].
+        most: deflection of a joint under the largest static torque of the rigid arm [rad].
         first: first joint that carries the arm; those before it turn the camera.
         masses: of the links from that joint on [kg].
     """
@@ -126,7 +126,7 @@ class Sag:
     def __call__(self, arm: Arm, q: FloatArray) -> FloatArray:
         poses = np.random.default_rng(0).uniform(-np.pi / 2, np.pi / 2, (_POSES, arm.joints))
         largest = np.abs(self.torques(arm, poses)).max(axis=0)
-        # A joint that carries next to nothing, as one about the vertical, is not built ever so soft for it.
+        # A joint with almost no load, such as a vertical one, does not get an extremely soft spring for it.
         compliance = self.most / np.maximum(largest, _SLIGHTEST_SHARE * largest.max())
         bent = q.copy()
         for _ in range(_EQUILIBRIUM_STEPS):
@@ -155,7 +155,7 @@ class Affine:
 
     @classmethod
     def drawn(cls, rng: np.random.Generator) -> Affine:
-        """Scales off by 2 to 3 %, skew of 1 %."""
+        """Sample scales off by 2 to 3 % and a skew of 1 %."""
         scales = rng.uniform(0.02, 0.03, 3) * rng.choice([-1.0, 1.0], 3)
         return cls(np.eye(3) + np.diag(scales) + np.triu(rng.normal(0.0, 0.01, (3, 3)), 1))
 

@@ -1,4 +1,4 @@
-"""The simulated arm of the experiments, and the poses for learning it."""
+"""The simulated arm of the experiments, and the poses at which it is learnt."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def configuration(joints: Sequence[str], state_dir: Path, rules: DaemonConfig, *
 
 
 def arm(joints: int | Sequence[str]) -> RigidChain:
-    """Return the shipped upper body with these joints, or this number of them, from the left camera to the ball."""
+    """Return the shipped upper body's chain, left camera to ball, with these joints or this number of them."""
     names = JOINTS[joints] if isinstance(joints, int) else joints
     return configuration(names, Path(), DaemonConfig()).robot.chain
 

@@ -90,7 +90,7 @@ class Panel:
     """One plot of a figure.
 
     Attributes:
-        title: what it shows.
+        title: the shown quantity.
         curves: its lines.
         as_paper: True to plot as the paper does: counts on a linear axis, and the largest errors too, dotted. Otherwise
             the axis of the counts is logarithmic, from 1 on.
@@ -156,7 +156,7 @@ class Experiment:
         panels: the plots of the figure, the paper's own first.
         readings: the paper's figures and ours.
         comparison: other models on the same pairs.
-        notes: what the paper leaves open, and how it was interpreted.
+        notes: questions that the paper leaves open, and their interpretation.
         floor_m: lengths below this are plotted as this one [m].
     """
 

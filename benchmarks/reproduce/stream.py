@@ -48,7 +48,7 @@ class Stream:
 
     @property
     def online(self) -> int:
-        """Number of online pairs, before the replay."""
+        """Return the number of online pairs, before the replay."""
         return len(self.q)
 
 

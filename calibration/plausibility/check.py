@@ -1,8 +1,8 @@
 """Check that a recording can be of this robot, before any fit of it is trusted.
 
-A rigid chain with free links fits a recording with a flipped joint or an offset of 90° as well as the right one: its
-links are then nonsense. So the links are kept at nominal. The pose of the camera, the marker and the joint offsets are
-fitted to many ways to read the columns.
+A rigid chain with free links fits a recording with a flipped joint or an offset of 90° as well as the right one, but
+with meaningless links. So the links are kept at nominal, and the pose of the camera, the marker and the joint offsets
+are fitted to many ways to read the columns.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from .verdict import FEWEST_ROWS, THRESHOLDS, Plausibility, mm
 
 
 class _Settings:
-    """When a recording is not of the arm, in any reading."""
+    """Limits beyond which a recording is not of the arm, in any reading."""
 
     # A fit with residuals above these shares of the positions' spread and of the arm's reach is not of this arm.
     unexplained: float = 0.25
@@ -61,7 +61,7 @@ def plausibility(
         t: times (n,) [s] if known.
         chain: the nominal chain if it is not the robot's.
         sigma_m: 1-sigma of a coordinate [m] if known.
-        orientation: of the marker, quaternions x, y, z, w (n, 4), if known.
+        orientation: orientations of the marker, quaternions x, y, z, w (n, 4), if known.
     """
     chain = chain or robot.chain
     exact_m, spread = _Settings.exact * reach_m(robot), spread_m(x)
@@ -82,14 +82,14 @@ def plausibility(
 class _Check:
     robot: RobotDescription  # the robot's description
     search: ReadingSearch  # the finished search over readings of the columns
-    as_it_is: Reading  # the columns as they are
+    as_it_is: Reading  # the unchanged columns
     best: Reading  # the simplest among the best readings
     others: list[Reading]  # others nearly as simple
     spread: float  # of the positions [m]
     noise: float  # largest distance that the known noise explains [m]
 
     def rows_and_size(self, q: FloatArray, x: FloatArray, t: FloatArray | None) -> Plausibility:
-        """Return what is wrong with the rows or the size of all pairs q (n, d) [rad, m], x (n, 3) [m] and t (n,)."""
+        """Return the faults of the rows or the size of all pairs q (n, d) [rad, m], x (n, 3) [m] and t (n,)."""
         search, best = self.search, self.search.fits[self.best].error
         placed = self._is_nameable(self.as_it_is) or self._is_nameable(self.best)
         if not placed or many_apart(search, THRESHOLDS.named * self.spread):
@@ -109,10 +109,10 @@ class _Check:
         return of_another_size(size, spread_m(search.x), self._before, best) or Plausibility()
 
     def columns(self, orientation: FloatArray | None) -> Plausibility:
-        """Return what is wrong with the columns.
+        """Return the faults of the columns.
 
         Args:
-            orientation: of the marker in the rows of the search, quaternions x, y, z, w (n, 4), if known.
+            orientation: orientations of the marker in the rows of the search, quaternions x, y, z, w (n, 4), if known.
         """
         search, reading = self.search, self.best
         if not (self._fits_clearly_better or self._is_nameable(reading)):
@@ -138,7 +138,7 @@ class _Check:
 
     @property
     def _before(self) -> float:
-        """Distance of the pairs as they are [m]."""
+        """Distance of the pairs with unchanged columns [m]."""
         return self.search.fits[self.as_it_is].error
 
     @property
@@ -163,7 +163,7 @@ class _Check:
         )
 
     def _of_another_reading(self, reading: Reading, fit: ReadingFit, after: float) -> Plausibility:
-        """Report another reading, which fits better than the columns as they are."""
+        """Report another reading that fits better than the unchanged columns."""
         names = self.robot.joints
         mirrored = self.robot.camera.pose_known and reading.mirrored
         frame = order_of_axes(fit.rotation, mirrored=True) if mirrored else ""
@@ -183,7 +183,7 @@ class _Check:
         return Plausibility(warnings=(f"perhaps {text}{either}",))
 
     def _as_it_is(self, fit: ReadingFit, held: tuple[Reading, ReadingFit] | None) -> Plausibility:
-        """Report on columns that are right, save for the zero of the last joint and the measurement frame."""
+        """Report on columns that are right, except for the last joint's offset and the measurement frame."""
         search, names = self.search, self.robot.joints
         turned = None
         if self.robot.camera.pose_known:
@@ -221,7 +221,7 @@ class _Check:
 
 
 def _decided(found: Plausibility, search: ReadingSearch, pairs: int) -> Plausibility:
-    """Turn a refusal into a warning where there are too few pairs or poses for it."""
+    """Turn a refusal into a warning if there are too few pairs or poses for it."""
     enough = pairs >= FEWEST_ROWS and (found.better == 1.0 or search.is_certain(math.log(found.better)))
     if found.refusal is None or enough or found.better >= THRESHOLDS.decisively:
         return found
@@ -247,7 +247,7 @@ _REMEDIES = {_W_FIRST: _REORDER, _CONJUGATE: _NEGATE, f"{_W_FIRST}, and {_CONJUG
 
 
 def turned_frame(chain: RigidChain, q: FloatArray, x: FloatArray, fit: ReadingFit) -> Plausibility | None:
-    """Return a refusal if the measurement frame is turned against a pose that robot.toml declares known; else None."""
+    """Return a refusal if the frame is rotated against a pose that robot.toml declares known, otherwise None."""
     angle = float(np.linalg.norm(rotation_vector(fit.rotation)))
     if angle < THRESHOLDS.turned_rad:
         return None
@@ -264,7 +264,7 @@ def turned_frame(chain: RigidChain, q: FloatArray, x: FloatArray, fit: ReadingFi
 
 
 def order_of_axes(rotation: FloatArray, *, mirrored: bool) -> str:
-    """Return the order and signs in which x, y, z are given, if they are axes of the frame in robot.toml; else ""."""
+    """Return the order and signs in which x, y, z are given, if they are axes of robot.toml's frame, otherwise ""."""
     given = np.diag([-1.0 if mirrored else 1.0, 1.0, 1.0]) @ rotation
     which = np.abs(given).argmax(axis=1)
     along = np.abs(given).max(axis=1)
@@ -277,7 +277,7 @@ def order_of_axes(rotation: FloatArray, *, mirrored: bool) -> str:
 def reordered_quaternions(
     chain: RigidChain, q: FloatArray, orientation: FloatArray, fit: ReadingFit
 ) -> Plausibility | None:
-    """Return a refusal if the quaternions fit far better in another order, or inverted; else None."""
+    """Return a refusal if the quaternions fit far better in another order, or inverted, otherwise None."""
     plain, first, conjugate = orientation, np.roll(orientation, -1, axis=1), np.array([-1.0, -1.0, -1.0, 1.0])
     readings = zip((_AS_IT_IS, *_REMEDIES), (plain, first, plain * conjugate, first * conjugate), strict=True)
     hand = fit.rotation @ chain.orientation(q)
@@ -297,6 +297,6 @@ def reordered_quaternions(
 
 
 def _scatter(turns: FloatArray) -> float:
-    """Return the median angle [rad] of rotations (n, 3, 3) from the one among them that is nearest to the others."""
+    """Return the median angle [rad] of rotations (n, 3, 3) from the one that is nearest to the others."""
     cosines = (np.einsum("aij,bij->ab", turns, turns) - 1.0) / 2.0
     return math.acos(float(np.clip(np.median(cosines, axis=1).max(), -1.0, 1.0)))

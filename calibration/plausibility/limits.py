@@ -50,7 +50,7 @@ _UNITS_PER_SECOND = (("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds
 
 
 def place_an_arm(rows: int, joints: int) -> bool:
-    """Return True if pairs have twice as many coordinates as an arm has offsets, with those of camera and marker."""
+    """Return True if pairs have twice as many coordinates as the arm, camera and marker have offsets."""
     return 3 * rows >= 2 * (joints + 9)
 
 
@@ -71,7 +71,7 @@ def beyond_limits(robot: RobotDescription, q: FloatArray, by: float = 0.0) -> Bo
 
 
 def limits_text(robot: RobotDescription, joint: int) -> str:
-    """Return a joint's limits for people, as in `-2.6 to 2.6 rad (-149° to 149°)`."""
+    """Return a joint's limits for messages, as in `-2.6 to 2.6 rad (-149° to 149°)`."""
     lower, upper = robot.lower[joint], robot.upper[joint]
     if robot.tree.joint(robot.joints[joint]).kind not in REVOLUTE:
         return f"{lower:.4g} to {upper:.4g} m"
@@ -79,7 +79,7 @@ def limits_text(robot: RobotDescription, joint: int) -> str:
 
 
 def require_units(robot: RobotDescription, recording: Recording, file: Path) -> None:
-    """Refuse angles and positions that no arm has in radians and metres.
+    """Refuse angles and positions that are impossible for an arm in radians and metres.
 
     Raises:
         RecordingError: angles far beyond the limits, positions farther apart than the arm reaches, or times in which
@@ -117,7 +117,7 @@ def _require_metres(robot: RobotDescription, recording: Recording, file: Path) -
 
 
 def _likely_units(chain: RigidChain, recording: Recording) -> list[str]:
-    """Return the unit in which the nominal arm fits the positions; if it fits in none, one or two by their size."""
+    """Return the unit in which the nominal arm fits the positions; if none fits, one or two by their size."""
     from kbmaps.chains.placement import place  # imports scipy, which `predict` starts without
 
     rows = np.unique(np.linspace(0, len(recording.q) - 1, LimitSettings.fitted_rows).astype(np.intp))

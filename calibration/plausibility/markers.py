@@ -1,4 +1,4 @@
-"""Check that the marker is at one place on the hand: of several reflectors or tags, each row has one."""
+"""Check that the marker has one position on the hand: of several reflectors or tags, rows may be of different ones."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ class _Settings:
 
 
 def several_markers(search: ReadingSearch, before: float) -> Plausibility | None:
-    """Return a refusal if the marker is at several places on the hand in turn; else None.
+    """Return a refusal if the marker is at several places on the hand in turn, otherwise None.
 
-    The arm is placed by a few rows at a time (Fischler and Bolles 1981): where these are of one marker, the others lie
+    The arm is placed by a few rows at a time (Fischler and Bolles 1981): if these are of one marker, the others lie
     at few places on the hand.
     """
     rng, rows = np.random.default_rng(_Settings.seed), len(search.q)
@@ -77,11 +77,11 @@ def _scatter(on_hand: FloatArray) -> float:
 
 
 def _places(search: ReadingSearch, on_hand: FloatArray) -> NDArray[np.intp]:
-    """Return the place of each point (n,), from 1; -1 where it is at none with enough others."""
+    """Return the place of each point (n,), from 1; -1 for a point without enough others at its place."""
     places = np.asarray(fcluster(linkage(on_hand), _Settings.one_place_m, "distance"), dtype=np.intp)
     for place in range(1, int(places.max()) + 1):
         rows = np.flatnonzero(places == place)
-        # A pose that is held or comes back has the same errors of the arm in each row.
+        # Repeated or held poses have the same errors of the arm in each row.
         if (
             len(rows) < _Settings.share * len(places)
             or len(Poses.of(search.chain, search.q[rows]).rows) < _Settings.fewest

@@ -22,9 +22,10 @@ NEAR_RAD = math.radians(12.0)
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """One way to read the columns; all defaults except the order leave them as they are.
+    """One way to read the columns; all defaults except the order leave them unchanged.
 
-    A joint is its column times its sign, plus its quarter turns, plus what its column lacks of the joint before.
+    A joint is its column times its sign, plus its quarter turns, plus the angle of the previous joint if its column
+    lacks it.
     """
 
     order: tuple[int, ...]  # index of the column of each joint
@@ -34,8 +35,8 @@ class Reading:
     unit: str = METRES  # of the positions
     degrees: bool = False  # the angles are in degrees
     millimetres: bool = False  # the readings of prismatic joints are in millimetres
-    # 1 or -1 for a joint whose column lacks the angle of the joint before, or has it twice; else 0. So do arms whose
-    # elbow counts from the horizontal, as behind a parallelogram. Empty where no joint does.
+    # 1 or -1 for a joint whose column lacks the previous joint's angle, or contains it twice; otherwise 0. This occurs
+    # for arms whose elbow counts from the horizontal, as behind a parallelogram. Empty if no joint does.
     carried: tuple[int, ...] = ()
 
     @classmethod
@@ -85,7 +86,7 @@ class Reading:
             yield replace(self, millimetres=not self.millimetres)
 
     def carrying(self, joint: int) -> Iterator[Reading]:
-        """Yield the readings in which the column of a joint lacks the angle of the joint before, or has it twice."""
+        """Yield the readings in which the column of a joint lacks the previous joint's angle, or contains it twice."""
         for times in (1, -1):
             yield replace(self, carried=tuple(times * (k == joint) for k in range(len(self.order))))
 
@@ -114,7 +115,7 @@ class Reading:
 
     @property
     def changes(self) -> int:
-        """Number of changes from the columns as they are; all signs reversed together count as one."""
+        """Number of changes from the given columns; reversing all signs together counts as one."""
         moved, turned = sum(k != column for k, column in enumerate(self.order)), self.signs.count(-1)
         return (
             max(moved - 1, 0)
@@ -132,7 +133,7 @@ class Reading:
         return _listed([looks for looks, _ in self._said(joints, zeros)])
 
     def remedy(self, joints: Sequence[str], zeros: FloatArray) -> str:
-        """Return what to do; arguments as in `looks`."""
+        """Return the remedy; arguments as in `looks`."""
         remedies = "; ".join(remedy for _, remedy in self._said(joints, zeros))
         return f"{remedies[0].upper()}{remedies[1:]}"
 
@@ -140,7 +141,7 @@ class Reading:
         return replace(self, signs=_replaced(self.signs, {k: -self.signs[k]}))
 
     def _turnings(self, slides: Sequence[bool]) -> Iterator[Reading]:
-        """Yield readings with another quarter turn of one joint; the first and last are left to camera and marker."""
+        """Yield readings with another quarter turn of one joint; camera and marker absorb the outer joints'."""
         joints = range(len(self.order))
         for k in joints[1:-1]:
             if not slides[k]:

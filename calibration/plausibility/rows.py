@@ -1,4 +1,4 @@
-"""Check that angles and positions of a row belong together: logs joined by row number lose one or two."""
+"""Check that angles and positions of a row belong together: logs joined by row number may be shifted by one or two."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class _Settings:
 
 
 def few_outliers(search: ReadingSearch, before: float) -> str:
-    """Return a warning if few rows place the arm without some of them; else "".
+    """Return a warning if few rows place the arm without some of them, otherwise "".
 
-    Of many rows, outliers do not keep the others from placing the arm.
+    Among many rows, outliers do not prevent the others from placing the arm.
     """
     rows, joints = len(search.q), search.chain.joints
     most = rows - math.ceil(LimitSettings.measured_share * rows)
@@ -54,7 +54,7 @@ def few_outliers(search: ReadingSearch, before: float) -> str:
 
 
 def all_shifted(search: ReadingSearch, q: FloatArray, x: FloatArray, t: FloatArray | None) -> Plausibility | None:
-    """Return a refusal if each position belongs to the angles of a row nearby; else None.
+    """Return a refusal if each position belongs to the angles of a row nearby, otherwise None.
 
     Args:
         search: the search over other readings, which found none.
@@ -63,7 +63,7 @@ def all_shifted(search: ReadingSearch, q: FloatArray, x: FloatArray, t: FloatArr
     shifts, rows = _rows_nearby(len(q))
     if not place_an_arm(len(rows), search.chain.joints):
         return None
-    # As they are, the same rows: others may hold the outliers.
+    # Compare the same rows unshifted, since others may contain the outliers.
     tried = [0, *shifts]
     errors = search.errors(np.stack([q[rows + shift] for shift in tried]), np.stack([x[rows]] * len(tried)))
     best = int(errors.argmin())
@@ -81,7 +81,7 @@ def all_shifted(search: ReadingSearch, q: FloatArray, x: FloatArray, t: FloatArr
 
 
 def many_apart(search: ReadingSearch, far: float) -> bool:
-    """Return True if many rows are far [m] from the arm that the others place: few poses in turn fit some others."""
+    """Return True if many rows are far [m] from the arm placed by the others, since a few poses may fit by chance."""
     (apart,) = search.distances(search.q, search.x, [(search.q, search.x)])
     return bool((apart > far).mean() > _Settings.shifted)
 
@@ -89,12 +89,12 @@ def many_apart(search: ReadingSearch, far: float) -> bool:
 def partly_shifted(
     search: ReadingSearch, q: FloatArray, x: FloatArray, t: FloatArray | None, *, fits: bool
 ) -> Plausibility | None:
-    """Return a refusal if in many rows, and not in most, angles or positions belong to a row nearby; else None.
+    """Return a refusal if in many rows, but not most, angles or positions belong to a row nearby, otherwise None.
 
     Args:
         search: the search over other readings.
         q, x, t: all pairs (n, d) [rad, m] and (n, 3) [m], and their times (n,) [s] if known.
-        fits: the pairs place the arm. Else every row may be wrong, and the arm is also placed by shifted rows.
+        fits: True if the pairs place the arm. Otherwise every row may be wrong, and shifted rows also place the arm.
     """
     if len(q) < FEWEST_ROWS:
         return None
@@ -125,9 +125,9 @@ def partly_shifted(
 
 
 def partly_carried(search: ReadingSearch, names: Sequence[str]) -> Plausibility | None:
-    """Return a refusal if a joint counts together with the one before, which moves in few rows; else None.
+    """Return a refusal if a joint's column includes the previous joint, which moves in few rows, otherwise None.
 
-    Where joints move one after the other, the other rows place the arm, and these rows look like outliers.
+    If joints move one after the other, the other rows place the arm, and these rows look like outliers.
     """
     readings, slides = search.carrying(), search.chain.prismatic
     if not readings:
@@ -151,14 +151,14 @@ def partly_carried(search: ReadingSearch, names: Sequence[str]) -> Plausibility 
 
 
 def _rows_nearby(count: int) -> tuple[list[int], NDArray[np.intp]]:
-    """Return shifts, and rows of a recording of `count` that have neighbours so far away."""
+    """Return shifts, and the rows of a recording of `count` rows that have neighbours at these distances."""
     near = _Settings.near_rows
     shifts = [shift for shift in range(-near, near + 1) if shift]
     return shifts, np.unique(np.linspace(near, count - 1 - near, SearchSettings.rows).astype(np.intp))
 
 
 def _moved(shift: int) -> tuple[str, str]:
-    """Return what row it is whose angles fit, and the remedy."""
+    """Return a description of the row whose angles fit, and the remedy."""
     count, where = abs(shift), "later" if shift > 0 else "earlier"
     rows = f"{count} row{'s' if count > 1 else ''}"
     return (
@@ -169,7 +169,7 @@ def _moved(shift: int) -> tuple[str, str]:
 
 
 def _or_late(remedy: str, shift: int, t: FloatArray | None) -> str:
-    """Return the remedy, and before it the delay that explains the shift where the rows have times (n,) [s]."""
+    """Return the remedy, preceded by the delay that explains the shift if the rows have times (n,) [s]."""
     if t is None:
         return remedy
     late_ms = -1e3 * shift * float(np.median(np.diff(t)))

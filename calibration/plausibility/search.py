@@ -50,7 +50,7 @@ class Poses:
 
         Args:
             gain: logarithm of the ratio of their distances.
-            share: of the rows, by which the distances are measured.
+            share: fraction of the rows used to measure the distances.
         """
         return gain * max(3.0 * share * len(self.rows) - joints - 9.0, 0.0)
 
@@ -93,9 +93,9 @@ class ReadingFit:
     """Quality of a reading's fit."""
 
     error: float  # RMS distance of the nearest pairs, in the recording's own unit
-    nats: float  # minus the log-likelihood, what zeros and marker cost included
+    nats: float  # minus the log-likelihood, including the cost of offsets and marker
     zeros: FloatArray  # added to the joints (d,) beside the quarter turns [rad, m]
-    tool_m: float  # how far from its place the marker is [m]
+    tool_m: float  # distance of the marker from its place [m]
     rotation: FloatArray  # of the nominal measurement frame in the real one (3, 3)
 
 
@@ -105,7 +105,7 @@ class ReadingSearch:
     Args:
         q, x: rows to be read, (n, d) [rad, m] and (n, 3) [m].
         exact_m: distances below this are not distinguished [m].
-        pose_known: the camera pose is known.
+        pose_known: True if the camera pose is known.
     """
 
     def __init__(self, chain: RigidChain, q: FloatArray, x: FloatArray, exact_m: float, pose_known: bool) -> None:
@@ -117,7 +117,7 @@ class ReadingSearch:
         self.fits: dict[Reading, ReadingFit] = {}  # the best fit of each reading so far
 
     def verdict(self) -> tuple[Reading, Reading, list[Reading]]:
-        """Return the columns as they are, the simplest reading among the best, and others nearly as simple."""
+        """Return the unchanged columns, the simplest reading among the best, and others nearly as simple."""
         as_it_is = Reading.plain(self.chain.joints)
         slides: list[bool] = self.chain.prismatic.tolist()
         self._try([as_it_is, *as_it_is.neighbours(slides), *self.carrying()])
@@ -162,7 +162,7 @@ class ReadingSearch:
         return as_it_is, good[0], others[: SearchSettings.listed]
 
     def carrying(self) -> list[Reading]:
-        """Return the columns as they are, but for a joint that counts together with a parallel one before it."""
+        """Return the readings in which a joint's column includes, or lacks, a parallel joint before it."""
         axes, turns = self.chain.axes, self.chain.fixed[1:-1, :3, :3]
         along = np.einsum("ki,kij,kj->k", axes[:-1], turns, axes[1:])
         rigid = self.chain.prismatic[:-1] | self.chain.prismatic[1:]
@@ -171,7 +171,7 @@ class ReadingSearch:
         return [reading for joint in parallel.tolist() for reading in plain.carrying(joint)]
 
     def _aligned_tool(self) -> FloatArray:
-        """Return the marker's offset (1, 3) [m] with nominal joint offsets: its fit starts from many places."""
+        """Return the marker's offset (1, 3) [m] with nominal joint offsets; its fit starts from many places."""
         try:
             return align(self.chain, self.q, self.x, pose_known=False, marker_known=False).marker_shift[None]
         except DegenerateDataError:
@@ -216,7 +216,7 @@ class ReadingSearch:
         return place(self.chain, self.q[rows], self.x[rows], zeros_std=self._std, tool_std=LimitSettings.tool_m)
 
     def on_hand(self, placed: Placements, one: int) -> FloatArray:
-        """Return the positions (n, 3) [m] beside the marker, along the axes of its frame, by one of some placements."""
+        """Return positions (n, 3) [m] relative to the marker, along the axes of its frame, by one of the placements."""
         p = self._parameters
         change = np.zeros(p.size)
         change[p.zeros], change[p.tool] = placed.zeros[one], placed.tools[one]
@@ -225,9 +225,9 @@ class ReadingSearch:
         return np.einsum("nij,ni->nj", jacobian[:, :, p.tool], off)
 
     def with_marker_known(self, reading: Reading) -> tuple[Reading, ReadingFit] | None:
-        """Return the reading with a zero near the hand off by quarter turns, and its fit, if the known marker shows it.
+        """Return the reading with an offset near the hand off by quarter turns, and its fit, if the marker shows it.
 
-        With a free marker position such a turn makes no difference.
+        With a free marker position such a rotation makes no difference.
         """
         if self.chain.prismatic[-1]:
             return None
@@ -246,7 +246,7 @@ class ReadingSearch:
         return (best, fit) if clearly and far else None
 
     def with_marker_nearer(self, reading: Reading) -> Reading | None:
-        """Return the reading with other quarter turns, as good a fit, that brings a far marker near to its place."""
+        """Return the reading with other quarter turns and as good a fit that brings a distant marker near its place."""
         best = min(self._turned_alike(reading), key=lambda each: self.fits[each].tool_m, default=reading)
         far = self.fits[reading].tool_m > SearchSettings.nearer * max(
             self.fits[best].tool_m, LimitSettings.known_tool_m
@@ -264,7 +264,7 @@ class ReadingSearch:
         ]
 
     def undirected(self, names: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the joints whose sign makes no difference, in no row: some joints may move in few rows alone."""
+        """Return the joints whose sign makes no difference in any row, since some joints may move in few rows only."""
         plain, slides = Reading.plain(len(names)), self.chain.prismatic
         readings = list(itertools.islice(plain.neighbours(slides.tolist()), len(names)))
         alike = [self._as_good(self.fits[one], self.fits[plain]) if one in self.fits else False for one in readings]
@@ -287,10 +287,11 @@ class ReadingSearch:
         )
 
     def _most_probable(self, as_it_is: Reading) -> tuple[Reading, list[float]]:
-        """Return the most probable reading with links of some tolerance, and the errors of better fits that it refutes.
+        """Return the most probable reading for links with tolerances, and the errors of better fits that it refutes.
 
-        With nominal links a wrong reading may fit better: its marker and joint offsets make up for errors of the links.
-        They do so only where the columns as they are place the arm. These may be the wrong reading that fits better.
+        With nominal links a wrong reading may fit better, because its marker and joint offsets compensate errors of the
+        links. This is only possible if the unchanged columns place the arm. These may themselves be the wrong reading
+        that fits better.
         """
         rivals, spread = self._distinct([]), spread_m(self.x)
         own = self.fits.get(as_it_is)
@@ -358,12 +359,12 @@ class ReadingSearch:
         tool_m: float = LimitSettings.tool_m,
         tools: FloatArray | None = None,
     ) -> dict[Reading, ReadingFit]:
-        """Return the best fit of each reading; a zero that goes to the next quarter turn makes it another reading.
+        """Return the best fit of each reading; an offset that reaches the next quarter turn makes it another reading.
 
         Args:
-            std: how far each zero may be off (d,) [rad, m]; 1-sigma.
-            tool_m: how far the marker may be from its place [m]; 1-sigma of a coordinate.
-            tools: moves of the marker (s, 3) [m] to start from.
+            std: 1-sigma of each offset (d,) [rad, m].
+            tool_m: 1-sigma of a coordinate of the marker [m].
+            tools: displacements of the marker (s, 3) [m] to start from.
         """
         slides = self.chain.prismatic
         q = np.stack([reading.angles(self.q, slides) for reading in new])
@@ -393,5 +394,5 @@ class ReadingSearch:
 
 
 def nameable(reading: Reading, fit: ReadingFit, spread: float) -> bool:
-    """Return True if a fit is better than that of any wrong reading with as many changes."""
+    """Return True if a fit is better than that of any wrong reading with the same number of changes."""
     return fit.error < THRESHOLDS.named / (1 + reading.changes) * spread

@@ -21,7 +21,7 @@ from .verdict import THRESHOLDS, Plausibility, mm
 
 
 class _Settings:
-    """When positions of another size are reported."""
+    """Limits beyond which positions of another size are reported."""
 
     # Off by this many times its own uncertainty. Right recordings of real and generated arms come to 4.0, and fit
     # hardly better for it.
@@ -44,16 +44,16 @@ class Size:
 
     @property
     def sigmas(self) -> float:
-        """Distance from the right size, in its uncertainty."""
+        """Distance from the right size, in units of its uncertainty."""
         return abs(math.log(self.factor)) / self.log_sigma
 
 
 def of_another_size(size: Size, spread: float, before: float, best: float) -> Plausibility | None:
-    """Return what to say of positions that are too large or too small for the arm; None if they are not.
+    """Return the verdict on positions that are too large or too small for the arm; None if they are not.
 
     Args:
-        spread: of the positions [m].
-        before: distance of the pairs as they are [m].
+        spread: spread of the positions [m].
+        before: distance of the pairs with unchanged columns [m].
         best: the same, in the best reading of the columns.
     """
     far = size.sigmas > _Settings.far and size.error < THRESHOLDS.named / 2 * spread
@@ -76,11 +76,11 @@ def of_another_size(size: Size, spread: float, before: float, best: float) -> Pl
 def size_of(chain: RigidChain, q: FloatArray, x: FloatArray, apart: NDArray[np.intp], exact_m: float) -> Size:
     """Estimate the size of positions x (n, 3) [m] at q (n, d) [rad, m].
 
-    The links of an arm may be a little longer than nominal, by tolerances that the pairs show, but hardly all of them
-    by the same factor.
+    The links of an arm may be slightly longer than nominal, by tolerances determined from the pairs, but hardly all of
+    them by the same factor.
 
     Args:
-        apart: rows of poses far from each other. The errors of others are alike, and say nothing new.
+        apart: rows of poses far from each other. The errors of others are correlated with theirs.
         exact_m: distances below this are not distinguished [m].
     """
     log, sigma = 0.0, math.inf
@@ -98,7 +98,7 @@ def evidences(
     """Return the log evidence (m,) of readings of the same pairs; links and size may be off by tolerances.
 
     Args:
-        readings: joints q (n, d) [rad, m], positions x (n, 3) [m], and how many of the recording's units are 1 m.
+        readings: joints q (n, d) [rad, m], positions x (n, 3) [m], and the number of the recording's units in 1 m.
         apart: as in `size_of`.
     """
     placed = [_placed(chain, q[apart], x[apart]) for q, x, _ in readings]
@@ -116,7 +116,7 @@ def _placed(chain: RigidChain, q: FloatArray, x: FloatArray) -> Placements:
 
 
 def _log_size(chain: RigidChain, q: FloatArray, placed: Placements, x: FloatArray) -> tuple[float, float]:
-    """Return mean and 1-sigma of the logarithm of the positions' size, over all workmanships and noise levels."""
+    """Return mean and 1-sigma of the logarithm of the positions' size, over all tolerances and noise levels."""
     evidence, means, variances = _evidences(chain, q, placed, x, _is_near(placed.distances[0]))
     shares = np.exp(evidence - evidence.max())
     shares /= shares.sum()
@@ -129,7 +129,7 @@ def _is_near(distances: FloatArray) -> BoolArray:
 
 
 def _evidences(chain: RigidChain, q: FloatArray, placed: Placements, x: FloatArray, good: BoolArray) -> FloatArray:
-    """Return log evidence, mean and variance (3, k) of the size from `good` rows, by workmanship and noise level."""
+    """Return log evidence, mean and variance (3, k) of the size from `good` rows, by tolerances and noise level."""
     distances, parameters = placed.distances[0], ChainParameters(chain)
     change = np.zeros(parameters.size)
     change[parameters.zeros], change[parameters.tool] = placed.zeros[0], placed.tools[0]
@@ -152,7 +152,7 @@ def _evidences(chain: RigidChain, q: FloatArray, placed: Placements, x: FloatArr
 
 
 def _made(parameters: ChainParameters) -> Iterator[FloatArray]:
-    """Yield roots (p, k) of the covariance of each workmanship, and of the same with one link of any length."""
+    """Yield roots (p, k) of the covariance for each of the tolerances, and the same with one link of any length."""
     _, _, tangents, _, marker = parameters.tables
     joints = len(tangents)
     for axes, points in ToleranceSettings.workmanship:
@@ -183,7 +183,7 @@ def _posteriors(
     """Return log evidence, mean and variance (3, k) of the size, for each noise variance (k,).
 
     Args:
-        effects: of numbers of variance 1 (p, k).
+        effects: effects of parameters of variance 1 (p, k).
         within: residuals and the effect of the size, as far as the parameters can explain them (2, p).
         beyond: products of the rest (2, 2).
     """

@@ -1,4 +1,4 @@
-"""Result of the plausibility check, and what it takes to report something."""
+"""Result of the plausibility check, and its thresholds."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FEWEST_ROWS = 40
 
 @dataclass(frozen=True)
 class _Thresholds:
-    """What a way to read the recording has to reach to be reported."""
+    """Thresholds beyond which a way to read the recording is reported."""
 
     # Another reading is reported if the pairs fit this many times better, and mentioned from `as_good` times on. Arms
     # with tolerances of 0.5° and 1 mm, offsets of 10° and noise of 10 mm stay below 1.15 with all wrong readings.
@@ -38,10 +38,10 @@ THRESHOLDS = _Thresholds()
 class Plausibility:
     """Result of the plausibility check."""
 
-    refusal: str | None = None  # why the recording cannot be of this robot as it is, or None
-    remedy: str = ""  # what to do about that
-    misread: bool = False  # another reading of the columns was found that fits
-    # so many times better than the columns as they are, or than those of any real arm where none fits
+    refusal: str | None = None  # reason why the recording cannot be of this robot in its present form, or None
+    remedy: str = ""  # the remedy
+    misread: bool = False  # True if another reading of the columns fits
+    # how many times better it fits than the unchanged columns, or than those of any real arm if none fits
     better: float = 1.0
     warnings: tuple[str, ...] = ()  # sentences about possible problems
     undirected: tuple[str, ...] = ()  # joints whose sign these pairs do not determine
@@ -55,7 +55,7 @@ class Plausibility:
         """Return the warnings for a recording that is fitted.
 
         Raises:
-            RecordingError: it cannot be of this robot as it is.
+            RecordingError: it cannot be of this robot in its present form.
         """
         if self.refusal is not None and not force:
             raise RecordingError(self.refusal, file=file, remedy=f"{self.remedy}. Or fit it as it is with --force")

@@ -1,1 +1,1 @@
-"""Calibrate cameras, and show what they see."""
+"""Calibrate cameras, and show their images."""

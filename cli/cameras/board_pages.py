@@ -12,7 +12,7 @@ _WRITERS = {".pdf": pdf, ".svg": svg}
 
 
 def write_page(page: Page, out: Path) -> tuple[float, float]:
-    """Write a page as PDF or SVG, ConfigError if that is not possible; return its rulers across and upright [mm]."""
+    """Write a page as PDF or SVG; return its horizontal and vertical ruler [mm]; raise ConfigError if writing fails."""
     writer = _WRITERS.get(out.suffix.lower())
     if writer is None:
         raise ConfigError(f"{out}: neither .pdf nor .svg", remedy="Name a file that ends so")
@@ -22,7 +22,7 @@ def write_page(page: Page, out: Path) -> tuple[float, float]:
 
 
 def printed_scale(nominal_mm: float, measured_mm: float) -> float:
-    """Return the scale at which a page's ruler measures that; ConfigError if another line was measured."""
+    """Return the ratio of a page's measured to its nominal ruler; raise ConfigError if it is implausible."""
     scale = measured_mm / nominal_mm
     if not 0.5 < scale < 2.0:
         raise ConfigError(

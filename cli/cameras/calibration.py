@@ -58,7 +58,7 @@ class Parameter(msgspec.Struct):
 
 
 class ViewFigures(msgspec.Struct):
-    """RMS errors of a view per image coordinate, fitted and not fitted [px]."""
+    """RMS errors of a view per image coordinate, fitted and held out [px]."""
 
     name: str
     rms_px: float
@@ -83,9 +83,9 @@ class UnusableImage(msgspec.Struct):
 class CamerasFile(msgspec.Struct):
     """Output of `bodyschema calibrate cameras --json`. Half widths are those of 95 % intervals.
 
-    One camera alone has no baseline. Positions are those of a marker of known size all over the view, 0.6 m ahead.
+    A single camera has no baseline. Positions are those of a marker of known size all over the view, 0.6 m ahead.
     `right_camera` is the pose of the right optical frame in the left one. `refocused` has a sentence for each sign that
-    a lens refocused between the views, or was free to.
+    a lens refocused, or could refocus, between the views.
     """
 
     model: str
@@ -149,7 +149,7 @@ def board_of(
 
 
 def as_printed(drawn: Board, ruler_mm: float | None) -> Board:
-    """Return the board as printed: the longer ruler of its page measures `ruler_mm`. ConfigError if that cannot be."""
+    """Return the board as printed: its page's longer ruler measures `ruler_mm`; raise ConfigError if implausible."""
     if ruler_mm is None:
         return drawn
     width, height = drawn.size_m
@@ -158,7 +158,7 @@ def as_printed(drawn: Board, ruler_mm: float | None) -> Board:
 
 
 def write_board(board: Board, paper: str, out: Path) -> tuple[float, float]:
-    """Write the board's page as PDF or SVG; the lengths of its rulers, across and upright [mm].
+    """Write the board's page as PDF or SVG; return the lengths of its horizontal and vertical ruler [mm].
 
     Raises:
         ConfigError: it does not fit, the ending is neither, or the file cannot be written.
@@ -167,7 +167,7 @@ def write_board(board: Board, paper: str, out: Path) -> tuple[float, float]:
 
 
 def from_images(images: Images, board: Board, tell: Tell) -> Gathered:
-    """All views in a folder's images.
+    """Return all views in a folder's images.
 
     Raises:
         CalibrationError: there are no pairs, sizes differ, or an eye never sees a usable board.
@@ -183,7 +183,7 @@ def calibrated(found: Gathered, known: KnownCameras, tell: Tell, serials: Sequen
     """Calibrate from the views.
 
     Args:
-        serials: those of the cameras; what is `known` takes precedence.
+        serials: serials of the cameras; those in `known` take precedence.
 
     Raises:
         CalibrationError: the result is not good enough; the message has the reasons.
@@ -224,8 +224,8 @@ def figures(
     """Return the figures of a calibration.
 
     Args:
-        autofocus: what live cameras reported of their focus.
-        size_was_measured: the board, or the distance between the lenses, was measured with a ruler.
+        autofocus: reports of live cameras on their focus.
+        size_was_measured: True if the board, or the distance between the lenses, was measured with a ruler.
     """
     rig, fitted = result.rig, result.fitted
     pair = rig if isinstance(rig, StereoRig) else None
@@ -256,7 +256,7 @@ def figures(
 
 
 def checked(file: Path, images: Images, board: Board) -> tuple[CheckFile, str]:
-    """One look at the board with the calibration in `file`, and which pair it was: the newest that shows the board.
+    """Check the calibration in `file` with the newest pair that shows the board; return the result and the pair's name.
 
     Raises:
         ConfigError: the file is damaged.
@@ -372,7 +372,7 @@ def _sentences(found: CamerasFile, wishes: int = 3) -> list[str]:
         said.append(f"Left out, since they do not fit the others: {names}.")
     if found.unusable:
         said.append(f"{len(found.unusable)} images could not be used; the report names them.")
-    # The size of the board moves it nearer or farther, and changes nothing of a lens.
+    # The size of the board changes its distance, but not the lens.
     if not found.size_was_measured and found.baseline_mm is not None:
         said.append(
             "No image shows whether the board has its stated size: measure the line below it and give --ruler-mm, "

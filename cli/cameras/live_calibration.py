@@ -36,16 +36,16 @@ MORE_VIEWS = 4
 class Shown:
     """Feedback for the person who holds the board."""
 
-    coverage: Coverage  # what the views cover
+    coverage: Coverage  # coverage of the views
     views: int  # number of views taken
     look: Look | None = None  # the last pair of images; None before any, and while the cameras are lost
-    trouble: tuple[str, ...] = ()  # what is wrong with the cameras, and what to do
-    refusal: str = ""  # why the calibration was not good enough, when it was last tried
-    doing: str = ""  # what takes its time; empty while views are taken
+    trouble: tuple[str, ...] = ()  # faults of the cameras, with the remedies
+    refusal: str = ""  # reason why the last calibration was not good enough
+    doing: str = ""  # present computation; empty while views are taken
 
     @property
     def wish(self) -> str:
-        """Advice on what to show next."""
+        """Advice on the next view."""
         missing = self.coverage.missing()
         if missing:
             return missing[0]
@@ -67,7 +67,7 @@ def _named(image_size_px: tuple[int, int], serials: tuple[str, ...]) -> str:
 
 
 class LiveCalibration:
-    """Takes views until nothing is missing and the calibration is good enough, or until `stop`."""
+    """Collector of views until none is missing and the calibration is good enough, or until `stop`."""
 
     def __init__(
         self,
@@ -75,7 +75,7 @@ class LiveCalibration:
         views: LiveViews,  # empty collection of views of the board
         # calibrates from views and serials; raises CalibrationError if the result is not good enough
         calibrated: Callable[[Gathered, tuple[str, ...], Tell], Calibrated],
-        show: Show,  # called for every pair of images, and with the trouble while there are none
+        show: Show,  # called for every pair of images, and with the fault if there are none
         clock: Clock,
         # called with the images of every view taken and its number, from 1 on
         keep: Callable[[ImagePair, int], None] = lambda _pair, _number: None,
@@ -89,14 +89,15 @@ class LiveCalibration:
         self._stopping = False
 
     def stop(self) -> None:
-        """End the collection of views, so that `run` calibrates from those it has. Sets a flag only."""
+        """End the collection of views, so that `run` calibrates from those so far. Only sets a flag."""
         self._stopping = True
 
     def run(self) -> tuple[Gathered, Calibrated]:
         """Gather views until their calibration is good enough; return both.
 
         Raises:
-            CalibrationError: the images ended or `stop` was called before it was good enough; with the reasons.
+            CalibrationError: the images ended, or `stop` was called, before it was good enough; the message has the
+                reasons.
             SourceError: the cameras cannot be opened.
         """
         with self._source, suppress(SourceEnded):
@@ -112,7 +113,7 @@ class LiveCalibration:
         return self._views.found, self._calibration()
 
     def _require_same(self) -> None:
-        """Raise SourceError if cameras or image size are not those of the first time."""
+        """Raise SourceError if cameras or image size have changed since the first opening."""
         these = self._eyes.image_size_px, self._eyes.serials
         self._first = self._first or these
         if these != self._first:
@@ -127,7 +128,7 @@ class LiveCalibration:
         return self._views.look(frame)
 
     def _tried(self) -> Calibrated | None:
-        """Return the calibration if the views cover enough and it is good enough; else None."""
+        """Return the calibration if the views cover enough and it is good enough, otherwise None."""
         if len(self._views.found.views) < self._next_try or self._views.coverage.missing():
             return None
         try:
@@ -148,11 +149,11 @@ class LiveCalibration:
 def checked_live(
     eyes: HealthyEyes, calibration: Path, views: LiveViews, show: Show, clock: Clock, longest_s: float
 ) -> Check:
-    """One look of both eyes at the board, held still, with the calibration in a file.
+    """Check the calibration in a file with one view of a still board by both eyes.
 
     Args:
-        eyes: cameras that are not open; they are closed again.
-        longest_s: how long the board is waited for [s].
+        eyes: closed cameras; they are closed again.
+        longest_s: longest wait for the board [s].
 
     Raises:
         ConfigError: the file is damaged.
@@ -203,7 +204,7 @@ def now_text(shown: Shown) -> str:
 
 
 def screen(shown: Shown, heading: str) -> Group:
-    """All of it, for 80 columns and 24 lines."""
+    """Return the feedback as a screen for 80 columns and 24 lines."""
     coverage = shown.coverage
     wanted = max(ViewSettings.wanted_views, coverage.whole_views)
     count = f"{coverage.whole_views} of {wanted} views, {coverage.progress:.0%}"
@@ -234,7 +235,7 @@ def _is_taken(look: Look | None) -> bool:
 
 
 def _cells(coverage: Coverage, look: Look | None, eye: Eye) -> Table:
-    """Return a table of the image's nine cells: those covered so far, and those the board is in now."""
+    """Return a table of the image's nine cells: those covered so far, and those that contain the board now."""
     table = Table.grid()
     here = None
     if look is not None and look.view.eye(eye) is not None:
@@ -271,7 +272,7 @@ def _distances(coverage: Coverage) -> Table:
 
 
 class Lines:
-    """The same as lines: each view and each complaint at once, what else changes every few seconds."""
+    """The same feedback as lines: each view and each complaint at once, other changes every few seconds."""
 
     def __init__(self, say: Callable[[str], None], clock: Clock) -> None:
         self._say, self._clock = say, clock
@@ -281,7 +282,7 @@ class Lines:
         self._wish = ""
 
     def __call__(self, shown: Shown) -> None:
-        """Print what is new."""
+        """Print the news."""
         for text in (shown.refusal and f"not good enough yet: {shown.refusal}", *shown.trouble):
             self._once(text, self._complaints)
         if _is_taken(shown.look) or (shown.wish != self._wish and not shown.doing):

@@ -48,7 +48,7 @@ class Tags:
 
     @property
     def numbers(self) -> list[int]:
-        """Numbers of the tags. ConfigError if they cannot be parsed, or one is repeated."""
+        """Numbers of the tags; raises ConfigError if they cannot be parsed, or one is repeated."""
         if self.ids is None:
             return list(range(1 if self.body is None else len(self.body.faces)))
         return numbers_of(self.ids)
@@ -70,14 +70,14 @@ def numbers_of(ids: str, most: int = 100) -> list[int]:
 
 
 def sheet(tags: Tags, paper: str) -> Page:
-    """Lay out the page. ConfigError if there are no such tags, or they do not fit."""
+    """Lay out the page; raise ConfigError if a tag is unknown, or they do not fit."""
     if tags.shape == "board":
         if tags.ids is not None:
             raise ConfigError("the tags of a board are numbered from 0", remedy="Leave out --ids")
         family = tags.dictionary.replace("aruco_6x6", "6X6").replace("apriltag", "APRILTAG")
         return board_page(Board(tags.columns, tags.rows, 1e-3 * face_mm(tags), dictionary=family), paper)
     if tags.shape == "chessboard":
-        tables(tags)  # raises where there is no such marker
+        tables(tags)  # raises if such a marker is impossible
         return board_page(Board(tags.columns, tags.rows, 1e-3 * tags.side_mm, pattern="chessboard"), paper)
     body, ids = tags.body, tags.numbers
     if body is None:
@@ -103,5 +103,5 @@ def tables(tags: Tags) -> str:
 
 
 def as_printed(tags: Tags, drawn_mm: float, measured_mm: float) -> Tags:
-    """Scale the tags by their page's ruler of `drawn_mm`. ConfigError if another line was measured."""
+    """Scale the tags by their page's ruler of `drawn_mm`; raise ConfigError if the length is implausible."""
     return replace(tags, side_mm=printed_scale(drawn_mm, measured_mm) * tags.side_mm)

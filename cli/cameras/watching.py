@@ -27,7 +27,7 @@ class Pictures(Source, Protocol):
 
 
 class Watching:
-    """Reads pictures until a stop is requested, there are no more, or enough were shown."""
+    """Reader of pictures until a stop is requested, there are no more, or enough were shown."""
 
     def __init__(
         self, pictures: Pictures, show: Callable[[bytes], None], *, every_s: float = 0.0, count: int | None = None
@@ -40,7 +40,7 @@ class Watching:
 
     @classmethod
     def into(cls, folder: Path, pictures: Pictures, *, every_s: float, count: int | None) -> Self:
-        """Write pictures into files 000001.jpg and so on. ConfigError if the folder cannot be created."""
+        """Write pictures into files 000001.jpg and so on; raise ConfigError if the folder cannot be created."""
         with writing(folder, what="made", remedy="Give another --out"):
             folder.mkdir(parents=True, exist_ok=True)
         numbers = itertools.count(1)
@@ -96,10 +96,10 @@ class _Server(ThreadingHTTPServer):
 
 
 class MjpegServer:
-    """Serves the newest picture to its viewers. A slow viewer misses pictures and delays no other."""
+    """Server of the newest picture to its viewers. A slow viewer misses pictures and delays no other."""
 
     def __init__(self, port: int) -> None:
-        """Prepare without listening yet; port 0 takes a free one."""
+        """Prepare without listening yet; port 0 selects a free one."""
         self._port = port
         self._newest: bytes | None = None
         self._number = 0

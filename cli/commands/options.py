@@ -79,7 +79,7 @@ class SearchOptions:
     seed: Annotated[int, Parameter(help="Of the resampling behind the intervals.", validator=Number(gte=0))] = 0
 
     def asked(self) -> Asked:
-        """Return the effects to look for; RequestError for an unknown one."""
+        """Return the effects to look for; raise RequestError for an unknown one."""
         from bodyschema.cli.recordings.diagnosis import Asked
 
         return Asked.of(self.effects, self.exclude, self.seed)
@@ -105,16 +105,16 @@ class LeRobotOptions:
     ] = False
 
     def require(self, config: Config) -> None:
-        """Raise ConfigError if joint offsets could not be put into the file, if there is one."""
+        """Raise ConfigError if a file is given but joint offsets could not be written to it."""
         from bodyschema.cli.hardware.lerobot_robot import CorrectedCalibration
 
         if self.lerobot is not None:
             CorrectedCalibration.of(config, self.lerobot, {})
 
     def lines(self, config: Config, offsets_rad: Mapping[str, float], recording: Path | None) -> list[str]:
-        """Return what joint offsets change in the file, after writing it where asked; nothing without a file.
+        """Return the changes of the file by joint offsets, after writing it if requested; nothing without a file.
 
-        Where the file has the offsets of this `recording` already, this is said, and nothing is written.
+        If the file already contains the offsets of this `recording`, nothing is written, and the lines report it.
         """
         from bodyschema.cli.hardware.lerobot_robot import CorrectedCalibration, after_writing, difference
 
@@ -139,14 +139,14 @@ def flag(text: str, *, name: str | None = None) -> Parameter:
 
 
 def say(*lines: str, stderr: bool = False) -> None:
-    """Print lines as they are: neither wrapped nor read as markup."""
+    """Return a function that prints lines unchanged: neither wrapped nor read as markup."""
     console = Console(stderr=stderr, highlight=False, soft_wrap=True)
     for line in lines:
         console.print(line, markup=False)
 
 
 def print_json(value: object) -> None:
-    """Print `value`, which becomes a JSON object, as one line, with the key `schema` for the version of its keys."""
+    """Print `value` as a JSON object on one line, with the key `schema` for the version of its keys."""
     import msgspec
 
     from bodyschema.daemon.transport.wire import SCHEMA, encode
@@ -162,7 +162,7 @@ def several(text: str) -> Parameter:
 
 
 def robot_file(given: Path | None, source: Path | None) -> Path:
-    """Return `given`; else the robot.toml beside `source`; else that of the environment or the working directory."""
+    """Return `given`, else the robot.toml beside `source`, else that of the environment or the working directory."""
     if given is not None:
         return given
     if source is not None and (beside := source.parent / HERE).exists():
@@ -173,7 +173,7 @@ def robot_file(given: Path | None, source: Path | None) -> Path:
 @Parameter(name="*")
 @dataclass(frozen=True)
 class PrintedBoard:
-    """The board: as its page was written, and as it came out of the printer."""
+    """The board: its nominal page, and the size of the print."""
 
     squares: Annotated[str, Parameter(help="Columns and rows of the board's squares, as in 8x6.")] = "8x6"
     square_mm: Annotated[float, Parameter(help="Nominal side of a square [mm].", validator=Number(gt=0))] = 30.0
@@ -215,7 +215,7 @@ class PrintedBoard:
 @Parameter(name="*")
 @dataclass(frozen=True)
 class EyeFiles:
-    """Which of a folder's images are which eye's."""
+    """Selection of a folder's images for each eye."""
 
     left: Annotated[str | None, Parameter(help="Pattern of the left eye's files in it, as in cam0_*.png.")] = None
     right: Annotated[str | None, Parameter(help="Pattern of the right eye's.")] = None

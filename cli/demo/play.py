@@ -48,7 +48,7 @@ _STYLE = (
 class CurveRow:
     """One moment of the demo: mean errors against the simulator's ground truth [m].
 
-    `angle_rad` is the mean angle to the true orientation on held-out poses [rad]; None if none is learnt.
+    `angle_rad` is the mean angle to the true orientation on held-out poses [rad]; None if no orientation is learnt.
     """
 
     pairs: int
@@ -136,7 +136,7 @@ class Verdict:
 
 
 class Judge:
-    """Compares the learner's answers with the simulated ground truth."""
+    """Evaluation of the learner's answers against the simulated ground truth."""
 
     def __init__(self, robot: RobotDescription, sampler: ZenohSession, learner: ZenohSession, seed: int) -> None:
         self._robot, self._sampler, self._learner = robot, sampler, learner

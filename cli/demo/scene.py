@@ -77,7 +77,7 @@ def _tag(id: int, xyz: FloatArray, rpy: FloatArray) -> list[str]:
 
 
 def _outward(normal: FloatArray) -> Rotation:
-    """Return a rotation that turns z into `normal` (3,)."""
+    """Return a rotation that maps z to `normal` (3,)."""
     from scipy.spatial.transform import Rotation
 
     side = np.roll(normal, 1)
@@ -122,10 +122,10 @@ class Scene:
 def prepare(
     folder: Path, seed: int, *, bus: Bus | None = None, marker: Marker = "ball", camera: Camera = "stereo"
 ) -> Scene:
-    """Lay out the demo's folder; what an earlier demo left there is replaced.
+    """Lay out the demo's folder; files of an earlier demo are replaced.
 
     Args:
-        bus: what the joints are read through, from a bench.
+        bus: emulated bus that the joints are read through.
         camera: the stereo pair, or its left eye alone.
 
     Raises:

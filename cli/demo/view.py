@@ -33,7 +33,7 @@ def shown_on(console: Console) -> Iterator[Callable[[Snapshot], None]]:
 
 
 class _Lines:
-    """Prints lines of less than 80 characters, a few seconds apart, without repeats."""
+    """Printer of lines of less than 80 characters, a few seconds apart, without repeats."""
 
     def __init__(self, console: Console) -> None:
         self._console = console

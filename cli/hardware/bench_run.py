@@ -116,7 +116,7 @@ class BenchRun:
             yield said
 
     def introduction(self) -> Iterator[str]:
-        """Yield what is emulated, and what to type in another terminal."""
+        """Yield a description of the emulation, and the commands to type in another terminal."""
         config, file = self._config, self.robot_file
         for words in bench_ports(self._bench):
             yield f"{config.robot.name}: {words}"

@@ -78,7 +78,7 @@ def steps(config: Config) -> Iterator[Step]:
 
 
 def as_json(checks: list[Check]) -> str:
-    """Return the checks as JSON; `well` is true if none is wrong."""
+    """Return the checks as JSON; `well` is true if none failed."""
     contents = {"schema": 1, "well": all(check.state != "wrong" for check in checks), "checks": checks}
     return msgspec.json.format(msgspec.json.encode(contents)).decode()
 
@@ -204,7 +204,7 @@ def store_checks(file: Path) -> Iterator[Check]:
 
 
 def clock_checks(is_synchronised: Callable[[], bool | None] | None = None) -> Iterator[Check]:
-    """Check that the wall clock, which dates the pairs, is synchronised. (Time stamps use the monotonic clock.)"""
+    """Check that the wall clock, which dates the pairs, is synchronised. (Timestamps use the monotonic clock.)"""
     known = (_is_synchronised if is_synchronised is None else is_synchronised)()
     if known is None:
         yield Check("clock", "ok", "the system does not report whether the clock is synchronised")
@@ -281,7 +281,7 @@ INDENT = "    "
 
 
 def show(console: Console, checks: Sequence[Check]) -> None:
-    """Print a line for each check, below it the command that fixes it, and the summary."""
+    """Print a line for each check, the command that fixes it below, and the summary."""
     for check in checks:
         line = Table.grid(padding=(0, 1))
         line.add_column(no_wrap=True)

@@ -55,7 +55,7 @@ class JointState(msgspec.Struct, frozen=True):
 
     @property
     def range(self) -> JointRange:
-        """The part of its limits that it has covered."""
+        """The covered part of its limits."""
         return JointRange(self.low, self.high, self.lower, self.upper)
 
 
@@ -70,7 +70,7 @@ class Seen(msgspec.Struct, frozen=True):
 
 
 class JointsWatch:
-    """Reads an arm, and keeps the ranges seen so far."""
+    """Reader of an arm that keeps the ranges so far."""
 
     def __init__(self, config: Config, source: EncoderJoints, clock: Clock) -> None:
         self._robot, self._source, self._clock = config.robot, source, clock
@@ -150,7 +150,7 @@ class JointsWatch:
 
 
 def signs_in(*, is_ros2: bool, is_plugin: bool) -> str:
-    """Return where the signs and zeros of the joints are set, for messages."""
+    """Return the place where the signs and zeros of the joints are set, for messages."""
     if is_ros2:
         return "[drivers.ros2.names] or the URDF: ROS 2 gives the angles with their signs and zeros"
     if is_plugin:
@@ -177,14 +177,14 @@ class Speeds:
 
 
 class SignCheck:
-    """Predicts by the URDF where the marker went when one joint was moved, for the user to compare."""
+    """Prediction by the URDF of the marker's motion when one joint was moved, for the user to compare."""
 
     def __init__(self, robot: RobotDescription) -> None:
         # from the link that carries the cameras to the marker
         placed = robot.with_placement(np.eye(4), np.array(robot.robot.marker_xyz))
         self._robot, self._chain = robot, placed.chain
         self._begin: FloatArray | None = None
-        self._rest: tuple[float, FloatArray] | None = None  # since when, and where
+        self._rest: tuple[float, FloatArray] | None = None  # start time and position
         self.said = ""  # the prediction in words, for the joint moved last; empty before
 
     def take(self, t: float, q: FloatArray) -> None:
@@ -197,7 +197,7 @@ class SignCheck:
         place = int(np.abs(moved).argmax())
         if abs(moved[place]) > _Settings.moved_rad:
             self.said = self._sentence(place, self._begin, float(moved[place]))
-        if t - self._rest[0] > _Settings.still_s:  # at rest: what follows is another move
+        if t - self._rest[0] > _Settings.still_s:  # at rest: any later motion is another move
             self._begin = q
 
     def _sentence(self, place: int, begin: FloatArray, moved: float) -> str:

@@ -52,11 +52,11 @@ class LeRobotServo:
     model: str
     direction: int
     zero_ticks: float
-    middle_rad: float  # the joint's angle where LeRobot reads 0° [rad]
+    middle_rad: float  # the joint's angle at LeRobot's 0° [rad]
 
 
 def lerobot_arm(name: str) -> LeRobotArm:
-    """Return the arm that LeRobot calls `name`; ConfigError where its motors are not known."""
+    """Return the arm that LeRobot calls `name`; raise ConfigError if its motors are unknown."""
     if name not in ARMS:
         raise ConfigError(f"--lerobot {name}: the motors of this arm are not known", remedy=did_you_mean(name, ARMS))
     return ARMS[name]
@@ -66,9 +66,9 @@ def lerobot_robot_toml(arm: LeRobotArm, urdf: Path, robot: Path, calibration: Pa
     """Return the text of a robot.toml for `arm`.
 
     Args:
-        robot: the file that is to be written; the URDF is named relative to it.
+        robot: the file to be written; the URDF is named relative to it.
         calibration: LeRobot's file of this arm.
-        port: where its servos are.
+        port: port of its servos.
 
     Raises:
         ConfigError: the URDF has other joints, or the calibration is not of this arm.
@@ -103,7 +103,7 @@ def lerobot_port(arm: LeRobotArm, scan: Scan) -> str:
 
 
 def joint_servos(servos: Servos) -> list[JointServo]:
-    """Return how each joint is read, from the servos of robot.toml."""
+    """Return the conversion of each joint, from the servos of robot.toml."""
     known, found = known_models(), list[JointServo]()
     for servo in servos.servos:
         model = known[servo.model]
@@ -121,7 +121,7 @@ def _ids(bus: ScannedBus) -> str:
 
 
 def _end(tree: UrdfTree, joints: Sequence[str]) -> str:
-    """Return the link that the last of `joints` moves, and no joint beyond it; the farthest of them."""
+    """Return the farthest link that the last of `joints` moves without any joint beyond it."""
     missing = [joint for joint in joints if joint not in tree.joints]
     if missing:
         raise ConfigError(
@@ -156,7 +156,7 @@ def _servos(arm: LeRobotArm, tree: UrdfTree, calibrations: Calibrations, file: P
 
 
 def _middle_rad(lower: float, upper: float) -> float:
-    """Return the angle of a joint with these limits where LeRobot reads 0° [rad]."""
+    """Return the angle of a joint with these limits at LeRobot's 0° [rad]."""
     middle = (lower + upper) / 2
     return 0.0 if abs(middle) < _Settings.middle_within_rad else middle
 
@@ -193,19 +193,19 @@ RECORDINGS = ".recordings"
 
 @dataclass(frozen=True)
 class CorrectedCalibration:
-    """A calibration file with the offsets in it."""
+    """A calibration file that contains the offsets."""
 
     file: Path  # LeRobot's
-    motors: Calibrations  # all motors as they would be written
-    changes: tuple[Correction, ...]  # what is put into which motor
+    motors: Calibrations  # all motors with their new values
+    changes: tuple[Correction, ...]  # the change of each motor
     warnings: tuple[str, ...] = ()
 
     @classmethod
     def of(cls, config: Config, file: Path, offsets_rad: Mapping[str, float]) -> CorrectedCalibration:
-        """Put offsets, which are to be added to the joints' readings [rad], into the calibration in `file`.
+        """Add joint offsets [rad], which are to be added to the readings, to the calibration in `file`.
 
         Raises:
-            ConfigError: robot.toml has no servos, or the file is not of them.
+            ConfigError: robot.toml has no servos, or the file does not belong to them.
         """
         servos = joint_servos(require_servos(config))
         motors = read_calibration(file, [servo.joint for servo in servos])
@@ -214,7 +214,7 @@ class CorrectedCalibration:
         return cls(file, after, changes, _other_zeros(config, servos, motors, file))
 
     def already(self, recording: Path | None) -> list[str]:
-        """Return what to say where the offsets of this recording are in the file already; else nothing."""
+        """Return a message if the file already contains the offsets of this recording, otherwise nothing."""
         digest = _digest(recording)
         backups = [line.split("\t")[1] for line in self._noted().splitlines() if line.startswith(f"{digest}\t")]
         if recording is None or not backups:
@@ -230,7 +230,7 @@ class CorrectedCalibration:
         """Replace the file, and keep the old one beside it; return the name of the old one.
 
         Args:
-            recording: the file in which the offsets were found, to be noted beside the calibration.
+            recording: the recording of the offsets, to be noted beside the calibration.
 
         Raises:
             ConfigError: nothing could be written.
@@ -275,11 +275,11 @@ def _other_zeros(config: Config, servos: Sequence[JointServo], motors: Calibrati
 
 
 def _digest(recording: Path | None) -> str | None:
-    """Return the SHA-256 of a recording in one file; None of any other."""
+    """Return the SHA-256 of a recording in one file; None for any other."""
     if recording is None or not recording.is_file():
         return None
     digest = hashlib.sha256()
-    recent = recording.with_name(f"{recording.name}-wal")  # where SQLite keeps what it has not yet put into a store
+    recent = recording.with_name(f"{recording.name}-wal")  # SQLite's file of data not yet moved into a store
     try:
         for file in (recording, recent):
             if file is recording or file.is_file():
@@ -291,7 +291,7 @@ def _digest(recording: Path | None) -> str | None:
 
 
 def difference(corrected: CorrectedCalibration) -> list[str]:
-    """Return the lines that show what changes in the file."""
+    """Return lines that show the changes of the file."""
     file, changes = corrected.file, [change for change in corrected.changes if change.ticks]
     if not changes:
         return [
@@ -308,7 +308,7 @@ def difference(corrected: CorrectedCalibration) -> list[str]:
 
 
 def after_writing(backup: Path) -> str:
-    """Return what to do once the file is written."""
+    """Return the steps to take after the file is written."""
     return (
         f"Written; the old file is {backup}. Start LeRobot, and press ENTER where it offers to write the calibration "
         "file to the motors. From then on the readings have the offsets in them, so keep robot.toml and its URDF."

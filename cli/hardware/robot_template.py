@@ -25,7 +25,7 @@ class Guess(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """Cameras of the robot and the marker that they look for."""
+    """Cameras of the robot and their marker."""
 
     cameras: Sequence[str] = ()  # those that are plugged in; with two or more, the first two are the eyes
     webcam: str | None = None  # one camera alone, in their place
@@ -198,7 +198,7 @@ def guess_from(urdf: Path, robot: Path, marker_link: str | None, camera_link: st
     Args:
         robot: path of the robot.toml to be written; the URDF is named relative to it.
         marker_link: the link with the marker; by default the last link fixed to the end of the chain.
-        camera_link: the link that the cameras stand on; by default the root.
+        camera_link: the link of the cameras; by default the root.
 
     Raises:
         RobotError: the URDF cannot be read.
@@ -232,7 +232,7 @@ def _moving(path: Sequence[UrdfJoint]) -> list[str]:
 
 
 def _is_finger(joint: UrdfJoint) -> bool:
-    """Return True for a joint that mimics another one, and for one of a gripper by its name."""
+    """Return True for a joint that mimics another one, or belongs to a gripper by its name."""
     return joint.mimics or (joint.kind in MOVING and bool(_FINGER.search(joint.name)))
 
 

@@ -1,4 +1,4 @@
-"""Read encoders and marker while the arm is moved, unpaired: live, or from a file; and write them to one."""
+"""Record encoders and marker, unpaired, while the arm is moved; read and write such recordings."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Collected:
 
     @property
     def said(self) -> str:
-        """Message on missed images if at least one in five gave no fix; else empty."""
+        """Message on missed images if at least one in five gave no fix, otherwise empty."""
         fixes, missed = len(self.wiggle.t_marker), self.missed.total()
         if missed < 0.2 * (fixes + missed):
             return ""

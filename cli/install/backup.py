@@ -225,7 +225,7 @@ class Backup:
         return manifest
 
     def _copied(self, source: IO[bytes], size: int, write: Callable[[bytes], object] = len) -> str:
-        """Pass at most one byte more than `size` to `write`: an archive can unpack to more than the disk holds.
+        """Pass at most one byte more than `size` to `write`: an archive can unpack to more than fits on the disk.
 
         Returns:
             Checksum of these bytes.
@@ -285,7 +285,7 @@ def _description(config: Config) -> dict[str, Path]:
 
 
 def _inside(name: str, endings: tuple[str, ...]) -> str:
-    """Return the archive name of a file: relative to robot.toml where it can be restored there, else under `ELSEWHERE`.
+    """Return a file's archive name: relative to robot.toml if it can be restored there, otherwise under `ELSEWHERE`.
 
     A file can be restored if it lies in robot.toml's folder, is not hidden (`.git/hooks/…`), and has an ending usual
     for its kind, so that no program would execute it.

@@ -50,7 +50,7 @@ class MachineFiles(ABC):
         """Return the files that `uninstall` would remove."""
 
     def install(self, texts: dict[Path, str]) -> None:
-        """Write files with their contents, and let the system read them. ConfigError: one cannot be written."""
+        """Write files with their contents, and let the system read them; raise ConfigError if one cannot be written."""
         for file, text in texts.items():
             with writing(file, f"install {self.kind}"):
                 file.parent.mkdir(parents=True, exist_ok=True)
@@ -58,7 +58,7 @@ class MachineFiles(ABC):
         self._call(self.reload)
 
     def uninstall(self) -> None:
-        """Remove the files, and folders of drop-ins that become empty. ConfigError: one cannot be removed."""
+        """Remove the files, and folders of drop-ins that become empty; raise ConfigError if one cannot be removed."""
         for file in self.installed():
             with writing(file, f"install {self.kind} --uninstall"):
                 file.unlink()
@@ -74,7 +74,7 @@ class MachineFiles(ABC):
 
 @contextmanager
 def writing(file: Path, command: str) -> Iterator[None]:
-    """Convert an OSError about `file` to a ConfigError; `command` is that of `bodyschema` for the remedy."""
+    """Convert an OSError about `file` to a ConfigError; `command` is the `bodyschema` command for the remedy."""
     try:
         yield
     except OSError as error:

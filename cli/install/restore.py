@@ -39,13 +39,13 @@ class Restored:
 
 
 def restore(backup: Backup, robot_file: Path, state_dir: Path | None = None, *, force: bool = False) -> Restored:
-    """Restore robot.toml and its files to `robot_file`, and the state to where that robot.toml says.
+    """Restore robot.toml and its files to `robot_file`, and the state to the folder that this robot.toml names.
 
     The store gets a new identity, because from now on its numbers may belong to other pairs than in the original. The
     checkpoint gets the same identity; a learner elsewhere will report that pairs come from another store.
 
     Args:
-        state_dir: folder for the state; None: the one of robot.toml, if that is in its folder.
+        state_dir: folder for the state; None for the one of robot.toml, if that is in its folder.
         force: existing files may be moved aside.
 
     Raises:
@@ -100,7 +100,7 @@ def _tables(backup: Backup) -> dict[str, Any]:
 
 
 def _targets(backup: Backup, tables: Mapping[str, Any], robot_file: Path) -> dict[str, Path]:
-    """Return where the description's files belong; robot.toml may have another name here."""
+    """Return the targets of the description's files; robot.toml may have another name here."""
     allowed = {ROBOT_TOML, *description_files(tables)}
     given = backup.manifest.files.keys() - {STORE, CHECKPOINT}
     if given != allowed:

@@ -36,7 +36,7 @@ class UnitFiles(MachineFiles):
         self.before_removal = [f"To be stopped: {names}"]
 
     def uninstall(self) -> None:
-        """Stop the units, and remove their files. ConfigError: one cannot be removed."""
+        """Stop the units, and remove their files; raise ConfigError if one cannot be removed."""
         self._call([("systemctl", "disable", "--now", *self.units)])
         super().uninstall()
 
@@ -50,7 +50,7 @@ class ServiceFiles(UnitFiles):
         root, run: as in `MachineFiles`.
 
     Raises:
-        ConfigError: it is no name for a service.
+        ConfigError: the name is invalid for a service.
     """
 
     kind, stays = "service", "Pairs and checkpoints are where they were."
@@ -160,7 +160,7 @@ def make_state_folders(configs: Sequence[Config], user: str, root: Path = ROOT) 
 
 
 def user_for(given: str | None) -> str:
-    """Return the user to run a service as: the given one, else the one who called sudo, else the current one.
+    """Return the user of a service: the given one, otherwise the one who called sudo, otherwise the current one.
 
     Raises:
         ConfigError: there is no such user, or it would be root or the user "nobody".

@@ -131,7 +131,7 @@ class ReportedDiagnosis:
     diagnosis: Diagnosis
     source: Source
     robot: RobotDescription
-    warnings: tuple[str, ...]  # what may be wrong with the recording itself
+    warnings: tuple[str, ...]  # possible faults of the recording itself
 
     @cached_property
     def file(self) -> DiagnosisFile:
@@ -140,7 +140,7 @@ class ReportedDiagnosis:
 
     @property
     def json(self) -> str:
-        """diagnosis.json, with the camera's pose beside what was found, and the covariance of predicted poses."""
+        """diagnosis.json, with the camera's pose in addition to the findings, and the covariance of predicted poses."""
         covariance = predicted_pose_covariance(self.diagnosis.stored)
         told = msgspec.to_builtins(self.file, enc_hook=float) | {
             "hand_eye": msgspec.to_builtins(self.hand_eye),
@@ -150,7 +150,7 @@ class ReportedDiagnosis:
 
     @property
     def hand_eye(self) -> HandEye:
-        """The camera's pose with what was found in it. Without a fitted pose it has no covariance."""
+        """The camera's pose with the findings applied. Without a fitted pose it has no covariance."""
         fit, covariance = self.diagnosis.stored, None
         effects = fit.simulation.effects
         shifts = [effect for effect in effects if isinstance(effect.kind, CameraEffect) and effect.kind.rigid]
@@ -183,11 +183,11 @@ def run(config: Config, source: Source, asked: Asked, tell: Tell, *, force: bool
     """Diagnose.
 
     Args:
-        force: go on with pairs that do not seem to be of this robot.
+        force: continue with pairs that do not seem to be of this robot.
 
     Raises:
-        DiagnosisError: there is too little to go by.
-        RecordingError: the pairs cannot be of this robot as they are.
+        DiagnosisError: there are not enough data.
+        RecordingError: the pairs cannot be of this robot in their present form.
     """
     robot, recording = config.robot, source.recording
     fewest = 5 * len(robot.joints)
@@ -222,7 +222,7 @@ def run(config: Config, source: Source, asked: Asked, tell: Tell, *, force: bool
 
 @contextmanager
 def results_in(folder: Path | None) -> Iterator[None]:
-    """Make the folder for results before minutes of work are lost, and remove it when they end without a result.
+    """Create the folder for results before minutes of work are lost, and remove it after an end without a result.
 
     Raises:
         RecordingError: nothing can be written to it.
@@ -236,13 +236,13 @@ def results_in(folder: Path | None) -> Iterator[None]:
         yield
     except BaseException:
         for place in new:
-            with suppress(OSError):  # something else was put there meanwhile
+            with suppress(OSError):  # another program has put something there meanwhile
                 place.rmdir()
         raise
 
 
 def require_writable(folder: Path) -> None:
-    """Make the folder; raise RecordingError where nothing can be written to it."""
+    """Create the folder; raise RecordingError if nothing can be written to it."""
     with writing(folder, RecordingError, remedy="Give another folder"):
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -256,7 +256,7 @@ def written(found: ReportedDiagnosis, folder: Path) -> None:
     extended = found.diagnosis.stored.written
     told = " ".join(filter(None, [f"{heading}.", modelled(found.file.unexplained)]))
     write_extended(extended, folder, told, replace=True)
-    # Tolerances alone are put into a URDF where the recording shows them.
+    # Tolerances alone are put into a URDF only if the recording determines them.
     bare = extended if found.diagnosis.tolerated.seen[:2].any() else extended.with_background(())
     write_corrected(bare, folder, heading)
     with writing(folder, RecordingError):

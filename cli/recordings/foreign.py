@@ -1,4 +1,4 @@
-"""Recordings as other programs made them: ROS bags and LeRobotDatasets, beside CSV, Parquet and stores."""
+"""Recordings of other programs: ROS bags and LeRobotDatasets, besides CSV, Parquet and stores."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ def markers_in_video(config: Config, source: Path, camera: str) -> MarkerTrack:
     """Return the marker's positions in a dataset's videos of `camera`, timed from the start of each episode.
 
     Raises:
-        RecordingError: there is no such video, or the marker is never seen.
-        ConfigError: nothing says how the camera sees, or a video cannot be decoded.
+        RecordingError: there is no such video, or the marker is never found.
+        ConfigError: the camera has no calibration, or a video cannot be decoded.
     """
     fixes = list[tuple[float, int, MarkerFix]]()
     parts = sorted(video_parts(source, camera), key=lambda part: (part.file, part.begin_s))
@@ -49,8 +49,8 @@ def markers_in_images(config: Config, bag: Path, topic: str) -> MarkerTrack:
     """Return the marker's positions in a bag's compressed images.
 
     Raises:
-        RecordingError: there is no such topic, or the marker is never seen.
-        ConfigError: nothing says how the camera sees, or the images cannot be decoded.
+        RecordingError: there is no such topic, or the marker is never found.
+        ConfigError: the camera has no calibration, or the images cannot be decoded.
     """
     from bodyschema.daemon.wiring.cameras import tracked_images
 
@@ -107,24 +107,24 @@ def _fixes(config: Config, file: Path, parts: list[VideoPart]) -> list[tuple[flo
 
 
 def seen_elsewhere(source: Path, taken: SourceOptions) -> bool:
-    """Return True if the positions in `source` are not known to be those of the cameras in robot.toml.
+    """Return True if the positions in `source` may not come from the cameras in robot.toml.
 
-    They are of a bag's topic, or of a file of their own. A table or store is taken for one of these cameras.
+    This is so for a bag's topic, or a separate file. A table or store is assumed to come from one of these cameras.
     """
     foreign = is_lerobot_dataset(source) or is_bag(source)
     return foreign and (taken.markers is not None or taken.video is None)
 
 
 def opened(config: Config, source: Path, taken: SourceOptions, lerobot: Path | None) -> Recording:
-    """Return the recording in `source`, whatever its format.
+    """Return the recording in `source`, in any format.
 
     Args:
         taken: the parts of a bag or a dataset.
         lerobot: LeRobot's calibration of the arm that a dataset was recorded with.
 
     Raises:
-        RecordingError, StoreError: it cannot be read, or what to take of it is not clear.
-        ConfigError: a file that it needs besides is wrong.
+        RecordingError, StoreError: it cannot be read, or the parts to read are ambiguous.
+        ConfigError: another file that it needs is wrong.
     """
     marker = None if taken.markers is None else read_marker_track(taken.markers)
     joints, delay_s = config.robot.joints, 1e-3 * taken.marker_delay_ms
@@ -158,7 +158,7 @@ def opened(config: Config, source: Path, taken: SourceOptions, lerobot: Path | N
 
 
 def read_marker_track(file: Path) -> MarkerTrack:
-    """Read the marker's positions from a recording without joints: t, x, y, z and what else a recording may have.
+    """Read the marker's positions from a recording without joints: t, x, y, z and optional columns of recordings.
 
     Raises:
         RecordingError: it cannot be read, or has no times.

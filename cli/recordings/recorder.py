@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 
 class History:
-    """The sampler's stored pairs from a sequence number on, page by page. Publications only trigger the next look."""
+    """The sampler's stored pairs from a sequence number on, page by page. Publications only trigger a request."""
 
     def __init__(self, bus: ZenohSession, robot: RobotDescription, from_seq: int) -> None:
         self._bus, self._joints, self._keys = bus, robot.joints, Keys(robot.name)
@@ -38,7 +38,7 @@ class History:
         bus.subscribe(self._keys.pair, lambda _: self._news.set())
 
     def page(self) -> list[Pair]:
-        """Return the next pairs, at most what one reply holds; an empty list if there are no more for now.
+        """Return the next pairs, at most one reply; an empty list if there are no more for now.
 
         Raises:
             BusError: the sampler does not answer.

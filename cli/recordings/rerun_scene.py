@@ -16,7 +16,7 @@ from bodyschema.recordings.rerun_export import LinkMesh, Scene
 
 
 def scene_for(out: Path, robot: Path, recording: Recording) -> Scene | None:
-    """Return the scene of a recording by a robot.toml or extended.toml; None where `out` cannot hold one.
+    """Return the scene of a recording by a robot.toml or extended.toml; None if `out` cannot hold one.
 
     Raises:
         ConfigError, RobotError: the robot's file is missing or wrong.
@@ -29,7 +29,7 @@ def scene_for(out: Path, robot: Path, recording: Recording) -> Scene | None:
 
 
 def scene_of(simulation: Simulation, recording: Recording) -> Scene:
-    """Return the scene of a recording; what robot.toml does not know of camera and marker is fitted to it."""
+    """Return the scene of a recording; poses of camera and marker unknown to robot.toml are fitted to it."""
     motion = Motion.of(recording)
     if not simulation.all_effects:
         simulation = aligned(Observations.of(recording, simulation), simulation).simulation.placed

@@ -35,7 +35,7 @@ def simulated(simulation: Simulation, like: Recording) -> Recording:
 
 
 def with_noise(simulation: Simulation, exact: Recording, like: Recording, rng: np.random.Generator) -> Recording:
-    """Return `exact` with noise added to its positions, by the covariances of `like` or else by [camera].
+    """Return `exact` with noise added to its positions, by the covariances of `like` or otherwise by [camera].
 
     Raises:
         ConfigError: neither gives the size of the noise.
@@ -56,7 +56,7 @@ def with_noise(simulation: Simulation, exact: Recording, like: Recording, rng: n
 
 
 def without_consequence(simulation: Simulation, like: Recording | None = None) -> list[str]:
-    """Return sentences on the effects that change nothing for this robot or for a recording without times."""
+    """Return sentences on the effects that have no influence for this robot or for a recording without times."""
     said = []
     for name in dict.fromkeys(effect.name for effect in simulation.effects):
         if EFFECT_TYPES[name].needs_times and like is not None and like.t is None:

@@ -40,7 +40,7 @@ class Process:
         raise BusError(f"the {self.name} ended with exit code {code}: {lines[-1].removeprefix('bodyschema: ')}")
 
     def wait_for(self, endpoint: str, token: str) -> None:
-        """Return as soon as it is alive on `endpoint`; raise BusError if it ends before, or is too late.
+        """Return as soon as it is alive on `endpoint`; raise BusError if it ends before, or takes too long.
 
         Listening is not enough: it is alive when it answers.
         """

@@ -105,7 +105,7 @@ class Job:
 
     @property
     def learnt_rows(self) -> Recording:
-        """Rows that are fed."""
+        """Rows to be fed."""
         return self.recording.rows(~self.split.held_out)
 
     @property

@@ -50,7 +50,7 @@ class Planned:
 
 
 def assignments(texts: Sequence[str]) -> list[tuple[str, str]]:
-    """Parse `NAME=VALUE` assignments. ConfigError if one is malformed."""
+    """Parse `NAME=VALUE` assignments; raise ConfigError if one is malformed."""
     found: list[tuple[str, str]] = []
     for text in texts:
         name, equals, value = text.partition("=")
@@ -137,7 +137,7 @@ def zero_ticks(workbench: EepromEditor, wanted: Sequence[Wanted]) -> list[tuple[
 def carry_out(
     workbench: EepromEditor, planned: Iterable[Planned], log: ServoLog, clock: Clock, *, undoes: int | None = None
 ) -> list[Done]:
-    """Switch torque off and verify it, then write what is needed; log each write before sending it to the servo.
+    """Switch torque off and verify it, then write the changes; log each write before sending it to the servo.
 
     Raises:
         SourceError: a servo's torque stays on, or it does not answer: nothing was written.
@@ -173,7 +173,7 @@ def _written(workbench: EepromEditor, group: Sequence[Planned]) -> list[Done]:
 
 
 def rate_of(setting: Setting, value: int) -> int:
-    """Return the baud rate that a register's value stands for [bit/s]."""
+    """Return the baud rate of a register's value [bit/s]."""
     return next(int(word) for word, known in setting.words.items() if known == value)
 
 

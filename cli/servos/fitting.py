@@ -17,7 +17,7 @@ from bodyschema.robot.toml_text import toml_value
 
 
 class Candidate(msgspec.Struct, frozen=True):
-    """A servo that answered, as `bodyschema scan --json` describes it."""
+    """A servo that answered, in the form of `bodyschema scan --json`."""
 
     port: str
     baud: int
@@ -136,7 +136,7 @@ def _bus_names(servos: Sequence[Candidate]) -> dict[tuple[str, int], str]:
 
 
 def _other_rates(servos: Sequence[Candidate], port: str) -> str:
-    """Return how to set all servos of a port to the baud rate that most of them have."""
+    """Return instructions to set all servos of a port to the baud rate that most of them have."""
     here = [servo for servo in servos if os.path.realpath(servo.port) == os.path.realpath(port)]
     most, _ = Counter(servo.baud for servo in here).most_common(1)[0]
     commands = [

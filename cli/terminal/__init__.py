@@ -1,1 +1,1 @@
-"""Terminal views, and what several commands share."""
+"""Terminal views, and parts that several commands share."""

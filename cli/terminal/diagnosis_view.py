@@ -44,7 +44,7 @@ def view(diagnosis: DiagnosisFile, remedies: Sequence[str], *, timed: bool) -> G
     """Return a view of the verdict, errors before and after, causes, rejected hypotheses and remedies.
 
     Args:
-        remedies: what to do about the causes.
+        remedies: remedies of the causes.
         timed: True if the recording has times.
     """
     head, style = _HEADS[diagnosis.verdict]

@@ -15,7 +15,7 @@ from .screen import mm, such_zeros
 
 
 def outlook_lines(outlook: Outlook | None) -> list[str]:
-    """Return at most two lines on whether there is enough data."""
+    """Return at most two lines on the sufficiency of the data."""
     if outlook is None:
         return ["not known yet"]
     pairs = outlook.further_pairs[-1]

@@ -58,7 +58,7 @@ def write_snippets(simulation: Simulation, file: Path, heading: str) -> list[str
     """Write the part of the simulation that drivers can represent to `file`, as text to copy from.
 
     Returns:
-        Sentences on what no driver can represent.
+        Sentences on the effects that no driver can represent.
 
     Raises:
         ConfigError: robot.toml has an invalid table.
@@ -99,7 +99,7 @@ def _ros2_control(joints: dict[str, JointErrors]) -> str:
 
 
 def _servos(simulation: Simulation, joints: dict[str, JointErrors]) -> Iterator[str]:
-    """Yield zeros in ticks, where robot.toml names the servos."""
+    """Yield zeros in ticks, if robot.toml names the servos."""
     drivers = Config.load(simulation.robot.file).tables.drivers
     for make, sign in _HOMING_SIGN.items():
         table = getattr(drivers, make)
@@ -121,7 +121,7 @@ def _servos(simulation: Simulation, joints: dict[str, JointErrors]) -> Iterator[
 
 
 def _kinematics(errors: ArmErrors) -> Iterator[str]:
-    """Yield Universal Robots' own file, for arms whose joints are called as in ur_description."""
+    """Yield Universal Robots' own file, for arms whose joints have the names of ur_description."""
     robot = errors.simulation.robot
     found = {name: link for name in robot.joints for end, link in _UR.items() if name.endswith(end)}
     if list(found.values()) != list(_UR.values()):
@@ -146,7 +146,7 @@ MJCF, URDF, CORRECTION, DRIVERS = ".xml", ".urdf", ".json", ".txt"
 
 
 def _write_correction(simulation: Simulation, file: Path, heading: str) -> list[str]:
-    """Write correction.json with the covariance of poses from the diagnosis.json beside extended.toml, if it is one."""
+    """Write correction.json with the covariance of poses from the diagnosis.json beside extended.toml, if any."""
     found, known = simulation.robot.file.with_name(DIAGNOSIS), None
     if simulation.robot.file.name == EXTENDED_FILE and found.is_file():
         try:
@@ -162,7 +162,7 @@ def _write_correction(simulation: Simulation, file: Path, heading: str) -> list[
 
 
 class _Known(msgspec.Struct, frozen=True):
-    """What a correction takes of diagnosis.json."""
+    """The part of diagnosis.json that a correction needs."""
 
     pose_covariance: Annotated[list[float], Meta(min_length=36, max_length=36)] | None = None
 
@@ -185,7 +185,7 @@ def write(simulation: Simulation, out: Path) -> list[str]:
     """Write the simulation in the format of the ending of `out`. The file appears once it is complete.
 
     Returns:
-        Sentences on what the file does not represent, or represents differently.
+        Sentences on effects that the file does not represent, or represents differently.
 
     Raises:
         ConfigError: the file cannot be written.
@@ -203,7 +203,7 @@ def write(simulation: Simulation, out: Path) -> list[str]:
 
 
 def effects_of(simulation: Simulation) -> str:
-    """Return how many effects a simulation has; those within tolerance of all links and drives are counted apart."""
+    """Return the number of effects of a simulation; those within tolerance of links and drives are counted apart."""
     count, small = len(simulation.effects), len(simulation.background)
     told = "without effects" if not count else f"with {count} effect{'s' if count > 1 else ''}"
     return f"{told} and {small} small error{'s' if small > 1 else ''} within tolerance" if small else told

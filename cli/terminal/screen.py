@@ -1,4 +1,4 @@
-"""Pieces of terminal screens that several commands share."""
+"""Parts of terminal screens that several commands share."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def or_dash(value: float | None, form: str) -> str:
 
 
 def such_zeros(joints: Collection[str]) -> str:
-    """Return what sentences call the joint offsets of these joints."""
+    """Return the name of these joints' offsets in sentences."""
     return "its zero" if len(joints) == 1 else "their zeros"
 
 
@@ -123,7 +123,7 @@ def quiet(_said: str) -> None:
 
 
 def counted(say: Say, what: str, items: Sequence[T]) -> Iterator[T]:
-    """Yield the items in order; report `what` at once, and every few seconds the number done."""
+    """Yield the items in order; report `what` at once, and the number done every few seconds."""
     say(what)
     told = time.monotonic()
     for done, item in enumerate(items):

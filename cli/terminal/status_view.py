@@ -42,7 +42,7 @@ class Seen:
 
 
 class Watcher:
-    """Queries both processes for their states. Use as a context manager; the processes may come and go."""
+    """Observer of the states of both processes. Use as a context manager; the processes may come and go."""
 
     def __init__(self, config: ClientConfig) -> None:
         self._keys = Keys(config.name)

@@ -134,7 +134,7 @@ log = logging.getLogger(__name__)
 
 
 class ExpectedMarker:
-    """Follows the encoders, and publishes the current model's prediction for them.
+    """Publisher that follows the encoders, and publishes the current model's prediction for them.
 
     Nothing is published before there is a model. For subscribers that receive no sigma, nothing is published outside
     the support of the data either.
@@ -155,7 +155,7 @@ class ExpectedMarker:
 
     @contextmanager
     def publishing(self) -> Iterator[None]:
-        """Publish from here to the end of the with statement; wait for a robot that is not there yet."""
+        """Publish within the with statement; wait for a robot that is not there yet."""
         thread = threading.Thread(target=self._run, name="expected_marker")
         thread.start()
         try:

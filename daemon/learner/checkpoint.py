@@ -119,7 +119,7 @@ def checkpoint_bytes(file: Path) -> bytes:
 
 
 def generations(file: Path) -> tuple[Path, Path]:
-    """Return the paths where a checkpoint is looked for: `file`, and its predecessor."""
+    """Return the paths at which a checkpoint is searched for: `file`, and its predecessor."""
     return file, file.with_name(file.name + ".previous")
 
 
@@ -209,10 +209,10 @@ def go_on(new: Callable[[], OnlineLearner], checkpoint: Path, robot: str) -> tup
 
     Args:
         new: creates a learner without data.
-        checkpoint: the newest; an unusable one is kept next to it under another name.
+        checkpoint: the newest one; if unusable, it is kept next to it under another name.
 
     Returns:
-        The learner, and a message about what was wrong, or None.
+        The learner, and a message about the fault, or None.
 
     Raises:
         CheckpointError: an unusable checkpoint cannot be moved aside.
@@ -245,9 +245,8 @@ def _told(said: list[str]) -> str:
 def first_pair(pairs: StoredPairs, checkpoint: Path, robot: str) -> int:
     """Return the row, from 1, of the first pair with the present tool.
 
-    Returns 1 if no learner of these pairs has left a checkpoint.
-
-    Pairs from before a `reset_to_prior` do not count as pairs with the present tool.
+    Returns 1 if no learner of these pairs has left a checkpoint. Pairs from before a `reset_to_prior` do not count as
+    pairs with the present tool.
     """
     try:
         state = read_checkpoint(checkpoint, robot=robot)

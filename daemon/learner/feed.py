@@ -31,7 +31,7 @@ History = Callable[[int], Page]
 
 
 class _Stamp(msgspec.Struct, frozen=True):
-    """The fields of a published pair that show how far the store goes."""
+    """The fields of a published pair that reveal the newest stored one."""
 
     store: str
     seq: int
@@ -48,30 +48,30 @@ class _Stored:
 
 
 class PairFeed:
-    """Feeds an `OnlineLearner`. `offer` and `wake` may be called from any thread, `step` from one only.
+    """Feed of an `OnlineLearner`. `offer` and `wake` may be called from any thread, `step` from one only.
 
     Attributes:
         problem: reason why arriving pairs are not learnt, or None.
         refused: reason why the last refused pair was refused, or None.
         foreign: identity of the store that pairs arrive from although the learner learnt from another one, or None.
-        paused: pairs are left to history.
+        paused: True if pairs are left to history.
     """
 
     def __init__(
         self, learning: OnlineLearner, history: History, clock: Clock, beat: Callable[[], None] = lambda: None
     ) -> None:
-        """Continue after the pairs that `learning` has.
+        """Continue after the last pair that `learning` has.
 
         Args:
-            history: returns stored pairs from a sequence number on, as many as fit into a reply; BusError when there is
-                no answer.
+            history: returns stored pairs from a sequence number on, as many as fit into a reply; raises BusError
+                without an answer.
             beat: called for each learnt pair, and after each history request.
         """
         self.lock = threading.Lock()
         self._learning, self._history, self._clock, self._beat = learning, history, clock, beat
         self._joints = learning.nominal.joints
         self._waiting: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
-        # Set by any thread: an item was not queued. All else belongs to `step`.
+        # Set by any thread: an item was not queued. All other attributes belong to `step`.
         self._missed = True
         self._behind, self.paused = False, False
         self._retry_at = 0.0
@@ -120,7 +120,7 @@ class PairFeed:
         self.wake()
 
     def restart(self) -> None:
-        """Continue after the pairs that the learner has; call this when they have changed, holding `lock`."""
+        """Continue after the last pair that the learner has; call this after they have changed, holding `lock`."""
         counters = self._learning.counters
         self._store, self._cursor = counters.store, counters.last_seq
         self._published = self._newest = None
@@ -231,7 +231,7 @@ class PairFeed:
         self._newest = _Stored(reply.last_seq, utc, self._clock.now())
 
     def _pass_over(self, missing: int) -> None:
-        """Continue after pairs that the sampler no longer has; it numbers without gaps, so they existed once."""
+        """Continue after pairs that the sampler no longer has; it numbers without gaps, so they existed before."""
         if missing > 0:
             log.warning(
                 "the sampler has no pairs %d to %d any more: they were deleted ([daemon] keep_days, keep_mb) or its "

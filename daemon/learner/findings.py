@@ -47,8 +47,8 @@ class FindingTurns:
 
     Attributes:
         due_at: time of the next permitted finding.
-        spent: returns the thread's processor time [s]. On a busy machine most of the wall time is waiting, and a rest
-            of ten times as long would leave findings out for a quarter of an hour.
+        spent: returns the thread's CPU time [s]. On a busy machine most of the wall time is waiting, and a rest of ten
+            times as long would suppress findings for a quarter of an hour.
     """
 
     def __init__(self, spent: Callable[[], float] = time.thread_time) -> None:
@@ -60,9 +60,9 @@ class FindingTurns:
 
 
 class Findings:
-    """Computes calibration and outlook whenever there is a new chain, or another model answers.
+    """Findings that are computed whenever there is a new chain, or another model answers.
 
-    Only the background thread may call it. Any thread may read the results.
+    Only the background thread may compute them. Any thread may read the results.
 
     Attributes:
         doubts: reasons to suspect that the pairs are of another robot: exchanged columns, reversed joints.
@@ -178,7 +178,7 @@ def calibrated(robot: RobotDescription, known: LearnerEvidence, scatter: Scatter
 def figures(robot: RobotDescription, known: LearnerEvidence) -> tuple[ChainFigures, tuple[float, float] | None]:
     """Return the figures, and the estimated manufacturing tolerances: 1-sigma of axis tilt [rad] and axis shift [m].
 
-    The tolerances are None where the pairs do not determine them.
+    The tolerances are None if the pairs do not determine them.
 
     With the learner's initial tolerances, an axis tilt could be mistaken for any joint offset. The pairs determine the
     tolerances, but seldom sharply, so the figures average over all probable tolerances.
@@ -197,18 +197,18 @@ def figures(robot: RobotDescription, known: LearnerEvidence) -> tuple[ChainFigur
 
 
 class Changes:
-    """Logs the learner's changes, in the robot's names. Not thread-safe.
+    """Logger of the learner's changes, in the robot's names. Not thread-safe.
 
     Args:
         joints: joint names.
-        change: the last change that was already reported; None: there was none.
+        change: the last change that was already reported, or None.
     """
 
     def __init__(self, joints: Sequence[str], change: ChangeRecord | None = None) -> None:
         self._joints, self._told = tuple(joints), change
 
     def note(self, change: ChangeRecord | None, *, rolled_back: bool = False) -> None:
-        """Log what is new about the last change: its detection, its cause, its rollback."""
+        """Log the news about the last change: its detection, its cause, its rollback."""
         was, self._told = self._told, change
         if rolled_back:
             log.info("rolled back to the model before %s", "the change" if was is None else f"pair {was.first_seq}")

@@ -47,10 +47,10 @@ class _Settings:
 
 
 class Background:
-    """Work for all until `stop` is set, one piece for each in turn, so that none waits for another's backlog.
+    """Background work for all learners until `stop` is set, one piece for each in turn, so that none waits for another.
 
     Args:
-        share: share of one processor's time, at most; 1 sets no limit.
+        share: largest share of one processor's time; 1 for no limit.
     """
 
     def __init__(
@@ -61,11 +61,11 @@ class Background:
         self._idle_since = [clock.now()] * len(workers)
 
     def run(self) -> None:
-        """Run the work: as a batch thread, or as a usual one within a share of a processor.
+        """Run the work: as a batch thread, or as a normal one limited to a share of a processor.
 
-        A batch thread does not interrupt others when it wakes. It has its share of a machine that others keep busy,
-        where a thread of low priority would learn nothing for minutes, and make all threads of the process wait when
-        it is preempted with Python's interpreter lock.
+        A batch thread does not interrupt others when it wakes. It still gets its share of a busy machine. A thread of
+        low priority would learn nothing for minutes there, and make all threads of the process wait when it is
+        preempted while it holds Python's interpreter lock.
         """
         if self._rest == 0.0:
             with contextlib.suppress(OSError):  # optional: without it answers are slightly later
@@ -104,7 +104,7 @@ def run_learners(configs: Sequence[Config], clock: Clock, wishes: SignalFlags, n
     """Learn and answer for all robots until `wishes` requests the end.
 
     Args:
-        notifier: is notified once everything is up, that every loop works, and of the learners' states.
+        notifier: is notified of the completed start, of working loops, and of the learners' states.
 
     Raises:
         ConfigError: the robots cannot be served by one process.
@@ -234,7 +234,7 @@ def attend(
     begin = time.monotonic()
     due = [begin + every_s * k / len(learners) for k in range(len(learners))]
     while not wishes.ending:
-        # Taken before the round: a request that comes during it is for every learner, in the next round.
+        # Taken before the round: a request during it is for every learner, in the next round.
         reloading, wishes.reloading = wishes.reloading, False
         for k, (learner, publish) in enumerate(zip(learners, publishers, strict=True)):
             if time.monotonic() >= due[k]:

@@ -1,7 +1,7 @@
 """The learner process of one robot. It needs a sampler for new pairs, but keeps answering without one.
 
 Threads: zenoh's (queries, from an immutable snapshot; published pairs, into a queue), one for each robot that learns
-each pair immediately, one as batch work for replay and the solver's orders, and the main thread for status and
+each pair immediately, a batch thread for replay and the requests to the solver, and the main thread for status and
 checkpoints; `bodyschema.daemon.learner.host` has the last two.
 """
 
@@ -353,9 +353,9 @@ def more_rarely(robots: int) -> float:
 
 
 def _common_variance(config: Config) -> tuple[Callable[[FloatArray], FloatArray] | None, str | None]:
-    """Return the variance that the cameras' calibration leaves in all positions, and why it is not known.
+    """Return the variance of all positions due to the cameras' calibration, and the reason if it is unknown.
 
-    Learning and predictions go on without it.
+    Learning and predictions continue without it.
     """
     if config.tables.vision.cameras is None:
         return None, None

@@ -11,7 +11,7 @@ from bodyschema.learning.solvers.solver import Solved, Task
 
 
 class SolverPool:
-    """Gives a process one robot's orders at a time. Single-threaded.
+    """Pool that gives a process one robot's orders at a time. Single-threaded.
 
     A robot's orders wait here for its turn, because the process does not read while it solves.
     """
@@ -64,7 +64,7 @@ class PooledSolver:
         self._shared, self._process, self._robot = shared, process, robot
         self._orders: deque[Callable[[], None]] = deque()
         self._pairs = self._new = self._had_turn = 0
-        self.asked = False  # True if a solution is wanted that the process does not work on yet
+        self.asked = False  # True if a solution is wanted that the process does not compute yet
         self.answers: deque[Solved] = deque()  # answers not fetched yet
 
     def start(self, task: Task) -> None:
@@ -74,7 +74,7 @@ class PooledSolver:
     def learn(
         self, q: FloatArray, x: FloatArray, cov: FloatArray | None = None, turns: FloatArray | None = None
     ) -> None:
-        """Queue more pairs, as `Solver` takes them."""
+        """Queue more pairs, as in `Solver`."""
         self._new += len(q)
         self._orders.append(lambda: self._process.learn(q, x, cov, turns, self._robot))
 

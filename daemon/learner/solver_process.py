@@ -76,7 +76,7 @@ _MODELS = (KBMap, ChainBelief, ResidualModel, OrientedChain)
 
 
 def _fields(record: Task | Solved | OrientationSolution | ChainTolerances) -> dict[str, Any]:
-    """Return a record as MessagePack takes it."""
+    """Return a record in MessagePack's form."""
     return {field.name: _packed(getattr(record, field.name)) for field in fields(record)}
 
 
@@ -144,7 +144,7 @@ class SolverProcess:
         turns: FloatArray | None = None,
         robot: int = 0,
     ) -> None:
-        """Send more pairs, as `Solver` takes them."""
+        """Send more pairs, as in `Solver`."""
         parts = [None if each is None else each.astype("<f8").tobytes() for each in (cov, turns)]
         self._send(Learn(q.shape[1], q.astype("<f8").tobytes(), x.astype("<f8").tobytes(), *parts, robot=robot))
 
@@ -175,8 +175,8 @@ class SolverProcess:
         if time.monotonic() - self._looked_at < _Settings.hung_after_s:
             return
         try:
-            used_s = time.clock_gettime(~pid << 3 | 2)  # as clock_getcpuclockid(3) has it
-        except OSError:  # it has ended, which the next look at its pipe shows, or this system has no such clock
+            used_s = time.clock_gettime(~pid << 3 | 2)  # as in clock_getcpuclockid(3)
+        except OSError:  # it has ended, as the next look at its pipe shows, or this system has no such clock
             return
         if used_s == self._moved_s:
             os.kill(pid, signal.SIGKILL)
@@ -240,7 +240,7 @@ def serve(orders: IO[bytes], solutions: IO[bytes]) -> None:
         if isinstance(order, Start):
             tolerances = order.task.pop("tolerances")
             solver.start(Task(**order.task, tolerances=None if tolerances is None else ChainTolerances(**tolerances)))
-            rested_at = 0.0  # a new task starts with few pairs, and its first result is awaited
+            rested_at = 0.0  # a new task starts with few pairs, and its first result is urgent
         elif isinstance(order, Learn):
             solver.learn(
                 np.frombuffer(order.q, dtype="<f8").reshape(-1, order.joints),
@@ -255,7 +255,7 @@ def serve(orders: IO[bytes], solutions: IO[bytes]) -> None:
 
 def _solve(solver: DirectSolver, solutions: IO[bytes]) -> float:
     """Solve, and send each solution as it is found; return the processor time used [s]."""
-    begin = time.process_time()  # on a busy machine most of the wall time is waiting, which is rest enough
+    begin = time.process_time()  # on a busy machine most of the wall time is waiting, which is sufficient rest
     for solved in solver.solutions():
         # A chain with residual is its own belief: sent once, as reading one takes milliseconds.
         _write(solutions, _fields(replace(solved, belief=None) if solved.belief is solved.model else solved))

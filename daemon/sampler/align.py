@@ -23,10 +23,10 @@ def joint_difference(q: FloatArray, other: FloatArray, prismatic: NDArray[np.boo
 class JointBuffer:
     """Recent joint readings, written by the encoders' thread and read by the frames' thread.
 
-    Both sides come in strictly increasing time. Readings before the last requested frame are forgotten. When the buffer
-    is full, `put` waits for room, because a recording can be read faster than its frames are stored. With live encoders
-    it forgets the oldest reading instead, because the thread that reads them may also hold up the arm and must not
-    block.
+    Both threads proceed in strictly increasing time. Readings before the last requested frame are dropped. When the
+    buffer is full, `put` waits for room, because a recording can be read faster than its frames are stored. With live
+    encoders it drops the oldest reading instead, because the thread that reads them may also hold up the arm and must
+    not block.
     """
 
     def __init__(
@@ -39,7 +39,7 @@ class JointBuffer:
         kept_s: float = 0.0,  # readings up to this long before the frame are kept [s]
     ) -> None:
         self._prismatic = prismatic
-        self.max_gap_s = max_gap_s  # readings around a frame may be this far apart [s]
+        self.max_gap_s = max_gap_s  # maximum time between the readings around a frame [s]
         self._capacity = capacity
         self._live, self._kept_s = live, kept_s
         self._readings: deque[JointReading] = deque(maxlen=capacity if live else None)
@@ -58,18 +58,18 @@ class JointBuffer:
             self._changed.notify_all()
 
     def silence(self) -> None:
-        """Expect no readings for now: the encoders are lost or at their end. The next `put` resets this."""
+        """Expect no readings for now: the encoders are lost or have ended. The next `put` resets this."""
         with self._changed:
             self._expecting = False
             self._changed.notify_all()
 
     def forget_before(self, t: float) -> None:
-        """Forget readings that no frame at or after `t` needs: those before the last one `kept_s` before `t`."""
+        """Drop readings that no frame at or after `t` needs: those before the last one `kept_s` before `t`."""
         with self._changed:
             self._forget_before(t)
 
     def make_room(self) -> None:
-        """Forget the older half of a full buffer; no frame has come for so long that none will need it."""
+        """Drop the older half of a full buffer; no frame has come for so long that none will need it."""
         with self._changed:
             if len(self._readings) >= self._capacity:
                 for _ in range(self._capacity // 2):
@@ -104,7 +104,7 @@ class JointBuffer:
         return frozen_array(before.q + fraction * joint_difference(after.q, before.q, self._prismatic))
 
     def slack(self, t: float) -> FloatArray:
-        """Return how far the joints move within the time uncertainty of the readings around `t`, shape (d,) [rad or m].
+        """Return the joints' motion within the time uncertainty of the readings around `t`, shape (d,) [rad or m].
 
         Call it only for a `t` at which `at` returned angles.
         """
@@ -114,10 +114,10 @@ class JointBuffer:
         return frozen_array(sigma_s / apart_s * joint_difference(after.q, before.q, self._prismatic))
 
     def moved(self, t: float, during_s: float, timeout_s: float) -> FloatArray | Reason:
-        """Return how far the joints move within `during_s` of time `t`, shape (d,) [rad or m], or a reason like `at`.
+        """Return the motion of the joints within `during_s` of time `t`, shape (d,) [rad or m], or a reason like `at`.
 
-        It is the mean over both sides, so that an encoder step counts half. Where `during_s` is longer than `kept_s`,
-        the speed within `kept_s` is extrapolated.
+        It is the mean over both sides, so that an encoder step counts half. If `during_s` is longer than `kept_s`, the
+        speed within `kept_s` is extrapolated.
         """
         span_s = min(during_s, self._kept_s)
         before = self.at(t - span_s, timeout_s)

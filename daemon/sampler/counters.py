@@ -95,7 +95,7 @@ class SamplerCounters:
         """Update the rates at the end of a window."""
         now = self._wall.now()
         passed = now - self._window_start
-        if passed < STATUS_EVERY_S:  # a shorter window would make single frames show
+        if passed < STATUS_EVERY_S:  # in a shorter window single frames would be visible
             return
         counts = (self.readings, self.frames, self.pairs)
         rates = [(count - before) / passed for count, before in zip(counts, self._window_counts, strict=True)]

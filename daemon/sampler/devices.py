@@ -44,7 +44,7 @@ class KeepsRecord(Protocol):
 
 
 class DeviceWatch:
-    """Records in the store which devices read the joints, and detects changes."""
+    """Recorder of the devices that read the joints, which detects changes of them."""
 
     def __init__(self, joints: JointSource, store: PairStore, wall: Clock) -> None:
         """Store the settings; nothing is queried yet.
@@ -127,7 +127,7 @@ CHANGEABLE = {("daemon", key) for key in DaemonConfig.__struct_fields__ if key !
 
 
 class SamplerRules:
-    """Applies robot.toml's rules to the sampler's parts; from any thread."""
+    """Rules of robot.toml, applied to the sampler's parts; from any thread."""
 
     def __init__(
         self,

@@ -28,7 +28,7 @@ class _Fix(NamedTuple):
 
 
 class Gate:
-    """Accepts a measurement if its joint-space step from the last pair is neither too small nor implausible.
+    """Gate that accepts a measurement if its joint-space step from the last pair is neither too small nor implausible.
 
     A step is the Euclidean norm over all joints in degrees; prismatic joints count with `metres_per_degree`. A step
     below `min_step_deg` makes no pair, not even after a restart or a pause: an arm at rest must not fill the store.
@@ -65,7 +65,7 @@ class Gate:
         self._believed = None
 
     def offer(self, t: float, q: FloatArray, x: FloatArray) -> int | Reason:
-        """Return the segment if joint angles `q` [rad or m] (d,) and marker `x` [m] (3,) make a pair, else the reason.
+        """Return the segment if joint angles `q` [rad or m] (d,) and marker `x` [m] (3,) make a pair, or the reason.
 
         Args:
             t: time of the measurement [s], later than all before.

@@ -66,13 +66,13 @@ class HandModel:
 
 
 class GazeLoop:
-    """Aims the head in a separate thread. If the thread fails, the target becomes stale and the head stands still."""
+    """Loop that aims the head in a separate thread. If it fails, the target expires and the head stands still."""
 
     def __init__(self, robot: RobotDescription, head: Head, model: HandModel) -> None:
         """Store the settings; nothing is started yet.
 
         Raises:
-            ConfigError: [camera] describes no stereo pair.
+            ConfigError: [camera] does not describe a stereo pair.
         """
         if robot.calibration is None:
             raise ConfigError(
@@ -111,7 +111,7 @@ class GazeLoop:
 
 
 def gaze_of(robot: RobotDescription, sources: Sources, bus: ZenohSession, wall: Clock) -> GazeLoop | None:
-    """Return the gaze loop of a robot that has a head, with its cameras as calibrated; None if it has none."""
+    """Return the gaze loop of a robot with a head, with its calibrated cameras; None if it has none."""
     if sources.head is None:
         return None
     key = Keys(robot.name).predict

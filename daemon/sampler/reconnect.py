@@ -28,12 +28,12 @@ class Readable(Source, Protocol[R_co]):
 
 
 class ReconnectingSource(Generic[R_co]):
-    """Reads a source. When the source is lost, report it once and try to reopen it at growing intervals.
+    """Reader of a source that reports a loss once and tries to reopen the source at growing intervals.
 
-    A source that is present but the wrong one (other cameras, another servo) is reported once more, and waited for. It
-    counts as back once it was read: a device may open and still not be readable.
+    A wrong source (other cameras, another servo) is reported too, and reopening continues. The source counts as back
+    once it was read, since a device may open without being readable.
 
-    The first opening has to succeed: a failure at the start needs a person.
+    The first opening has to succeed, since a failure at the start needs a person.
     """
 
     def __init__(
@@ -44,7 +44,7 @@ class ReconnectingSource(Generic[R_co]):
         sleep: Callable[[float], None] = time.sleep,
         # returns a device that this process will never be allowed to open, or None
         forbidden: Callable[[], str | None] = lambda: None,
-        # called after each opening; raises SourceError for another device than is wanted
+        # called after each opening; raises SourceError for a wrong device
         require: Callable[[], None] = lambda: None,
     ) -> None:
         self._forbidden, self._require = forbidden, require
@@ -135,7 +135,7 @@ T = TypeVar("T")
 
 
 class ResilientWriter:
-    """Appends pairs to a store. A pair that cannot be written is dropped, and the next one is tried."""
+    """Writer of pairs to a store. A pair that cannot be written is dropped, and the next one is tried."""
 
     def __init__(self, store: PairStore, wall: Clock) -> None:
         self._store, self._wall = store, wall

@@ -48,7 +48,7 @@ LOOPS = ("encoders", "frames")
 
 
 class Sampler:
-    """Turns measurements into pairs: aligned in time, gated, committed to the store, and then published.
+    """Sampler that turns measurements into pairs: aligned in time, gated, committed to the store, and then published.
 
     One thread reads the encoders, the thread that calls `run` does the rest, and zenoh's threads answer queries.
     """
@@ -61,7 +61,7 @@ class Sampler:
         store: PairStore,
         *,
         exit_at_end: bool = False,  # return from `run` when the sources end, instead of continuing to serve the history
-        # is notified once everything is up, that `LOOPS` work, and of the sampler's state
+        # is notified of the completed start, of working `LOOPS`, and of the sampler's state
         service: Service | None = None,
     ) -> None:
         """Prepare a sampler over an open bus and an open store; `run` opens the sources.
@@ -102,7 +102,7 @@ class Sampler:
         self._publish = bus.publisher(self._keys.pair, cache=LARGEST_REPLY)
         self._publish_status = bus.publisher(self._keys.status("sampler"))
         self._stopping = self._reloading = False
-        # Once a pause is acknowledged, no pair may follow.
+        # After a pause is acknowledged, no pair may follow.
         self._deciding = threading.Lock()
         self._rules = SamplerRules(
             config, store, self._devices, self._wall, gate=self._gate, buffer=self._buffer, deciding=self._deciding

@@ -135,7 +135,7 @@ class Sources:
 
 
 def find_powered(drives: Iterable[object], name: str, file: Path) -> Powered:
-    """Return the arm's drive of this name. ConfigError if robot.toml, `file`, does not configure it."""
+    """Return the arm's drive of this name; raise ConfigError if robot.toml, `file`, does not configure it."""
     for drive in drives:
         if isinstance(drive, Powered) and drive.name == name:
             return drive
@@ -184,7 +184,7 @@ class MarkerTopic(Source, Protocol):
 
 
 class ToolRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Mounts another tool on the simulated hand. An empty request returns the truth instead."""
+    """Request to mount another tool on the simulated hand. An empty request returns the truth instead."""
 
     tool: tuple[float, float, float]  # marker position in `marker_link`, at most 2 m from the hand [m]
 

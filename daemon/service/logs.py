@@ -31,14 +31,14 @@ _FLOODED = ("uvicorn", "bodyschema.daemon.sampler.reconnect")
 
 
 class PlainFormatter(logging.Formatter):
-    """Prints commands in the form in which the user has to type them."""
+    """Formatter that shows commands as the user has to type them."""
 
     def format(self, record: logging.LogRecord) -> str:
         return as_typed(super().format(record))
 
 
 class JournalFormatter(PlainFormatter):
-    """Format an event as one line with a priority such as `<4>`, without a time: the journal adds its own."""
+    """Formatter of an event as one line with a priority such as `<4>`, without a time, which the journal adds."""
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the formatted record; several lines, as in a traceback, are joined into one."""
@@ -57,7 +57,8 @@ class _Said:
 class UnrepeatedHandler(logging.StreamHandler[TextIO]):
     """Suppresses repeats: the same text within `repeated_s`, or more than `often` texts that differ only in numbers.
 
-    The number of suppressed messages is logged with the next record after that time, and at the end.
+    Texts are similar if they differ only in numbers. The number of suppressed messages is logged with the next record
+    after that time, and at the end.
     """
 
     def __init__(self, stream: TextIO, formatter: logging.Formatter, now: Callable[[], float] = time.monotonic) -> None:
@@ -115,7 +116,7 @@ def set_up(*, verbose: bool = False, environment: Mapping[str, str] = os.environ
     if is_journal(out, environment):
         handler: logging.Handler = UnrepeatedHandler(out, JournalFormatter("%(name)s: %(message)s"))
         limited: list[logging.Handler] = []
-        faulthandler.enable(out)  # shows what each thread did when the watchdog ends the process
+        faulthandler.enable(out)  # shows the activity of each thread when the watchdog ends the process
     else:
         formatter = PlainFormatter("%(asctime)s %(levelname)-7s %(name)s: %(message)s", "%H:%M:%S")
         handler = logging.StreamHandler(out)

@@ -1,4 +1,4 @@
-"""Notify systemd of a service's state by sd_notify(3): datagrams to the socket that NOTIFY_SOCKET names."""
+"""Notify systemd of a service's state by sd_notify(3): datagrams to the socket in NOTIFY_SOCKET."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ class NotifySettings:
 
 
 class Notifier:
-    """Notifies systemd; does nothing without a socket.
+    """Notifier of systemd; it does nothing without a socket.
 
     Attributes:
-        watchdog_s: systemd ends the process after this long without `WATCHDOG=1` [s]; None: no watchdog.
+        watchdog_s: systemd ends the process after this long without `WATCHDOG=1` [s]; None without a watchdog.
     """
 
     def __init__(self, address: str | None = None, watchdog_s: float | None = None) -> None:
-        """Notify the socket at `address`, a path or with a leading `@` an abstract name; None: nothing."""
+        """Notify the socket at `address`, a path or with a leading `@` an abstract name; None to do nothing."""
         is_abstract = address is not None and address.startswith("@")
         self._address = f"\0{address[1:]}" if address and is_abstract else address
         self._failed = False
@@ -37,7 +37,7 @@ class Notifier:
 
     @classmethod
     def of_environment(cls, environment: MutableMapping[str, str] = os.environ) -> Notifier:
-        """Return what systemd requested, and remove it from the environment, as children must not see it."""
+        """Return the notifier that systemd requested; remove the request from the environment of later children."""
         address = environment.pop(SOCKET, None) or None
         microseconds, pid = environment.pop(WATCHDOG, ""), environment.pop(WATCHDOG_PID, "")
         ours = not pid or pid == str(os.getpid())

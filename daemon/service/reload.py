@@ -1,4 +1,4 @@
-"""Read robot.toml again while a process runs: what takes effect at once, and what needs a restart."""
+"""Read robot.toml again while a process runs: find the changes that take effect, and those that need a restart."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Reload:
     waiting: list[str]  # settings that need a restart
 
     def message(self, process: str) -> str:
-        """Return a summary, with what to do."""
+        """Return a summary, with the remedy."""
         said = [f"in force now: {', '.join(self.changed)}"] if self.changed else []
         if self.waiting:
             restart = f"systemctl restart bodyschema-{process}@{self.config.robot.name}"
@@ -39,8 +39,8 @@ def reload(config: Config, tables: Collection[str], changeable: Collection[Key])
     """Read the robot.toml of `config` again.
 
     Args:
-        config: the configuration in force; settings overridden on the command line stay overridden.
-        tables: those that the process uses, and single keys, as in `vision.marker`.
+        config: the present configuration; settings overridden on the command line stay overridden.
+        tables: tables that the process uses, and single keys, as in `vision.marker`.
         changeable: table and key of settings that may change while it runs.
 
     Raises:
@@ -69,7 +69,7 @@ def reload(config: Config, tables: Collection[str], changeable: Collection[Key])
 
 
 def _table(config: Config, name: str) -> dict[str, Any]:
-    """Return the settings of a table, defaults included; of a key, its value."""
+    """Return the settings of a table, defaults included, or the value of a key."""
     described = {"robot": config.robot.robot, "camera": config.robot.camera}
     table = described[name] if name in described else attrgetter(name)(config.tables)
     if isinstance(table, msgspec.Struct):

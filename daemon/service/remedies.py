@@ -16,7 +16,7 @@ _LINE = re.compile(r"^bodyschema ([^#\n]+?)(?=\s*(?:#|$))")
 
 
 def given_robot(arguments: Sequence[str]) -> str | None:
-    """Return the --robot of a command line; None if it was left to the environment or the folder."""
+    """Return the --robot of a command line; None if it is omitted."""
     for place, argument in enumerate(arguments):
         name, equals, value = argument.partition("=")
         if name == OPTION:

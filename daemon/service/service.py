@@ -22,7 +22,7 @@ class _Settings:
 
 
 class Service:
-    """Reports a process with working loops to systemd; from any thread.
+    """Reporter of a process with working loops to systemd; from any thread.
 
     Each loop calls `beat` in every round. The watchdog is fed once all loops have called it since the last feed, so a
     single hanging loop starves it.
@@ -34,7 +34,7 @@ class Service:
         loops: Collection[str],  # names of the loops that have to keep running
         clock: Clock,
         *,
-        devices: Sequence[str] = (),  # devices that systemd lets the service open; access(2) has the same answer
+        devices: Sequence[str] = (),  # devices that systemd lets the service open; access(2) gives the same result
         may_open: Callable[[str], bool] = lambda device: os.access(device, os.R_OK | os.W_OK),
     ) -> None:
         """Start in the state "not ready"."""
@@ -67,7 +67,7 @@ class Service:
                 self._notifier.feed_watchdog()
 
     def leave(self, loop: str) -> None:
-        """Note that the loop of this name has ended as it should: the watchdog no longer waits for it."""
+        """Note that the loop of this name has ended as intended: the watchdog no longer waits for it."""
         with self._lock:
             self._loops.discard(loop)
 
@@ -89,7 +89,7 @@ class Service:
         return found if now - self._forbidden_since >= _Settings.settled_s else None
 
     def follow(self, reload: Callable[[], str]) -> None:
-        """Report that robot.toml is read again by `reload`. Log its result, as the request came by a signal."""
+        """Report that robot.toml is read again by `reload`. Log its result, since a signal has no reply."""
         self._notifier.reloading()
         try:
             log.info("robot.toml was read again: %s", reload())

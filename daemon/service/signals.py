@@ -21,19 +21,19 @@ def with_parent() -> dict[str, str]:
 
 
 def end_with_parent() -> None:
-    """Arrange an orderly end for when the parent dies in any way, if it asked for that by `with_parent`."""
+    """Arrange an orderly end on the parent's death, if the parent asked for it by `with_parent`."""
     parent = os.environ.pop(PARENT, None)
     if parent is None:
         return
     import ctypes
 
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
-    if os.getppid() != int(parent):  # the parent died before the kernel was told
+    if os.getppid() != int(parent):  # the parent died before the kernel was informed
         sys.exit(1)
 
 
 def tell_parent_serving() -> None:
-    """Report to a parent that asked for it by `SERVING` that this process has started, and works."""
+    """Report to a parent that requested it by `SERVING` that this process has started and works."""
     pipe = os.environ.pop(SERVING, None)
     if pipe is not None:
         with suppress(OSError), open(int(pipe), "wb", buffering=0) as parent:

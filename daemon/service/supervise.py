@@ -21,9 +21,9 @@ END_LIMIT_S = 10.0
 class Child:
     """A process that is kept running.
 
-    If a process refuses to start (it ends with an error code of its own before it ever reported that it works), a
-    person is needed, and this is an error. A process that was killed, or ends later, is restarted, with growing waits
-    until it runs for longer than they grow to.
+    If a process refuses to start (it ends with its own error code before it has reported that it works), a person is
+    needed, and this is an error. A process that was killed, or ends later, is restarted. The waits grow until it runs
+    for longer than their limit.
     """
 
     def __init__(self, name: str, command: Sequence[str]) -> None:
@@ -105,7 +105,7 @@ def _has_line(pipe: int) -> bool:
 
 
 class Supervisor:
-    """Keeps child processes running until `stop`, and ends them all."""
+    """Supervisor that keeps child processes running until `stop`, and ends them all."""
 
     def __init__(self, children: Sequence[Child]) -> None:
         self._children = children

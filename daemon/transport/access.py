@@ -30,7 +30,7 @@ _MESSAGES: dict[Deed, tuple[tuple[str, ...], tuple[str, ...]]] = {
 
 
 class Names(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Names per role: common names of certificates, or user names where passwords are required."""
+    """Names per role: common names of certificates, or user names if passwords are required."""
 
     viewer: tuple[str, ...] = ()  # asks for predictions, pairs, the model and states, and receives pairs and states
     # a viewer who may give commands, see the cameras' picture, and change the simulated robot's tool

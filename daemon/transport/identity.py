@@ -27,7 +27,7 @@ class TlsConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class LoginConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A table `login`: name and password in place of a client certificate."""
+    """A table `login`: name and password instead of a client certificate."""
 
     user: str  # name
     password_file: str  # its first line is the password; relative to the file that names it

@@ -135,7 +135,7 @@ class QueryLimiter(Generic[T]):
         resting = [name for name, asking in self._sources.items() if not asking.waiting]
         if not resting:
             raise RequestError(f"{self._limits.sources} clients wait already, and that is the most; ask again later")
-        # The source that rested longest has the least state to lose.
+        # The source that rested longest loses the least state.
         del self._sources[min(resting, key=lambda name: self._sources[name].seen)]
 
 

@@ -52,7 +52,7 @@ class Request:
 
 @dataclass(frozen=True, slots=True)
 class Reply:
-    """One answer, decoded: `error` says what was wrong with the request, or is None."""
+    """One answer, decoded: `error` is the fault of the request, or None."""
 
     payload: bytes
     error: str | None
@@ -75,7 +75,7 @@ class ZenohSession:
         # time allowed for the process that accepts the connection to speak zenoh
         open_timeout_s: float = SessionSettings.open_timeout_s,
     ) -> None:
-        """Open a session that listens on `listen` and connects to `connect` when a process listens there."""
+        """Open a session that listens on `listen` and connects to `connect` if a process listens there."""
         self._listen, self._client, self._settings = listen, client, dict(settings or {})
         self._route = Route((connect,)) if isinstance(connect, str) else connect
         self._open_timeout_s = open_timeout_s
@@ -113,8 +113,8 @@ class ZenohSession:
         """Call `handler` with the payload of every publication under `key`, in a thread of the session.
 
         Args:
-            quick: the handler only stores the payload. It then gets no thread of its own: each further thread that
-                needs the interpreter for every message slows all others.
+            quick: True if the handler only stores the payload. It then gets no thread of its own, because each further
+                thread that needs the interpreter for every message slows down all others.
         """
 
         def receive(sample: zenoh.Sample) -> None:
@@ -167,7 +167,7 @@ class ZenohSession:
     def alive(self, key: str, *, timeout_s: float = 2.0) -> list[str]:
         """Return the live keys that match this one, except those that this session also watches.
 
-        zenoh answers from what a watch of the same session has received so far, which may still be nothing.
+        zenoh answers from the part that a watch of the same session has received so far, which may still be nothing.
         """
         replies = self._open.liveliness().get(key, timeout=timeout_s)
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
@@ -259,7 +259,7 @@ class ZenohSession:
         self._threads.clear()
 
     def _refuse(self) -> None:
-        """Refuse queries beyond the limits, in a separate thread: a client that does not listen blocks it."""
+        """Refuse queries beyond the limits, in a separate thread, since a client that does not listen blocks it."""
         while (refused := self._refusals.get()) is not None:
             with contextlib.suppress(zenoh.ZError), refused[0]:  # a closed session cannot answer
                 _reply_error(*refused)

@@ -13,7 +13,7 @@ from .wire import SCHEMA
 
 
 class JointRange(msgspec.Struct, frozen=True):
-    """The part of one joint's range that accepted pairs have covered [rad, of a prismatic joint m]."""
+    """The part of one joint's range that accepted pairs have covered [rad; m for a prismatic joint]."""
 
     low: float  # smallest angle of all accepted pairs
     high: float  # largest
@@ -114,24 +114,24 @@ class LearnerStatus(msgspec.Struct, frozen=True, kw_only=True):
     schema: int = SCHEMA
 
     def expected_error_m(self, claimed_m: float | None) -> float | None:
-        """Return the mean distance [m] to expect between predictions and new measurements, their noise included.
+        """Return the expected mean distance [m] between predictions and new measurements, noise included.
 
-        People are shown this one: they can check it against `prequential_m`.
+        This is the figure shown to users, who can compare it with `prequential_m`.
 
         Args:
             claimed_m: mean distance of predictions to the ground truth [m].
 
         Returns:
-            None while the noise of the measurements is not known.
+            None if the noise of the measurements is unknown.
         """
         noise_m = self.noise_m()
         return None if claimed_m is None or noise_m is None else math.hypot(claimed_m, _MEAN_LENGTH * noise_m)
 
     def noise_m(self) -> float | None:
-        """Return the noise of the measurements, 1-sigma per coordinate [m]; None while it is not known.
+        """Return the noise of the measurements, 1-sigma per coordinate [m]; None if unknown.
 
-        The calibration's contains what its chain cannot explain. Errors on new pairs contain the noise, so it is at
-        most what the best model has.
+        The calibration's noise contains the errors that its chain cannot explain. Errors on new pairs contain the
+        noise, so it is at most the error of the best model.
         """
         if self.calibration is None:
             return None

@@ -1,4 +1,4 @@
-"""Messages over zenoh: JSON, or MessagePack when the request asks for it. Every message has a schema number.
+"""Messages over zenoh: JSON, or MessagePack if the request asks for it. Every message has a schema number.
 
 Requests are checked for unknown keys. Replies and publications may gain keys, so readers ignore unknown ones.
 """
@@ -164,7 +164,7 @@ def decode(payload: bytes, kind: type[M], encoding: str = JSON) -> M:
     """Return the message in `payload`.
 
     Raises:
-        RequestError: it is not of this type; the message says where.
+        RequestError: it is not of this type; the message names the place.
     """
     try:
         decoder: Any = msgspec.msgpack if encoding == MSGPACK else msgspec.json
@@ -187,7 +187,7 @@ def pairs_to_wire(pairs: Sequence[Pair]) -> list[PairMessage]:
 
 
 def _with_poses(pairs: Sequence[Pair]) -> Iterable[tuple[Pair, MarkerPose]]:
-    """Return pairs of which all or none have an orientation and its covariance, with their poses."""
+    """Return pairs with their poses; all or none have an orientation and its covariance."""
     import numpy as np
 
     R = [pair.R for pair in pairs if pair.R is not None]
@@ -297,7 +297,7 @@ def joint_angles(request: JointsRequest, joints: tuple[str, ...]) -> FloatArray:
     """Return the request's joint angles, shape (n, d) [rad].
 
     Raises:
-        RequestError: as `joint_rows` does, or if a value is impossible for a joint.
+        RequestError: as in `joint_rows`, or if a value is impossible for a joint.
     """
     import numpy as np
 

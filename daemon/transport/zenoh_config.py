@@ -48,7 +48,7 @@ class ZenohConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return tuple(name for name in named if name is not None)
 
     def identity(self, folder: Path) -> Identity | None:
-        """Return this machine's credentials; None without certificates. ConfigError if its files are unusable."""
+        """Return this machine's credentials, None without certificates; raise ConfigError if its files are unusable."""
         return None if self.tls is None else Identity.of(self.tls, self.login, self.users_file, folder)
 
     def check(self, file: Path, text: str) -> None:
@@ -105,7 +105,7 @@ class ZenohConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return Route(endpoints, self.identity(folder))
 
     def settings_of(self, process: str, robot: str, folder: Path) -> dict[str, Any]:
-        """Return zenoh's configuration of the process, apart from what all our sessions share."""
+        """Return zenoh's configuration of the process, apart from the settings that all our sessions share."""
         connect = [self.sampler] if process == "learner" else []
         settings: dict[str, Any] = {
             "listen/endpoints": [self.endpoint(process)],

@@ -1,1 +1,1 @@
-"""The one place that chooses hardware, a recording or the simulation."""
+"""The one place that selects hardware, a recording or the simulation."""

@@ -1,4 +1,4 @@
-"""The wiring of benches: the arm that robot.toml describes without the arm, alone or in the simulation's place."""
+"""The wiring of emulated arms: the arm of robot.toml without hardware, alone or instead of the simulation."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ OnPorts = DynamixelConfig | FeetechConfig | SerialLinesConfig
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """Motion of a bench: for each joint its angle [rad] as a function of time, and a description in words."""
+    """Motion of an emulated arm: the angle [rad] of each joint as a function of time, and a description in words."""
 
     angles: dict[str, Angle]
     words: str
@@ -159,7 +159,7 @@ def _plural(count: int, what: str) -> str:
 
 
 def _require_free(link: Path) -> None:
-    """ConfigError when something is there that no earlier bench left, or the terminal it leads to is still open."""
+    """Raise ConfigError unless the path is free, or a link of an earlier emulator whose terminal is closed."""
     is_of_a_bench = link.is_symlink() and os.readlink(link).startswith(PSEUDO_TERMINALS)
     if is_of_a_bench and link.exists():
         remedy = f"Give another --port, or end that bench. If none runs: rm {link}"
@@ -171,7 +171,7 @@ def _require_free(link: Path) -> None:
 
 
 def bench_robot_file(config: Config, bench: DryRun, port: Path) -> Path:
-    """Write a copy of robot.toml beside `port`, with the bench's ports and its own state.
+    """Write a copy of robot.toml beside `port`, with the emulator's ports and its own state.
 
     Raises:
         ConfigError: another file is there, or it cannot be written.
@@ -208,7 +208,7 @@ OpenDriver = Callable[[OnPorts | Ros2Config], JointSource]
 
 
 def through_bench(config: Config, joints: JointSource, open_driver: OpenDriver) -> JointSource:
-    """Return the simulation's joints, read from a bench by the driver configured in robot.toml."""
+    """Return the simulation's joints, read from an emulator by the driver configured in robot.toml."""
     hardware = require_bench(config)
     match hardware:
         case DynamixelConfig() | FeetechConfig():
@@ -236,7 +236,7 @@ def _looking_at_servos(
 def _looking_at_lines(
     hardware: SerialLinesConfig, angles: Mapping[str, Angle], open_driver: OpenDriver
 ) -> Iterator[Behind]:
-    """Yield joints read from a board on a bench; each look waits for a line measured after it."""
+    """Yield joints read from an emulated board; each read waits for a line measured after it."""
     from bodyschema.drivers.serial_lines.bench.board import Listener
 
     clock = SystemClock()
@@ -250,7 +250,7 @@ def _looking_at_lines(
 def _looking_at_messages(
     hardware: Ros2Config, angles: Mapping[str, Angle], open_driver: OpenDriver
 ) -> Iterator[Behind]:
-    """Yield joints read from a node and a router in this process; the node publishes at each look."""
+    """Yield joints read from a node and a router in this process; the node publishes at each read."""
     from bodyschema.drivers.ros2.bench.node import Node
     from bodyschema.drivers.ros2.bench.zenoh_robot import ZenohRobot
 

@@ -1,4 +1,4 @@
-"""The wiring of real cameras: what robot.toml asks for, how it is looked at, which there are."""
+"""The wiring of real cameras: open those of robot.toml, check them, and list the connected ones."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def open_eyes(config: Config, clock: Clock) -> Eyes:
 
 
 def focus_complaints(eyes: Eyes) -> tuple[str, ...]:
-    """Return what live cameras reported of lenses that moved or may move."""
+    """Return the reports of live cameras on lenses that moved or may move."""
     return eyes.focus_complaints if isinstance(eyes, LiveEyes) else ()
 
 
@@ -76,9 +76,9 @@ def calibration_file(config: Config) -> Path:
 
 
 def common_error(config: Config) -> CommonError | None:
-    """Return what all positions share of the error of the cameras' calibration.
+    """Return the error of the cameras' calibration that all positions share.
 
-    Return None where robot.toml names no calibration, or where positions of several sources are fused.
+    Return None if robot.toml names no calibration, or if positions of several sources are fused.
 
     Raises:
         ConfigError: the file cannot be read. A learner may run on another machine than the cameras.
@@ -98,7 +98,7 @@ def common_error(config: Config) -> CommonError | None:
 
 
 def camera_of(config: Config, eyes: Eyes) -> StereoCamera:
-    """Return `eyes` with rectified images, not opened yet: by the calibration file, else by [camera].
+    """Return `eyes` with rectified images, not opened yet: by the calibration file, otherwise by [camera].
 
     Raises:
         ConfigError: there is no calibration, or the file cannot be read.
@@ -121,7 +121,7 @@ def camera_of(config: Config, eyes: Eyes) -> StereoCamera:
 
 
 def _of_files(rig: Rig, cameras: CamerasConfig) -> Rig:
-    """Return the rig without serials unless it names these files: files do not tell which cameras took them."""
+    """Return the rig without serials unless it names these files, since files do not identify their cameras."""
     layout = cameras.layout
     names = {layout.left, layout.right} if isinstance(layout, ImagesConfig | VideosConfig) else set[str | None]()
     if names & set(rig.serials):
@@ -133,7 +133,7 @@ def tracked_video(config: Config, file: Path) -> TrackedCamera:
     """Return a video of one camera with its tracker, not opened yet; lens and marker are those of robot.toml.
 
     Raises:
-        ConfigError: there is no calibration of the camera, or the marker cannot be.
+        ConfigError: there is no calibration of the camera, or the marker is impossible.
     """
     return _tracked(config, videos=VideosConfig(left=str(file.absolute()), speed=0.0))
 
@@ -160,7 +160,7 @@ def seen_through(config: Config, cameras: CamerasConfig) -> Config:
 
 
 def require_usable(config: Config) -> None:
-    """ConfigError when pairs cannot be made of the cameras' images and the encoders' readings."""
+    """Raise ConfigError if the cameras' images and the encoders' readings cannot be combined to pairs."""
     cameras = require_cameras(config)
     if cameras.realsense is not None:
         require_extra("realsense", "a RealSense camera")
@@ -177,7 +177,7 @@ def require_usable(config: Config) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Watched:
-    """Cameras for a person to look at."""
+    """Cameras for live display."""
 
     camera: WatchedCamera | PlainEyes  # gives the pictures, not opened yet. eyes: tells how the cameras are.
     eyes: Eyes
@@ -185,7 +185,7 @@ class Watched:
 
 
 def open_watched(config: Config) -> Watched:
-    """Return the cameras of robot.toml, not opened yet; once calibrated, detections are drawn into their images."""
+    """Return the cameras of robot.toml, not opened yet; if calibrated, detections are drawn into their images."""
     eyes = open_eyes(config, SystemClock())
     is_described = config.robot.calibration is not None or isinstance(eyes, RealsenseCamera)
     is_calibrated = require_cameras(config).calibration is not None or is_described
@@ -198,7 +198,7 @@ def open_watched(config: Config) -> Watched:
 
 
 def camera_checks(config: Config) -> Iterator[Check]:
-    """Yield checks that the cameras of robot.toml are present and send images when both are open at once."""
+    """Yield checks that the cameras of robot.toml are present and send images if both are open at once."""
     yield from _checks_of(require_cameras(config), config.file.parent)
     for further in config.tables.vision.further_cameras:
         for check in _checks_of(further, config.file.parent):
@@ -238,7 +238,7 @@ def _where(device: str) -> str:
 
 
 def _open_checks(eyes: Eyes, cameras: CamerasConfig) -> Iterator[Check]:
-    """Open the cameras together for a while and yield checks of what they send."""
+    """Open the cameras together for a while and yield checks of their images."""
     with ExitStack() as stack:
         stack.enter_context(eyes)
         serials = eyes.serials

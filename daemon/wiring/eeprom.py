@@ -88,7 +88,7 @@ def configured(config: Config, joints: Sequence[str], bus: str | None) -> list[W
 
 
 def stranger(port: str, baud: int, id: int) -> Wanted:
-    """Return the servo of that ID, of any vendor, that robot.toml does not name. SourceError if there is no answer."""
+    """Return the servo with an ID that robot.toml does not name, of any vendor; raise SourceError without an answer."""
     for table in [table for table, (_, _, bauds) in EEPROM_VENDORS.items() if baud in bauds]:
         with workbench_of(table) as workbench:
             model = workbench.model_at(workbench.bus(port, baud), id)
@@ -120,7 +120,7 @@ def settings_by_name(workbench: EepromEditor, model: Model) -> Mapping[str, Sett
 
 
 def model_called(table: str, name: str) -> Model:
-    """Return the model of a vendor. ConfigError if this version does not know it."""
+    """Return the model of a vendor; raise ConfigError if this version does not know it."""
     models = EEPROM_VENDORS[table][1] if table in EEPROM_VENDORS else {}
     if name not in models:
         raise ConfigError(f"unknown model {name!r} of {table}", remedy=did_you_mean(name, models))

@@ -1,4 +1,4 @@
-"""Learn a marker from images, as tables of robot.toml: a ball's colour, or where the tags of a cluster are."""
+"""Learn a marker from images, as tables of robot.toml: a ball's colour, or the poses of a cluster's tags."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def learnt_colour_table(images: Sequence[Path], at: tuple[float, float] | None) 
     """Return the table [vision.colour] of the ball at pixel `at` of the first image, or of the moving one.
 
     Raises:
-        ColourUnlearnt: there is no such ball; the message says why.
+        ColourUnlearnt: there is no such ball; the message gives the reason.
     """
     from bodyschema.vision.ball.colour_model import colour_at, colour_of_the_moving, colour_table, read_images
 
@@ -53,7 +53,7 @@ def moving_colour_table(eyes: StereoEyes, clock: Clock, seconds: float, tell: Ca
     """Return the table [vision.colour] of the ball that moves in the left image during `seconds` [s].
 
     Args:
-        eyes: cameras that are not open; they are closed again afterwards.
+        eyes: closed cameras; they are closed again afterwards.
         tell: called with instructions and with problems of the cameras.
 
     Raises:
@@ -91,7 +91,7 @@ class Wanted:
 
 
 class TagFigures(msgspec.Struct):
-    """A tag, 1-sigma of its place [mm] and of its turn [°], and how many views show it.
+    """A tag, 1-sigma of its position [mm] and rotation [°], and the number of views that show it.
 
     `pose` is the same in SI, in the frame of the cluster.
     """

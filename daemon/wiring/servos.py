@@ -48,7 +48,7 @@ def servos_of(config: Config) -> Servos | None:
 
 
 def require_servos(config: Config) -> Servos:
-    """Return the servos of robot.toml. ConfigError if it has none."""
+    """Return the servos of robot.toml; raise ConfigError if it has none."""
     servos = servos_of(config)
     if servos is None:
         raise ConfigError(
@@ -75,7 +75,7 @@ def scanned_bauds() -> list[int]:
 
 
 def ports_to_scan(given: Sequence[str], config: Config | None) -> list[str]:
-    """Return the given ports; else those of robot.toml and all USB serial ports, each once.
+    """Return the given ports; otherwise those of robot.toml and all USB serial ports, each once.
 
     Raises:
         ConfigError: there are none.

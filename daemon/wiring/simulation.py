@@ -1,4 +1,4 @@
-"""The simulation's settings: [sim], with the marker that [vision] looks for."""
+"""The simulation's settings: [sim], with the marker of [vision]."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ class _Settings:
 
 
 def simulation_settings(config: Config) -> SimConfig:
-    """Return the table [sim], with the marker that [vision] looks for in the hand unless [sim.camera] has another.
+    """Return the table [sim], with the marker of [vision] in the hand unless [sim.camera] has another.
 
     Raises:
-        ConfigError: the tracker does not find what the simulation would show.
+        ConfigError: the tracker does not find the simulated marker.
     """
     from bodyschema.sim_backend.config import CameraConfig
 
@@ -62,7 +62,7 @@ def _marker(vision: VisionConfig) -> dict[str, Any]:
 
 
 def _require_found(config: Config, calibration: StereoCalibration, camera: CameraConfig) -> None:
-    """Raise ConfigError if the tracker does not find the marker even alone before a plain wall."""
+    """Raise ConfigError if the tracker does not find the marker even alone in front of a plain wall."""
     from bodyschema.sim_backend.rendering.eye import portraits
     from bodyschema.vision.trackers import tracker_of
 

@@ -1,4 +1,4 @@
-"""The one place that chooses hardware, a recording or the simulation."""
+"""The one place that selects hardware, a recording or the simulation."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def open_sources(config: Config, *, sim: bool) -> Iterator[Sources]:
     """Yield the sources configured in robot.toml; with `sim`, the simulation instead.
 
     Raises:
-        ConfigError: no driver or no cameras are configured, or the simulation cannot be made of this description.
+        ConfigError: no driver or no cameras are configured, or this description cannot be simulated.
         RecordingError: the configured recording cannot be read.
     """
     _require_source(config, sim=sim)
@@ -82,7 +82,7 @@ def open_sources(config: Config, *, sim: bool) -> Iterator[Sources]:
 
 
 def check_sources(config: Config, *, sim: bool) -> None:
-    """ConfigError when `open_sources` would find nothing to open; opens nothing."""
+    """Raise ConfigError if `open_sources` would find nothing to open; open nothing."""
     _require_source(config, sim=sim)
     if sim:
         require_extra("sim", "the simulation")
@@ -157,7 +157,7 @@ def _last_pose(config: Config) -> list[float] | None:
     try:
         with PairReader(config.store_file) as pairs:
             last = pairs.last()
-    except StoreError as error:  # the sampler reports it, too, and repairs the store
+    except StoreError as error:  # the sampler reports it too, and repairs the store
         log.warning("where the joints were last is not known: %s", error)
         return None
     return None if last is None or len(last.q) != len(config.robot.joints) else last.q.tolist()
@@ -190,7 +190,7 @@ def _require_source(config: Config, *, sim: bool) -> None:
 
 
 def connected_cameras() -> list[str]:
-    """Return the cameras of this machine, by the names that stay."""
+    """Return the cameras of this machine, by their persistent names."""
     from bodyschema.vision.cameras.v4l2.serials import connected
 
     return connected()
@@ -225,7 +225,7 @@ def _real(config: Config) -> Sources:
 def _open_marker(
     config: Config, clock: Clock
 ) -> tuple[MarkerSource, TellsHealth, StereoCalibration | None, Picture | None]:
-    """Return what sees the marker, not opened yet, its health, and the calibration and picture of the cameras."""
+    """Return the marker source, not opened yet, its health, and the calibration and picture of the cameras."""
     tables = config.tables.marker_source
     streams = [stream_of(table, clock) for table in tables]
     if config.tables.vision.cameras is None and len(streams) == 1:
@@ -254,7 +254,7 @@ def _open_marker(
 
 
 def _seen_by(config: Config) -> str:
-    """Return the name in messages of what sees the marker."""
+    """Return the name of the marker source in messages."""
     tables = config.tables
     names = [*(table.name for table in tables.vision.further_cameras), *(table.label for table in tables.marker_source)]
     if tables.vision.cameras is not None:
@@ -307,7 +307,7 @@ def open_streams(config: Config, clock: Clock) -> list[MarkerStream]:
 
 
 def marker_source_checks(config: Config) -> Iterator[Check]:
-    """Yield checks of what each marker source of robot.toml sends. Open it for that."""
+    """Yield checks of the data of each marker source of robot.toml. Open it for that."""
     clock = SystemClock()
     for stream in open_streams(config, clock):
         yield from stream_checks(stream, clock)
@@ -349,7 +349,7 @@ def open_postures(config: Config, count: int) -> Iterator[Sources]:
     """Yield the simulation's sources with the robot at rest in `count` independently sampled postures.
 
     Raises:
-        ConfigError: the simulation cannot be made of this description.
+        ConfigError: this description cannot be simulated.
     """
     require_extra("sim", "the simulation")
     from bodyschema.sim_backend.posed import PosedWorld, visible_postures
@@ -382,7 +382,7 @@ def _recorded(config: Config, file: Path) -> Sources:
 
 
 def stream_of(table: AnySource, clock: Clock) -> MarkerStream:
-    """Return the source, not opened yet; `clock` has to be the machine's monotonic one."""
+    """Return the source, not opened yet; `clock` must be the machine's monotonic one."""
     match table:
         case UdpTable():
             return MarkerStream(table, UdpReceiver(table, clock), decode_datagram, clock)
@@ -412,10 +412,10 @@ def holding_torques(robot: RobotDescription) -> Callable[[FloatArray], FloatArra
 
 
 def open_drives(config: Config, servos: DynamixelConfig, clock: Clock) -> tuple[ZeroForce | Gaze, ...]:
-    """Return the drives that may move the joints: those that robot.toml names, inactive until a person asks.
+    """Return the drives that may move the joints: those in robot.toml, inactive until requested.
 
     Raises:
-        ConfigError: the URDF states no masses, or robot.toml says that the arm is held in another way.
+        ConfigError: the URDF states no masses, or robot.toml declares that the arm is held in another way.
     """
     joints, drives = config.robot.joints, []
     _check_hold(config, servos)

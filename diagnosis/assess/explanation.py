@@ -53,7 +53,7 @@ class Explanation:
 
     @property
     def wanders(self) -> bool:
-        """True if neighbouring rows share what no unnamed cause predicts, and it is more than an imperfect shape."""
+        """True if neighbouring rows share an error beyond unnamed causes, larger than that of an imperfect shape."""
         fit = self.beside
         if fit.is_exact or not wanders(fit.correlation, fit.observations.motion.begins):
             return False
@@ -79,8 +79,8 @@ def explain(
 ) -> Explanation:
     """Keep the causes found, unless fewer of them with unnamed causes are clearly more probable.
 
-    Functions of time and of the joints of a walk follow noise that is alike in neighbouring rows. So where it still is
-    beside unnamed causes, rows count for as many as are independent.
+    Functions of time, and of the joints during a walk, follow noise that is correlated between neighbouring rows. If
+    noise is still correlated beside unnamed causes, only the effective number of independent rows counts.
 
     Args:
         found: the fit with all named causes of the search.
@@ -102,11 +102,11 @@ def _compared(found: Fit, path: Sequence[Fit], unnamed: UnnamedFamilies, search:
     best = _with_unnamed(found, unnamed, search, counted)
     inexact = max(_Settings.of_the_causes * whole, _Settings.of_the_way * _length(found, changed_by_the_way(found)))
     if is_at_limit(found.background.scales):
-        # Causes of an arm that no workshop made have not been found, so what is left is not their shape.
+        # The causes of an arm beyond workshop tolerances have not been found, so the remainder is not their shape.
         inexact = 0.0
     if best.apart is not None and (best.size < inexact or not unnamed.predicts(best.apart, found)):
         best = replace(best, apart=None, size=0.0)
-    # Named causes that explain nearly everything are not given up for what explains the rest.
+    # Named causes that explain nearly everything are not given up for an explanation of the rest.
     is_rest = best.size < _Settings.rest * whole
     margin = _Settings.margin if is_rest else 0.0
     # Upper bound of an unnamed cause's gain: to first order it explains no more beside fewer causes.
@@ -131,8 +131,8 @@ def _compared(found: Fit, path: Sequence[Fit], unnamed: UnnamedFamilies, search:
         if other.apart is not None and better and unnamed.predicts(other.apart, found):
             best = other
     if best.apart is not None:
-        # Linearised about what is found beside them: without them, tolerances follow them far from there. In the
-        # contest nothing is linearised again, where named causes are not either.
+        # Linearised about the fit beside them: without them, tolerances follow them to distant values. Named causes are
+        # not linearised again in this comparison, so neither is anything else.
         about = best.apart.fit.tolerating(tolerated(best.apart.fit).scales).to(best.fit.observations)
         best = _rescaled(best, best.apart, unnamed, search, about)
         best = _pruned(best, unnamed, search, rest=is_rest and best.fit is found)
@@ -140,10 +140,10 @@ def _compared(found: Fit, path: Sequence[Fit], unnamed: UnnamedFamilies, search:
 
 
 def useful(explanation: Explanation, search: Search, blocks: Blocks, tell: Callable[[str], None]) -> Explanation:
-    """Drop causes that are not worth naming, do not reduce the error on data not used in the fit, or cannot be.
+    """Drop causes that are not worth naming, do not reduce the held-out error, or have impossible amounts.
 
-    Larger tolerances may take the place of a link or a joint offset without any loss on such data, and with a slight
-    one by chance. Such a cause stays if it is more probable than these tolerances.
+    Larger tolerances may replace a link or a joint offset with no loss on held-out data, or a slight loss by chance.
+    Such a cause stays if it is more probable than these tolerances.
     """
     fit = explanation.fit
     if explanation.unnamed_causes or fit.is_exact:
@@ -153,14 +153,14 @@ def useful(explanation: Explanation, search: Search, blocks: Blocks, tell: Calla
         whole = max(float(error[markers].sum()), 1e-300)
         beyond = [beyond_tolerances(fit, cause, search.multiplicity) for cause in fit.causes]
         fewer = [search.beside(fit, cause).without for cause in fit.causes]
-        # Tolerances that are more probable than a cause have their own size without it.
+        # If tolerances are more probable than a cause, they get their own size without it.
         fewer = [
             one.tolerating(tolerated(one).scales) if cause.kind.rigid and is_beyond is False else one
             for one, cause, is_beyond in zip(fewer, fit.causes, beyond, strict=True)
         ]
         losses = [float((_missed(one, blocks) - error)[markers].sum()) for one in fewer]
         told = [
-            # Negative backlash or compliance is no cause, whatever it gains.
+            # Negative backlash or compliance is impossible, even if it explains the data.
             cause.is_possible and search.worth(fit, cause) >= 0.0 and _is_told(cause, is_beyond, loss / whole)
             for cause, is_beyond, loss in zip(fit.causes, beyond, losses, strict=True)
         ]
@@ -171,13 +171,13 @@ def useful(explanation: Explanation, search: Search, blocks: Blocks, tell: Calla
             "no gain on data not used in the fit" if losses[least] <= 0.0 else "something in its place is more probable"
         )
         tell(f"dropped {describe(fit.causes[least])}: {why}")
-        # Tolerances grow by what the cause no longer explains.
+        # Tolerances grow by the part that the cause no longer explains.
         fit = fewer[least].tolerating(tolerated(fewer[least]).scales)
     return replace(explanation, fit=fit)
 
 
 def _is_told(cause: Effect, beyond: bool | None, loss: float) -> bool:
-    """Return True if a cause is worth telling, whose absence adds a share `loss` to the held-out squares."""
+    """Return True if a cause is worth naming; leaving it out adds the share `loss` to the held-out squares."""
     if cause.kind.rigid and beyond is not None and loss < _Settings.slight:
         # Every link is a little off, so a slight gain of one is chance.
         return beyond
@@ -187,7 +187,7 @@ def _is_told(cause: Effect, beyond: bool | None, loss: float) -> bool:
 def _missed(fit: Fit, blocks: Blocks) -> FloatArray:
     """Return squared held-out errors (n,), in units of the stated noise.
 
-    In metres, the rows that the instrument sees least exactly would decide.
+    In metres, the rows with the least accurate measurements would dominate.
     """
     errors = held_out_errors(fit, blocks)[:, :, None]
     return np.square(fit.observations.whitened(errors)).sum(axis=(1, 2))
@@ -196,7 +196,7 @@ def _missed(fit: Fit, blocks: Blocks) -> FloatArray:
 def _rescaled(
     best: Explanation, apart: Apart, unnamed: UnnamedFamilies, search: Search, about: Fit | None = None
 ) -> Explanation:
-    """Refit with the tolerance scales found beside the unnamed causes, where that is more probable.
+    """Refit with the tolerance scales found beside the unnamed causes, if that is more probable.
 
     Args:
         about: the named causes with these scales, linearised elsewhere.
@@ -233,7 +233,7 @@ def _length(fit: Fit, change: FloatArray) -> float:
 def _with_unnamed(
     fit: Fit, unnamed: UnnamedFamilies, search: Search, counted: float, least: float = -np.inf
 ) -> Explanation:
-    """Add worthwhile unnamed causes one by one; stop where the total will hardly reach `least` [nats]."""
+    """Add worthwhile unnamed causes one by one; stop when the total is unlikely to reach `least` [nats]."""
     apart: Apart | None = None
     promise, names = -np.inf, cost_of_names(fit.causes, search)
     while not fit.is_exact and (apart is None or len(apart.chosen) < _Settings.most_unnamed):
@@ -258,12 +258,12 @@ def _with_unnamed(
 
 
 def cost_of_names(causes: Iterable[Effect], search: Search) -> float:
-    """Return the cost of causes where sets of causes are compared [nats]."""
+    """Return the cost of naming causes, for the comparison of sets of causes [nats]."""
     return sum(_Settings.number * len(effect.amounts) + search.doubt_of(effect) for effect in causes)
 
 
 def _pruned(explanation: Explanation, unnamed: UnnamedFamilies, search: Search, *, rest: bool) -> Explanation:
-    """Remove causes not worth keeping beside unnamed ones; with a remainder, those the unnamed ones can replace."""
+    """Remove causes not worth keeping beside unnamed ones; with a remainder, those that unnamed ones can replace."""
     for cause in explanation.fit.causes:
         least = explanation.worth - (_Settings.as_good if rest else WorthSettings.named_nats)
         fewer = without_one(explanation, cause, unnamed, search, least)
@@ -276,5 +276,5 @@ def _pruned(explanation: Explanation, unnamed: UnnamedFamilies, search: Search, 
 def without_one(
     explanation: Explanation, cause: Effect, unnamed: UnnamedFamilies, search: Search, least: float = -np.inf
 ) -> Explanation:
-    """Return the explanation without one of its causes; it is given up where it will hardly reach `least` [nats]."""
+    """Return the explanation without one of its causes; abandon it if it is unlikely to reach `least` [nats]."""
     return _with_unnamed(explanation.fit.without(cause), unnamed, search, explanation.counted, least)

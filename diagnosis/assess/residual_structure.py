@@ -30,7 +30,7 @@ class ResidualStructure:
     model: SmoothModel | None = None  # the causes beside a smooth model of it; None where no structure is left
     untold: tuple[str, ...] = ()  # descriptions of time-dependent parts, which no stored model can contain
     rattle: Rattle | None = None  # play of a loose marker; None for one that is fixed
-    unpredicted_m: float = 0.0  # RMS of what neighbouring rows share and nothing predicts [m]
+    unpredicted_m: float = 0.0  # RMS of the error that neighbouring rows share and nothing predicts [m]
 
     @property
     def is_there(self) -> bool:
@@ -39,7 +39,7 @@ class ResidualStructure:
 
     @property
     def unnamed(self) -> tuple[str, ...]:
-        """The descriptions but for a loose marker."""
+        """The descriptions, except for a loose marker."""
         return self.what if self.rattle is None else self.what[:-1]
 
 
@@ -50,7 +50,7 @@ def residual_structure(
     left = _of_families(explanation, unnamed, blocks, is_loose=loose is not None)
     if loose is None:
         return left
-    # Look at the joint that carries the marker.
+    # Also check the joint that carries the marker.
     carrier = len(explanation.fit.simulation.robot.joints) - 1
     joints = tuple(sorted({*left.joints, carrier}))
     return replace(left, what=(*left.what, loose.what), joints=joints, rattle=loose)
@@ -65,7 +65,7 @@ def _of_families(
     if apart is None:
         beside = unnamed.apart(fit, (unnamed.nearest(fit)[0][0],))
         left = ResidualStructure((), (), False, min(1.0, _chance(fit, beside, unnamed) * unnamed.count))
-        # On which side of its play a marker lies is alike in neighbouring rows.
+        # Neighbouring rows have the marker on the same side of its play.
         if is_loose or not explanation.wanders:
             return left
         squares = np.square(fit.observations.x - fit.predicted).sum(axis=1)
@@ -84,7 +84,7 @@ def _of_families(
 
 
 def _chance(fit: Fit, apart: Apart, unnamed: UnnamedFamilies) -> float:
-    """Return the p-value of this structure arising by chance: an F-test, since few rows do not tell the noise."""
+    """Return the p-value of this structure by an F-test, since few rows do not determine the noise."""
     count = max(unnamed.told(apart).shape[2] + apart.choice, 1)
     coordinates = 3.0 * float(fit.noise.weights.sum())
     free = coordinates - basis_of(fit).shape[1] - count

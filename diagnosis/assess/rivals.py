@@ -45,12 +45,12 @@ class Rival:
     """An alternative to a cause."""
 
     instead: Fit | UnnamedAlternative  # the fit with it in the place of the cause
-    itself: Effect | UnnamedAlternative  # the effect with its best-fitting numbers, or what has no name
+    itself: Effect | UnnamedAlternative  # the effect with its best-fitting numbers, or the unnamed alternative
     probability: float  # given that the cause or one of its rivals is present
     difference: float  # Δχ² by which this motion is expected to separate them
     anywhere: float  # the same for as many poses over the whole range of the joints
     signal: float  # Δχ² of the cause itself on those poses
-    # True if the cause, refitted, also covers this rival on any motion, and it does not matter which is corrected
+    # True if the refitted cause also covers this rival on any motion, so that either may be corrected
     is_one: bool
 
     @property
@@ -73,8 +73,8 @@ class Standing:
     dof: int  # number of its amounts that the data determine
     gain: float  # its Δχ²
     rivals: tuple[Rival, ...]  # the probable ones, the most probable first
-    # True if a joint that gives under the arm's weight explains nearly as much, and was not tested, or with weights
-    # that are assumed
+    # True if a joint that deflects under the arm's weight explains nearly as much, and was not tested, or only with
+    # assumed weights
     is_like_sag: bool = False
 
 
@@ -114,7 +114,7 @@ def _standing(
         if (alternative := UnnamedAlternative.in_place_of(cause, fit, aparts, unnamed, search)) is not None:
             others.append((alternative, alternative))
             behind.append(alternative.behind)
-    # What a cause is worth allows for blocks already.
+    # The worth of a cause accounts for blocks already.
     rows = [np.zeros(len(fit.left)), *(_at_rows(fit, other, cause, itself) for other, itself in others)]
     probable = bagged([-worth, *behind], rows, blocks, seed)
     wide = widened(fit, range(fit.observations.motion.q.shape[1]), uneven=RivalSettings.uneven)
@@ -133,18 +133,18 @@ def _standing(
 
 
 def can_be_measured(cause: Effect, rival: Effect | UnnamedAlternative) -> bool:
-    """Return True if a rule tells a cause from its rival: a wrong scale of all from a wrong length of the arm."""
+    """Return True if a ruler separates a cause from its rival: a wrong scale of everything from a wrong arm length."""
     return isinstance(rival, Effect) and cause.kind.scales_all != rival.kind.scales_all
 
 
 def resembles_sag(kind: EffectType) -> bool:
-    """Return True for an error of a joint that depends on angles alone, as sag nearly does."""
+    """Return True for a joint error that depends on angles alone, as sag nearly does."""
     lasts = not (kind.depends_on_path or kind.changes_with_time)
     return isinstance(kind, EncoderEffect) and lasts and not kind.is_zero
 
 
 def is_like_sag(without: Fit, cause: Effect, least: float) -> bool:
-    """Return True if a spring at one joint explains what a cause does, although its weight is assumed or not borne.
+    """Return True if a spring at one joint explains a cause, and the weight is assumed or not borne by the joints.
 
     Args:
         without: the fit without the cause.
@@ -168,11 +168,12 @@ def is_like_sag(without: Fit, cause: Effect, least: float) -> bool:
 def bagged(behind: Sequence[float], rows: Sequence[FloatArray], blocks: Blocks, seed: int) -> FloatArray:
     """Return the probability of a cause and of each alternative to it (1 + m,), as the mean over block resamplings.
 
-    No model is exact, so evidence that a few blocks decide is not sure (Huggins and Miller 2023, bagged posteriors).
+    No model is exact, so evidence that depends on a few blocks is uncertain (Huggins and Miller 2023, bagged
+    posteriors).
 
     Args:
         behind: log-evidence of each alternative over the cause [nats].
-        rows: the part of it that each row holds (n,).
+        rows: contribution of each row to it (n,).
     """
     even = np.full(blocks.count, 1.0 / blocks.count)
     drawn = np.random.default_rng(seed).multinomial(blocks.count, even, RivalSettings.bagged) - 1
@@ -194,7 +195,7 @@ def _at_rows(
 
 
 def _is_no_more(other: Fit | UnnamedAlternative, fit: Fit, without: Fit, wide: Motion) -> bool:
-    """Return True if the cause, refitted, covers all that a rival can do on any motion."""
+    """Return True if the refitted cause covers everything that a rival can do on any motion."""
     if not isinstance(other, Fit):
         return True
     return apart_on(other, fit, wide) < RivalSettings.same_share * apart_on(other, without, wide)

@@ -1,4 +1,4 @@
-"""Divide the explained error among causes, tolerances and the smooth model of what has no name."""
+"""Divide the explained error among causes, tolerances and the smooth model of unnamed causes."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from bodyschema.interfaces.records import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class Shares:
-    """Shares of the explained squared error, with a sum of 1, or 0 where nothing is explained.
+    """Shares of the explained squared error, with a sum of 1; all 0 if nothing is explained.
 
-    A joint offset has a share here even where large tolerances could take its place: the tolerances are those of the
-    fit, and the share is what the offset does and not what would be lost without it.
+    A joint offset has a share here even if large tolerances could replace it. The tolerances are those of the fit. The
+    share is the error that the offset explains, not the loss without it.
     """
 
     causes: tuple[float, ...]  # share of each cause of the fit
@@ -26,16 +26,16 @@ class Shares:
 
 
 def shares(aligned: Fit, extended: Fit, kept: NDArray[np.bool_], unnamed: FloatArray | None) -> Shares:
-    """Divide what `extended` explains of the residuals of `aligned`, by the covariance of each part with them.
+    """Divide the part of the residuals of `aligned` that `extended` explains, by each part's covariance with them.
 
     Args:
         kept: rows that count (n,).
-        unnamed: change (n, 3) [m] by the smooth model of unnamed causes; None where there is none.
+        unnamed: change (n, 3) [m] by the smooth model of unnamed causes; None without one.
     """
     simulation, motion = extended.simulation, extended.observations.motion
     left = _beside_nuisances(extended, (extended.observations.x - aligned.predicted)[kept], kept)
     whole = simulation.positions(motion)
-    # Tolerances that the simulation came with are no part of what was found.
+    # Initial tolerances of the simulation are not part of the findings.
     given = aligned.simulation.background
     changes = [
         whole - simulation.with_effects([one for one in simulation.effects if one is not cause]).positions(motion)
@@ -55,7 +55,7 @@ def shares(aligned: Fit, extended: Fit, kept: NDArray[np.bool_], unnamed: FloatA
 
 
 def _beside_nuisances(fit: Fit, left: FloatArray, kept: NDArray[np.bool_]) -> FloatArray:
-    """Return the part of residuals (m, 3) that the parameters robot.toml does not know cannot follow."""
+    """Return the part of residuals (m, 3) that parameters unknown to robot.toml cannot follow."""
     columns = amount_columns(fit.run, fit.simulation.effects[: fit.nuisances])[kept].reshape(left.size, -1)
     columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     basis = np.linalg.qr(columns)[0]

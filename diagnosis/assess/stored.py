@@ -1,4 +1,4 @@
-"""Choose what extended.toml holds: nothing that is not surely better on another recording."""
+"""Choose the content of extended.toml: only parts that are surely better on another recording."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ class _Settings:
 def stored(candidates: Sequence[Fit], markers: NDArray[np.bool_]) -> Fit:
     """Return the fit that is surely best on another recording.
 
-    The expected squared error there is that on long blocks of time that were left out, and the variance between fits
-    without one of them on poses that combine the readings of each joint in new ways. A fit has to be better than a
-    simpler one by Student's t-test of the blocks.
+    The expected squared error there is the error on long held-out blocks of time, plus the variance between fits
+    without one of them on poses that recombine the readings of the joints. A fit has to be better than a simpler one by
+    Student's t-test of the blocks.
 
     Args:
         candidates: fits of the same observations, the simplest first.
@@ -47,7 +47,7 @@ def is_better_with(model: SmoothModel, simpler: Fit, markers: NDArray[np.bool_],
     """Return True if a fit with a smooth model is surely better on another recording than a simpler fit.
 
     Args:
-        blocks: those that held out the functions of the model.
+        blocks: blocks held out from the functions of the model.
     """
     before, after = _Elsewhere.of(simpler, markers), _Elsewhere.of(model.fit, markers)
     left = model.fit.observations.x - model.fit.predicted + model.unseen
@@ -57,7 +57,7 @@ def is_better_with(model: SmoothModel, simpler: Fit, markers: NDArray[np.bool_],
 
 @dataclass(frozen=True, eq=False)
 class _Elsewhere:
-    """What a fit is expected to do on another recording."""
+    """Expected errors of a fit on another recording."""
 
     fit: Fit
     squares: FloatArray  # sum of squared held-out errors in each long block, over the number of all rows (blocks,) [m²]
@@ -79,7 +79,7 @@ class _Elsewhere:
             rows = columns[own].reshape(-1, columns.shape[2])
             change = solved(normal - rows.T @ rows, gradient - rows.T @ fit.left[own].ravel())
             if fit.observations.rattling is not None:
-                # As it is written: both sides of the play place it.
+                # As stored: both sides of the play determine the place.
                 missed = (whole.residuals(fit.predicted + here @ change) * fit.root_weights)[~own].ravel()
                 rest = free[~own].reshape(len(missed), fit.amounts)
                 change[: fit.amounts] += solved(rest.T @ rest, rest.T @ missed)
@@ -98,10 +98,10 @@ class _Elsewhere:
 
 
 def predicted_pose_covariance(fit: Fit) -> FloatArray | None:
-    """Return the covariance (6, 6) of the marker's pose as the fit predicts it, or None if nothing was fitted.
+    """Return the covariance (6, 6) of the predicted pose of the marker, or None if nothing was fitted.
 
     It is that of all fitted numbers together, in the mean of recorded poses and without the instrument's noise: x, y,
-    z [m²] in the measurement frame, then turns about its axes [rad²].
+    z [m²] in the measurement frame, then rotations about its axes [rad²].
     """
     if not fit.covariance.size:
         return None
@@ -110,7 +110,7 @@ def predicted_pose_covariance(fit: Fit) -> FloatArray | None:
     simulation = fit.settled_simulation
     own = [effect for effect in simulation.effects if _is_of_pose(effect)]
     arm = replace(simulation, effects=tuple(own), residual=None)
-    # The marker, and points 1 m from it along the axes of its link, which turn about it.
+    # The marker, and points 1 m from it along the axes of its link, which rotate about it.
     beside = [Effect.at(arm.robot, "tool_offset", values=axis) for axis in np.eye(3)]
     marker, *points = (arm.with_effects([*own, *more]).run(motion) for more in ([], *([one] for one in beside)))
     moved = _pose_columns(fit, marker)
@@ -122,14 +122,14 @@ def predicted_pose_covariance(fit: Fit) -> FloatArray | None:
 
 
 def _is_of_pose(effect: Effect) -> bool:
-    """Return True if an effect moves the arm, the marker or the camera as it was set up, not what is reported."""
+    """Return True if an effect moves the arm, the marker or the camera's mount, but not the reported positions."""
     if effect.kind.stage == "camera":
         return effect.pose is not None and not effect.kind.begins
     return not effect.kind.drifts
 
 
 def _pose_columns(fit: Fit, run: Simulated) -> FloatArray:
-    """Return derivatives (n, 3, p) [m] of a run, in the order of `Fit.covariance`; of what it lacks they are 0."""
+    """Return derivatives (n, 3, p) [m] of a run in the order of `Fit.covariance`; 0 for effects that it lacks."""
     columns = [_columns(fit, run), *(run.by_shape(effect) for effect in fit.causes if effect.shapes)]
     numbers = [(effect, len(effect.amounts)) for effect in fit.simulation.effects]
     numbers += [(effect, len(effect.shapes)) for effect in fit.causes]
@@ -142,7 +142,7 @@ def _long_blocks(rows: int) -> Blocks:
 
 
 def _sums(errors: FloatArray, markers: NDArray[np.bool_]) -> FloatArray:
-    """Return the sum of squared errors (n, 3) in each long block, over the number of rows that count [m²]."""
+    """Return the sum of squared errors (n, 3) in each long block, divided by the number of rows that count [m²]."""
     squares = np.where(markers, np.square(errors).sum(axis=1), 0.0)
     return _long_blocks(len(errors)).sums(squares) / max(float(markers.sum()), 1.0)
 

@@ -1,4 +1,4 @@
-"""Test unnamed causes as rivals of named ones: a mount or a link that yields."""
+"""Test unnamed causes as rivals of named ones: a mount or a link that deflects."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class UnnamedAlternative:
     def in_place_of(
         cls, cause: Effect, fit: Fit, tried: Iterable[Apart], unnamed: UnnamedFamilies, search: Search
     ) -> UnnamedAlternative | None:
-        """Return the most probable one; None where none is tried.
+        """Return the most probable one; None if there is none to test.
 
         Args:
             fit: the fit with the cause.
@@ -46,7 +46,7 @@ class UnnamedAlternative:
 
     @property
     def kind(self) -> str:
-        """Erring part: a joint, a body, or the place in the image."""
+        """Source of the error: a joint, a body, or the place in the image."""
         return self.apart.chosen[0].family.kind
 
     @property

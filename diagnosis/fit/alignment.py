@@ -1,4 +1,4 @@
-"""Fit what robot.toml marks as unknown before anything else; it is never a finding."""
+"""Fit the parameters that robot.toml marks as unknown before anything else; they are never a finding."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ class _Settings:
 
 
 def aligned(observations: Observations, simulation: Simulation) -> Fit:
-    """Fit the free camera pose and the free marker where robot.toml does not know them."""
+    """Fit the camera pose and the marker if robot.toml does not know them."""
     robot = simulation.robot
     free = [kind.name for kind in EFFECT_TYPES.values() if kind.is_free(robot)]
-    # The camera's pose first, from which the rest is fitted.
+    # Start with the camera's pose, from which the rest is fitted.
     nuisances = [Effect.at(robot, name) for name in reversed(free)]
     if not robot.camera.pose_known:
         pose = placed(simulation.positions(observations.motion), observations.x)

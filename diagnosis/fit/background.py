@@ -43,7 +43,7 @@ class Scales(NamedTuple):
 
     @property
     def several_times(self) -> float:
-        """Logarithm of the larger scale of lengths and angles, limited to 0 (a workshop's) and 1 (e times that)."""
+        """Logarithm of the larger scale of lengths and angles, clipped to 0 (a workshop's) and 1 (e times that)."""
         return float(np.clip(np.log(self[:2]), 0.0, 1.0).max())
 
     @property
@@ -55,13 +55,13 @@ class Scales(NamedTuple):
 
 
 class Background:
-    """Small errors throughout a simulated run, to first order about those that the simulation already has.
+    """Small errors throughout a simulated run, linearised about those that the simulation already has.
 
     Args:
         run: run of a simulation, whose background may be empty.
         whitening: (n, 3, 3), to units in which the stated noise has unit covariance.
         scales: scales of the tolerances; None for no background at all.
-        before: the background from which this one is derived; None where the simulation's own errors are known and the
+        before: the background from which this one is derived; None if the simulation's own errors are known and the
             tolerances are centred on them.
     """
 
@@ -157,7 +157,7 @@ def rows_in_part(weights: FloatArray) -> NDArray[np.intp]:
 
 
 def background_effects(simulation: Simulation, q: FloatArray) -> tuple[Effect, ...]:
-    """Return the tolerance effects, with zero amounts, of each joint that moves over q (n, d) and each link between."""
+    """Return the tolerance effects, with zero amounts, of each joint that moves over q (n, d) and the links between."""
     robot, found = simulation.robot, []
     for k, joint in enumerate(robot.joints):
         found.append(Effect.at(robot, "link_geometry", joint))

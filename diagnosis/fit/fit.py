@@ -59,7 +59,7 @@ class Fit:
     run: Simulated  # the simulation over the observed motion
     residuals: FloatArray  # (n, 3) in units of the stated noise
     noise: Noise  # the fitted noise model
-    tangent: Tangent | None = None  # derivatives about a similar fit, for the first steps; None where there is none
+    tangent: Tangent | None = None  # derivatives about a similar fit, for the first steps, or None
 
     @property
     def causes(self) -> tuple[Effect, ...]:
@@ -87,7 +87,7 @@ class Fit:
 
     @property
     def log_likelihood(self) -> float:
-        """Log-likelihood of the observations, less the prior cost of large effects and tolerances [nats]."""
+        """Log-likelihood of the observations minus the prior cost of large effects and tolerances [nats]."""
         return self.noise.log_likelihood - self.prior_cost
 
     @property
@@ -152,7 +152,7 @@ class Fit:
 
     @property
     def doubtful_at_first(self) -> NDArray[np.bool_]:
-        """Rows (n,) before any whose history is known, if the arm goes straight from each run to the next."""
+        """Rows (n,) before the first one with known history, if the arm goes straight from each run to the next."""
         rows = np.zeros(len(self.observations), dtype=np.bool_)
         joined = replace(self.run, motion=self.run.motion.joined)
         for effect in self.simulation.effects:
@@ -170,7 +170,7 @@ class Fit:
 
     @cached_property
     def correlation(self) -> float:
-        """Correlation of the residuals of neighbouring rows [0, 1), 0 where it is within two standard errors."""
+        """Correlation of the residuals of neighbouring rows [0, 1); 0 within two standard errors."""
         return correlation(self.left, self.observations.motion.begins)
 
     @cached_property
@@ -230,8 +230,8 @@ class Fit:
     def covariance(self) -> FloatArray:
         """Covariance of all amounts (p, p), nuisances first, then of periods and time constants.
 
-        It is widened where blocks of time disagree by more than independent rows would (Liang and Zeger 1986), and by
-        what other scales of the tolerances would give.
+        It is widened where blocks of time disagree by more than independent rows would (Liang and Zeger 1986), and for
+        the uncertainty of the tolerances' scales.
         """
         columns = np.concatenate([self.columns, self.shape_columns], axis=2)
         flat, variance = columns.reshape(self.left.size, -1), self.noise.sigma**2
@@ -251,7 +251,7 @@ class Fit:
     def _wider_by_scales(self, products: FloatArray, scores: FloatArray, precision: FloatArray) -> FloatArray:
         """Return the factors (p,) of the variances when the scales of the tolerances are integrated over.
 
-        Where a zero is wrong, the turn of its link within tolerances is known no better than their scale.
+        If an offset is wrong, the rotation of its link within tolerances is only known to within their scale.
 
         Args:
             products: information (p, p) of the data about all parameters.
@@ -267,7 +267,7 @@ class Fit:
         groups = np.full(len(precision), -1)
         groups[first : first + len(self.tolerated)] = self.background.group
         units = 1.0 / np.sqrt(np.diag(products) + precision)
-        # Relative to the fit: an instrument that stands metres away would leave nothing of the evidence but rounding.
+        # Relative to the fit: an instrument metres away would leave only rounding of the evidence.
         inner, toward, now, prior = products * np.outer(units, units), scores * units, now / units, precision * units**2
         factors = np.ones(len(precision))
         here = _posteriors(inner, toward, now, prior[None])
@@ -299,7 +299,7 @@ class Fit:
 
     @property
     def near_tangent(self) -> Tangent:
-        """Derivatives about this fit, those of effects that `tangent` has taken from there."""
+        """Derivatives about this fit; those of effects in `tangent` are taken from it."""
         if self.tangent is None or len(self.tangent.weights) != len(self.left):
             return self.own_tangent
         columns = self._columns_of_each(self.tangent)
@@ -325,7 +325,7 @@ class Fit:
         return found
 
     def step(self, tangent: Tangent | None = None) -> tuple[FloatArray, float]:
-        """Return the Gauss-Newton step of amounts, periods and time constants, and its promised rise of the likelihood.
+        """Return the Gauss-Newton step of amounts, periods and time constants, and the expected rise of the likelihood.
 
         Args:
             tangent: derivatives about a similar fit with the same effects; this fit's own by default.
@@ -434,7 +434,7 @@ class Fit:
         return improved(self._about(simulation, scales))
 
     def tolerating_anew(self, scales: Scales) -> Fit:
-        """Refit with tolerances of these scales, linearised about an arm that has none."""
+        """Refit with tolerances of these scales, linearised about an arm without any."""
         before = self.background
         bare = self.simulation.with_background(before.with_amounts(np.zeros_like(before.start)))
         return improved(self._about(bare, scales))
@@ -455,8 +455,8 @@ class Fit:
     def written(self) -> Simulation:
         """Return the simulation to be stored: tolerances as found, and everything else refitted beside them.
 
-        Tolerances are found to first order. Where a link turns one way and the camera the other, their second-order
-        terms are left over. Rows that were ignored for the sake of other causes count here.
+        Tolerances are found to first order. If a link rotates one way and the camera the other, their second-order
+        terms remain. Rows that were ignored because of other causes count here.
         """
         if self.is_exact:
             return self.simulation
@@ -494,10 +494,10 @@ def fitted(observations: Observations, simulation: Simulation, nuisances: int, s
 def improved(fit: Fit, least: float = -np.inf) -> Fit:
     """Refit the parameters of a fit by Gauss-Newton steps, as in `fitted`.
 
-    Derivatives are computed again only when a step leaves more than they should (Shamanskii 1967).
+    Derivatives are recomputed only if a step reduces the residuals by less than expected (Shamanskii 1967).
 
     Args:
-        least: log-likelihood to reach; the fit is given up early once it cannot be expected to [nats].
+        least: log-likelihood to reach; the fit is abandoned once it is unlikely to be reached [nats].
     """
     if not fit.simulation.effects and not len(fit.tolerated):
         return fit
@@ -527,7 +527,7 @@ def improved(fit: Fit, least: float = -np.inf) -> Fit:
 
 
 def _best_of(fit: Fit, step: FloatArray) -> Fit | None:
-    """Return the fit after as much of a step as raises its likelihood; None where nothing does."""
+    """Return the fit after the part of a step that raises its likelihood; None if no part does."""
     for shortened in (1.0, 0.3, 0.05):
         tried = fit.stepped(shortened * step)
         if tried.log_likelihood > fit.log_likelihood:

@@ -1,4 +1,4 @@
-"""Estimate the size and the shape of the instrument's noise beside the encoders' quantisation."""
+"""Estimate the size and the shape of the instrument's noise, in addition to the encoders' quantisation."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ class _Settings:
 
 
 def reshaped(fit: Fit) -> Observations | None:
-    """Return the observations with the shape of the noise that the residuals show; None where the stated one will do.
+    """Return the observations with the noise shape estimated from the residuals; None if the stated shape is adequate.
 
-    A stereo camera is stated to see depth least exactly. Where its noise is in truth the same in all directions, the
-    others are trusted too much, and chance there looks like a cause.
+    A stereo camera states that depth is least accurate. If its noise is in truth isotropic, the other directions are
+    trusted too much, and chance in these looks like a cause.
     """
     observations, rows = fit.observations, fit.noise.weights >= 0.5
     variances, axes = np.linalg.eigh(observations.stated)
     if np.allclose(variances[:, 0], variances[:, 2]):
-        # No shape is stated, and few rows with many parameters do not tell one.
+        # No shape is stated, and few rows with many parameters do not determine one.
         return None
     left = np.einsum("nji,nj->ni", axes, observations.x - fit.predicted)[rows]
     rounding = np.einsum("nji,njk,nki->ni", axes, observations.rounding, axes)[rows]
@@ -34,7 +34,7 @@ def reshaped(fit: Fit) -> Observations | None:
         return None
     factors = (np.square(left) / (stated + rounding)).mean(axis=0)
     count = fit.independence * float(rows.sum())
-    # Evidence of three sizes over one, less the cost of two more parameters (Schwarz 1978).
+    # Evidence of three sizes over one, minus the cost of two more parameters (Schwarz 1978).
     gained = 0.5 * count * float(3.0 * np.log(factors.mean()) - np.log(factors).sum())
     if gained < np.log(3.0 * count):
         return None

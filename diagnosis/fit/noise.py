@@ -1,4 +1,4 @@
-"""The noise of measured positions: its size, its outliers, and how much neighbouring rows share."""
+"""The noise of measured positions: its size, its outliers, and the correlation of neighbouring rows."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class NoiseSettings:
 class Noise:
     """A mixture: most fixes have the stated noise times `sigma`; a share of outliers lies anywhere.
 
-    Outliers are scattered. Where many rows in a row are off, something has changed.
+    Outliers are isolated. Many consecutive rows that are off mean that something has changed.
     """
 
     sigma: float  # size of the noise, in units of the stated one
@@ -84,7 +84,7 @@ class Noise:
 
 
 def correlation(left: FloatArray, begins: NDArray[np.bool_]) -> float:
-    """Return the correlation [0, 1) of residuals (n, 3) of neighbouring rows; 0 within two errors of white rows.
+    """Return the correlation [0, 1) of residuals (n, 3) of neighbouring rows; 0 within two standard errors.
 
     Args:
         begins: (n,), True in the first row after each break.
@@ -97,7 +97,7 @@ def correlation(left: FloatArray, begins: NDArray[np.bool_]) -> float:
 
 
 def wanders(rho: float, begins: NDArray[np.bool_]) -> bool:
-    """Return True if residuals of neighbouring rows are surely more alike than the noise of an instrument.
+    """Return True if residuals of neighbouring rows are surely more correlated than an instrument's noise.
 
     Args:
         rho: their correlation.

@@ -69,27 +69,27 @@ class Observations:
         """Return the same observations of a loose marker.
 
         Args:
-            ratio: variance that its play adds, over that of the noise, of all rows or of each (n,).
+            ratio: additional variance by its play relative to the noise, of all rows or of each (n,).
             ways: direction of the play at each row (n, 3).
         """
         variances = ratio * np.trace(self.own, axis1=1, axis2=2) / 3.0
         return replace(self, rattling=variances[:, None, None] * ways[:, :, None] * ways[:, None, :])
 
     def without_play(self, play: FloatArray) -> Observations:
-        """Return the same observations of a marker whose displacement `play` (n, 3) [m] is taken out of them."""
+        """Return the same observations with the displacement `play` (n, 3) [m] of the marker subtracted."""
         return replace(self, x=self.x + self.play - play, play=play)
 
     def some(self, rows: IntArray) -> Observations:
-        """Return a part of the observations, of increasing rows (m,), before anything is known of the noise."""
+        """Return a part of the observations, at increasing rows (m,), before anything is known about the noise."""
         return Observations(self.motion.some(rows), self.x[rows], self.stated[rows], self.rounding[rows])
 
     def without(self, doubtful: NDArray[np.bool_]) -> Observations:
-        """Return the same observations with rows (n,) that are ignored."""
+        """Return the same observations, ignoring some rows (n,)."""
         return replace(self, doubtful=doubtful)
 
     @property
     def whole(self) -> Observations:
-        """The same observations as they place an arm without memory: all rows count, and both sides of a play."""
+        """The same observations for an arm without memory: all rows count, on both sides of a play."""
         return replace(self, doubtful=None, rattling=None, is_whole=True)
 
     def with_factor(self, stated_factor: float) -> Observations:
@@ -109,9 +109,7 @@ class Observations:
 
     @cached_property
     def trusted(self) -> NDArray[np.bool_]:
-        """Rows (n,) whose preceding path was observed; at the start of a run the state of joints with memory is
-        unknown.
-        """
+        """Rows (n,) whose preceding path was observed; at a run's start the state of joints with memory is unknown."""
         begins = self.motion.begins
         if self.is_whole or begins.sum() * _Settings.rows_a_run > len(self):
             begins = np.zeros(len(self), dtype=np.bool_)
@@ -126,7 +124,7 @@ class Observations:
 
 
 def ticks(q: FloatArray) -> FloatArray:
-    """Return the encoder step (d,) [rad, m] of each joint; 0 where readings (n, d) are no multiples of a step."""
+    """Return the encoder step (d,) [rad, m] of each joint; 0 if readings (n, d) are not multiples of a step."""
     steps = np.zeros(q.shape[1])
     for k, column in enumerate(q.T):
         gaps: FloatArray = np.diff(np.unique(column))

@@ -1,7 +1,7 @@
 """Form normal equations of many hypotheses, beside a fit and beside that fit without each of its causes.
 
-The columns of a hypothesis are the same in all these places. Only the residuals differ, and the few directions that a
-cause alone could change; these are freed again.
+The columns of a hypothesis are the same in all these places. Only the residuals differ, and the few directions that
+only one cause could change; these are freed again.
 """
 
 from __future__ import annotations
@@ -94,9 +94,7 @@ class Products:
         return self._ports[joint]
 
     def since(self, columns: FloatArray, moments: range) -> System:
-        """Return systems of weighted columns (n, 3, k) that begin at each of some rows, the last of which is before the
-        end.
-        """
+        """Return systems of weighted columns (n, 3, k) that begin at each of some rows, all of them before the end."""
         parts = [columns, self._basis, self._lefts]
         step, last = moments.step, moments[-1]
         between = [part[moments[0] : last].reshape(len(moments) - 1, 3 * step, -1) for part in parts]

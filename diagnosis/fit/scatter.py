@@ -20,7 +20,7 @@ class _Settings:
 
 
 def remembers(effect: Effect) -> bool:
-    """Return True if an effect derives a joint's position from past readings, so that reading noise looks like it."""
+    """Return True if an effect derives a joint's position from past readings, which reading noise can imitate."""
     return effect.kind.remembers
 
 
@@ -29,16 +29,16 @@ def instruments(fit: Fit, effect: Effect) -> FloatArray:
 
     A backlash or a lag puts a joint nearer to the previous reading. Noise of the reading itself looks the same. So the
     columns of a row are computed from its neighbours' readings and not from its own, which is in the row's residual: an
-    instrumental variable (Durbin 1954). Where there is no such effect, its product with the residual has zero
-    expectation, however large the noise, as long as the noise is independent between rows. Only where the joint has
-    come from far does its own reading tell the direction as well.
+    instrumental variable (Durbin 1954). Without such an effect, its product with the residual has zero expectation,
+    however large the noise, provided that the noise is independent between rows. Only after a long move of the joint
+    does its own reading determine the direction as well.
     """
     if not remembers(effect):
         return fit.weighted(fit.run.columns(effect)[:, :, effect.amounts])
     motion, joint = fit.observations.motion, fit.simulation.robot.joints.index(str(effect.where))
     between = _between(fit, motion, joint, _Settings.play_far if effect.kind.by_direction else _Settings.far)
     columns = np.empty((len(motion), 3, len(effect.amounts)))
-    # What the readings alone determine does not change the columns, and takes long.
+    # Effects determined by the readings alone have the same columns, which take long to compute.
     simulation = replace(fit.simulation, residual=None)
     # Replace alternate rows, so that each row's neighbours keep their own readings.
     for every_other in (slice(0, None, 2), slice(1, None, 2)):
@@ -52,8 +52,8 @@ def instruments(fit: Fit, effect: Effect) -> FloatArray:
 def beyond_single_rows(one: Fit, other: Fit) -> float:
     """Return the correction to the log-likelihood of `other` over `one` that limits the weight of each row [nats].
 
-    Only rows after a short move distinguish the memory effects of a joint. They are few, so a single outlier decides
-    easily: the first row after a bump, or a joint that the motion of another one pushed across its backlash.
+    Only rows after a short move distinguish the memory effects of a joint. They are few, so a single outlier may
+    decide: the first row after a bump, or a joint that the motion of another one pushed across its backlash.
     """
     return float((limited_rows(one, other) - (other.row_log_likelihoods - one.row_log_likelihoods)).sum())
 

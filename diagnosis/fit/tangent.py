@@ -47,14 +47,14 @@ class Tangent:
         weights: FloatArray,
         near: Tangent | None = None,
     ) -> Tangent:
-        """Form the products; those of columns that `near` has as well are taken from there."""
+        """Form the products; those of columns that `near` contains are taken from it."""
         if near is not None:
             weights = near.weights
         ends = np.cumsum([0, *(own.shape[1] for own in columns)])
         spans = [np.arange(first, end) for first, end in pairwise(ends)]
         tolerances = np.arange(ends[-1], ends[-1] + len(background.tolerances))
         known = {} if near is None else near.known
-        # Places here and in `near` of what both have.
+        # Indices of the common columns here and in `near`.
         shared = [(spans[k], known[id(own)]) for k, own in enumerate(columns) if id(own) in known]
         is_same = near is not None and near.background is background
         if near is not None and is_same:
@@ -92,7 +92,7 @@ class Tangent:
 
 
 def solved(normal: FloatArray, gradient: FloatArray) -> FloatArray:
-    """Return the solution (p, ...) of normal equations, with columns scaled to equal length; the shortest of many."""
+    """Return the (shortest) solution (p, ...) of normal equations, with columns scaled to equal length."""
     if not len(gradient):
         return gradient
     scales = np.sqrt(np.maximum(np.diag(normal), 1e-300))

@@ -1,4 +1,4 @@
-"""Weigh causes: what their parameters and the choice among hypotheses cost, in nats."""
+"""Weigh causes: the cost of their parameters and of the choice among hypotheses, in nats."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def rise_for(worth: float, dof: int) -> float:
 
 
 def choices(effect: Effect) -> float:
-    """Return the number of ways in which the amounts of an effect could have been chosen, equally probable ones."""
+    """Return the effective number of equally probable choices of an effect's free amounts."""
     if not effect.kind.in_parts or effect.free is None:
         return 1.0
     return float(ways_to_choose(effect)[sum(1 << k for k in effect.amounts)])
@@ -56,8 +56,8 @@ def choices(effect: Effect) -> float:
 def ways_to_choose(effect: Effect) -> FloatArray:
     """Return the number of equally probable ways in which each set of an effect's numbers could have been chosen.
 
-    In half of the cases it is a whole: all its shifts, all its turns, or both, as a part is mounted askew. In the
-    other half it is any number of them, and any such set.
+    In half of the cases the set is complete: all shifts, all rotations, or both, for a part that is mounted askew. In
+    the other half it is any subset, with equal probability.
 
     Returns:
         One number for each sum of 2ᵏ over the free numbers k.

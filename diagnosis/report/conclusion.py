@@ -108,7 +108,7 @@ def _tolerances(diagnosis: Diagnosis) -> Tolerances:
 
 
 def _verdict(diagnosis: Diagnosis, causes: tuple[Cause, ...], gain_percent: float, tolerances: Tolerances) -> Verdict:
-    # A search that ends at its limit has described the error and not explained it; so have tolerances of no workshop.
+    # A search that ends at its limit has only described the error, and so have tolerances beyond a workshop's.
     if diagnosis.left.is_there or diagnosis.ended_early or is_at_limit(diagnosis.extended.background.scales):
         return "unexplained"
     if not causes:
@@ -164,7 +164,7 @@ def _causes(diagnosis: Diagnosis, seen_by: str) -> tuple[Cause, ...]:
 
 
 def merged_ripples(fit: Fit) -> set[Identity]:
-    """Return the ripples of a joint that are so near each other that together they may describe any curve."""
+    """Return the ripples of a joint whose periods are so similar that together they may describe any curve."""
     found = set[Identity]()
     ripples = [cause for cause in fit.causes if cause.kind.search == "cycles"]
     for one, other in combinations(ripples, 2):
@@ -301,7 +301,7 @@ def _limitations(diagnosis: Diagnosis) -> tuple[str, ...]:
 
 
 def _left_out(stored: Fit) -> str:
-    """Return a sentence on what extended.toml leaves out."""
+    """Return a sentence on the parts that extended.toml leaves out."""
     parts = ["the causes"] if stored.causes else []
     parts += ["small errors everywhere"] if stored.background.scales is not None else []
     held = " and ".join(parts) or "none of it but the parameters that robot.toml calls unknown"

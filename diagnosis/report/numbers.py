@@ -88,7 +88,7 @@ def numbers_of(cause: Cause, *, timed: bool) -> list[Number]:
 
 
 def told_values(cause: Cause) -> dict[str, float]:
-    """Return a cause's numbers without shifts and turns that are not identifiable; all if none is."""
+    """Return a cause's numbers without shifts and rotations that are not identifiable; all if none is identifiable."""
     parts = {name for name in cause.parameters if name.removeprefix("r")[1:] in ("_m", "_rad")}
     told = {n: of.value for n, of in cause.parameters.items() if n not in parts or number(n, of).is_told}
     return told if told.keys() & parts or not parts else {name: of.value for name, of in cause.parameters.items()}

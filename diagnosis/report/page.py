@@ -57,7 +57,7 @@ def page(diagnosis: Diagnosis, file: DiagnosisFile, remedies: Sequence[str], abo
     """Return the page as HTML.
 
     Args:
-        remedies: what to do about each cause, in the order of `remedies()`.
+        remedies: the remedy of each cause, in the order of `remedies()`.
     """
     residuals = Residuals(diagnosis)
     body = [

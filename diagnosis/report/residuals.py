@@ -114,7 +114,7 @@ class Residuals:
 
     @cached_property
     def direction(self) -> NDArray[np.intp]:
-        """Last direction of each joint (n, d): 1, -1, or 0 where it has not moved in its run."""
+        """Last direction of each joint (n, d): 1, -1, or 0 before its first move in the run."""
         signs = np.sign(self.motion.moves).astype(np.intp)
         for first, end in self.motion.runs:
             for k in range(first + 1, end):
@@ -165,7 +165,7 @@ def structure(x: FloatArray, y: FloatArray) -> float:
 
 
 def _members(x: FloatArray) -> NDArray[np.intp]:
-    """Return the bin of each row (n,): equal numbers of rows per bin, or one bin per value where x has few."""
+    """Return the bin of each row (n,): equal numbers of rows per bin, or one bin per value if x has few."""
     values, member = np.unique(np.round(x, 9), return_inverse=True)
     if len(values) <= ResidualSettings.bins:
         return member

@@ -65,7 +65,7 @@ class Cause(msgspec.Struct, frozen=True):
 
     @property
     def weight_percent(self) -> float:
-        """The larger of its share of the gain, which others might take over, and of what is lost without it."""
+        """The larger of its share of the gain, which others might take over, and the loss without it [%]."""
         return max(self.share_of_gain_percent, self.held_out_gain_percent)
 
     @property
@@ -80,7 +80,7 @@ class Cause(msgspec.Struct, frozen=True):
 
     @property
     def is_outvoted(self) -> bool:
-        """True where a rival is more probable, in the whole percents that a report gives."""
+        """True if a rival is more probable, in the whole percents of a report."""
         return any(round(100.0 * rival.probability) > round(100.0 * self.probability) for rival in self.rivals)
 
     @property

@@ -37,7 +37,7 @@ def errors(diagnosis: DiagnosisFile) -> str:
 
 
 def causes(diagnosis: DiagnosisFile, *, timed: bool) -> str:
-    """Return a table of the causes with their non-zero numbers, and of the shares of what else explains."""
+    """Return a table of the causes with their non-zero numbers, and of the other shares of the gain."""
     rows, others = [], other_shares(diagnosis)
     for cause in in_order(diagnosis.causes):
         if cause.is_correction:

@@ -1,4 +1,4 @@
-"""Say in words that a mechanic understands what was found, what to do about it, and what to measure next."""
+"""Describe in words that a mechanic understands: the findings, the remedies, and the next measurements."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ _WATCH = {
 
 
 def in_order(causes: Sequence[Cause]) -> list[Cause]:
-    """Return causes in the order in which to act: the heaviest first, small ones later, mere corrections last."""
+    """Return causes in the order in which to act: the most important first, small ones later, mere corrections last."""
     return sorted(causes, key=lambda cause: (cause.is_small, cause.is_correction, -cause.weight_percent))
 
 
@@ -81,10 +81,10 @@ def finding(
     timed: bool = True,
     weighed: bool = True,
 ) -> str:
-    """Return one cause as a clause: what is wrong, where, by how much.
+    """Return one cause as a clause: fault, place and size.
 
     Args:
-        numbers: only the shifts and turns given count.
+        numbers: only the given shifts and rotations count.
         seen_by: the kind of measuring device, as in `DiagnosisFile`.
         timed, weighed: as in `FoundCause`.
     """
@@ -95,7 +95,7 @@ def remedies(diagnosis: DiagnosisFile, robot: RobotDescription, steps: FloatArra
     """Return advice on each cause, the one that explains most first.
 
     Args:
-        steps: encoder step of each joint (d,) [rad, m]; 0 where it is unknown.
+        steps: encoder step of each joint (d,) [rad, m]; 0 if unknown.
         torques: the largest torque of gravity on each joint (d,) [N·m, N].
     """
     workshop = Workshop(robot, steps, torques, {cause.effect: cause for cause in diagnosis.causes})
@@ -134,8 +134,8 @@ def sentence(
     """Return the verdict in one or two short sentences.
 
     Args:
-        named_mm: RMS without the smooth model of unnamed causes [mm], where there is one.
-        tolerated_mm: RMS with small errors everywhere and no cause [mm], where such errors show.
+        named_mm: RMS without the smooth model of unnamed causes [mm], if there is one.
+        tolerated_mm: RMS with small errors everywhere and no cause [mm], if such errors are detected.
         seen_by: the kind of measuring device, as in `DiagnosisFile`.
         timed, weighed: as in `FoundCause`.
     """
@@ -195,14 +195,14 @@ def _shows(tolerances: Tolerances | None) -> bool:
 
 
 def _or(cause: Cause, seen_by: str) -> str:
-    """Return the most probable alternative of a cause that is not sure, in parentheses."""
+    """Return the most probable alternative of an uncertain cause, in parentheses."""
     if not cause.leaves_open:
         return ""
     return f" ({'more probably' if cause.is_outvoted else 'or'} {rival_named(cause.rivals[0], seen_by)})"
 
 
 def _or_a_cause(tolerances: Tolerances | None, seen_by: str) -> str:
-    """Return the most probable cause that may be there in the place of large tolerances, in parentheses."""
+    """Return the most probable cause instead of large tolerances, in parentheses."""
     if tolerances is None or not tolerances.leaves_open:
         return ""
     rival = tolerances.rivals[0]
@@ -226,7 +226,7 @@ def _share(gain: Gain) -> str:
 
 
 def made_to(tolerances: Tolerances, seen_by: str) -> str:
-    """Return one sentence on the manufacturing tolerances of an arm; upper bounds where they do not show."""
+    """Return one sentence on the manufacturing tolerances of an arm; upper bounds if they are not detected."""
 
     def told(size: Interval, unit: str, sign: str = "") -> str:
         low, high = size.ci95
@@ -240,7 +240,7 @@ def made_to(tolerances: Tolerances, seen_by: str) -> str:
 
 
 def _instead(tolerances: Tolerances, seen_by: str) -> str:
-    """Return a sentence on what may be there in the place of large tolerances."""
+    """Return a sentence on possible causes instead of large tolerances."""
     told = [f"{rival_named(rival, seen_by)} ({100.0 * rival.probability:.0f} %)" for rival in tolerances.rivals]
     if not told:
         return ""
@@ -248,10 +248,10 @@ def _instead(tolerances: Tolerances, seen_by: str) -> str:
 
 
 def to_do(diagnosis: DiagnosisFile, remedies: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return what to do in its order, and what to do about small causes.
+    """Return the steps to take, in order, and the remedies of small causes.
 
     Args:
-        remedies: of each cause, as returned by `remedies`.
+        remedies: remedies of each cause, as returned by `remedies`.
     """
     ordered = list(zip(in_order(diagnosis.causes), remedies, strict=True)) if remedies else []
     told = [remedy for cause, remedy in ordered if not cause.is_small]
@@ -302,7 +302,7 @@ def advice(diagnosis: Diagnosis, causes: Sequence[Cause], seen_by: str) -> tuple
     """Return sentences of advice: motions that would separate confounded causes, and steps against unnamed causes.
 
     Args:
-        causes: those of the diagnosis, and perhaps outliers after them.
+        causes: those of the diagnosis, possibly followed by outliers.
         seen_by: the kind of measuring device, as in `DiagnosisFile`.
     """
     told: list[str] = []

@@ -1,4 +1,4 @@
-"""Ripples of drives: small ones that join the background, and those that a recording confuses with others."""
+"""Ripples of drives: small ones that join the background, and those with aliases in a recording."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Predict blocks of time that a model was not fitted to.
+"""Predict held-out blocks of time.
 
 A fit without a block differs from the full one by a Newton step, so no model is fitted twice. With H the information
 of the other blocks and g the gradient of the block's own likelihood, the amounts move by -H⁻¹ g.
@@ -84,8 +84,8 @@ def held_out_errors(fit: Fit, blocks: Blocks) -> FloatArray:
 def gain_percent(before: FloatArray, after: FloatArray, blocks: Blocks, seed: int) -> tuple[float, tuple[float, float]]:
     """Return the reduction of the RMS of distances (n,) [%], and its 95 % interval on new poses.
 
-    The interval is for another recording of the same kind, half as long: long blocks are resampled, since this
-    recording is a sample, and as many as the other one has are drawn from them.
+    The interval is for another recording of the same kind, half as long: as many long blocks as it would have are
+    resampled from this recording, which is itself a sample.
     """
     blocks = blocks.merged(HeldOutSettings.long_blocks)
     rows = blocks.sums(np.stack([np.square(before), np.square(after)], axis=1))
@@ -107,7 +107,7 @@ def gain_percent(before: FloatArray, after: FloatArray, blocks: Blocks, seed: in
 
 @dataclass(frozen=True, slots=True)
 class Added:
-    """Gain of one more hypothesis on held-out data."""
+    """Gain by one more hypothesis on held-out data."""
 
     held_out_gain_percent: float  # reduction of the squared error on held-out rows
     p_value: float  # p-value of no gain, from the agreement of blocks, for this hypothesis alone
@@ -167,7 +167,7 @@ class _Products:
         for inner, toward in zip(self.inner, self.toward, strict=True):
             normal, wanted = inners - inner, towards - toward
             across = normal[:first, first:]
-            # What the first columns follow of each of the others, and their own amounts.
+            # Projection of each of the others onto the first columns, and their own amounts.
             followed = solved(normal[:first, :first], np.column_stack([across, wanted[:first]]))
             others, alone = followed[:, :-1], followed[:, -1]
             left, sought = normal[first:, first:] - across.T @ others, wanted[first:] - across.T @ alone
@@ -182,22 +182,22 @@ class _Products:
 def block_p_value(fit: Fit, columns: FloatArray, blocks: Blocks) -> float:
     """Return the p-value that columns (n, 3, k) explain nothing of the residuals, from the agreement of blocks.
 
-    The noise of the scores comes from the blocks' own scores, with the columns fitted. So it is right where
-    neighbouring rows are correlated, as when a joint stands still and is rounded in the same way again and again (Liang
-    and Zeger 1986; Hotelling's T² for few blocks).
+    The noise of the scores comes from the blocks' own scores, with the columns fitted. So it is right even if
+    neighbouring rows are correlated, as when a joint stands still and is rounded the same way repeatedly (Liang and
+    Zeger 1986; Hotelling's T² for few blocks).
     """
     return _p_value(fit, beside_fit(fit, columns), blocks)
 
 
 def beside_fit(fit: Fit, columns: FloatArray) -> FloatArray:
-    """Return what columns (n, 3, k) change beside a fit, `unshared`."""
+    """Return the part of columns (n, 3, k) orthogonal to a fit, `unshared`."""
     flat = fit.unshared(columns.reshape(fit.left.size, -1))
     basis = fit.orthogonal.reshape(fit.left.size, -1)
     return (flat - basis @ (basis.T @ flat)).reshape(columns.shape)
 
 
 def _p_value(fit: Fit, beside: FloatArray, blocks: Blocks) -> float:
-    """Return the `block_p_value` of columns from what they change beside the fit (n, 3, k)."""
+    """Return the `block_p_value` of columns from their part orthogonal to the fit (n, 3, k)."""
     flat = beside.reshape(fit.left.size, -1)
     inner = flat.T @ flat
     scales = np.sqrt(np.maximum(np.diag(inner), 1e-300))

@@ -53,9 +53,10 @@ class Hypotheses:
 
 
 def has_simpler_name(effect: Effect, hypotheses: Collection[Effect], simulation: Simulation) -> bool:
-    """Return True for the link before the first joint where the camera's pose is a hypothesis.
+    """Return True for the link before the first joint if the camera's pose is a hypothesis.
 
-    In any motion they are the same. The pose is named, which is measured by hand, and the link told as its rival.
+    In any motion they are the same. The pose, which is measured by hand, is named, and the link is reported as its
+    rival.
     """
     if not effect.kind.in_parts or simulation.place(effect).joint != 0 or simulation.upward[0]:
         return False
@@ -93,7 +94,7 @@ class _Limits:
             )
 
     def excludes(self, kind: EffectType) -> bool:
-        """Return True if no effect of this kind can be tested, or if all of it is free anyway."""
+        """Return True if no effect of this kind can be tested, or if it consists of free parameters."""
         robot = self._simulation.robot
         if kind.needs_weight:
             unknown = kind.is_load and not self._simulation.gravity.known

@@ -93,7 +93,7 @@ class Scan:
         return found
 
     def candidate(self, effect: Effect, least: float = 0.0) -> Candidate | None:
-        """Return the hypothesis with its best first-order fit; None if nothing of it is identifiable.
+        """Return the hypothesis with its best first-order fit; None if no part of it is identifiable.
 
         Args:
             least: gain from which its period or time constant is refined fully.
@@ -118,7 +118,7 @@ class Scan:
                 return Candidate(effect.with_amounts(amounts[0]), float(gains[0]), int(dofs[0]), choices(effect))
 
     def _in_parts(self, effect: Effect) -> Candidate | None:
-        """Return an effect with those of its amounts free that are worth their number; None if none is identifiable."""
+        """Return an effect with the subset of its amounts free that is worth its cost; None if none is identifiable."""
         inner, gradient, raw = self._linear(effect).at(self._state)
         chosen = _subsets(inner.shape[1])
         # Amounts that are not free keep no product with the residuals or with the others.
@@ -139,9 +139,9 @@ class Scan:
         return Candidate(found, float(gains[best]), int(dofs[best]), choices(found))
 
     def in_full(self, candidate: Candidate) -> Candidate:
-        """Return the candidate with the gain at its actual amounts, where that exceeds the first-order gain.
+        """Return the candidate with the gain at its actual amounts, if that exceeds the first-order gain.
 
-        A turn of some degrees beside noise of a tenth of a millimetre is not linear.
+        A rotation by some degrees is not linear compared with noise of a tenth of a millimetre.
         """
         if not self._is_bent(candidate.effect):
             return candidate
@@ -158,7 +158,7 @@ class Scan:
         return replace(candidate, gain=gain) if gain > candidate.gain else candidate
 
     def _is_bent(self, effect: Effect) -> bool:
-        """Return True if what an effect does differs from its first order by more than the noise.
+        """Return True if an effect deviates from its first order by more than the noise.
 
         A move by d along an arc of radius r leaves its tangent by d²/2r.
         """
@@ -166,7 +166,7 @@ class Scan:
         moved = run.columns(effect)[:, :, effect.amounts] @ effect.values[effect.amounts]
         radius = float(np.sqrt(np.square(run.x_true - run.frames[:, 0, :3, 3]).sum(axis=1).mean()))
         off = np.square(moved).sum(axis=1, keepdims=True) / (2.0 * max(radius, 1e-6))
-        # In all directions alike, since it is not known in which.
+        # In all directions, since the direction is unknown.
         white = observations.whitened(np.broadcast_to(off[:, :, None] * np.eye(3), (len(off), 3, 3)))
         return bool(np.square(white).sum(axis=(1, 2)).mean() > 3.0 * (ScanSettings.bent * self._fit.noise.sigma) ** 2)
 
@@ -175,7 +175,7 @@ class Scan:
         return self._besides[self._state - 1] if self._state else None
 
     def _finely(self, effect: Effect, shapes: FloatArray, least: float) -> Candidate | None:
-        """Return the best of an effect with one shape parameter, over increasing shapes (m,), then between them."""
+        """Return the best fit of an effect with one shape parameter, at increasing shapes (m,), then between them."""
         # Each place without a cause uses the same coarse shapes.
         gains, amounts, dofs = self._solved(self._products.kept(effect, lambda: self._each(effect, shapes)), effect)
         if not dofs.any():
@@ -224,7 +224,7 @@ class Scan:
         return Candidate(effect.with_values(amounts[best]), float(gains[best]), int(dofs[best]), len(widths))
 
     def _hung(self, effect: Effect) -> Candidate | None:
-        """Return the best loaded backlash over frictions; None where the load never changes sides."""
+        """Return the best loaded backlash over frictions; None if the load never changes sides."""
         run = self._fit.run
         k = self._fit.simulation.place(effect).joint
         torque = run.torques[:, k]
@@ -269,7 +269,7 @@ class Scan:
         return float(-3.0 * self._products.rows * np.log1p(-min(factor * share, 0.999999)))
 
     def _rippled_best(self, effect: Effect, cycles: FloatArray) -> _Tried:
-        """Return the best of a band of cycles, which is tried in the place of each cause."""
+        """Return the best of a band of cycles, which is tried in place of each cause."""
         begun = effect.with_values(np.append(effect.values[:-1], cycles[0]))
         return self._best(self._products.kept(begun, lambda: self._rippled(effect, cycles)), effect)
 
@@ -377,7 +377,7 @@ def moment_again(fit: Fit, cause: Effect, doubted: NDArray[np.bool_]) -> Candida
     """Return a cause that begins at a moment with its best moment.
 
     Args:
-        doubted: rows (n,) that count in full: those on the wrong side of the moment seem to be outliers.
+        doubted: rows (n,) that count fully, since those on the wrong side of the moment look like outliers.
     """
     weights = np.where(doubted & fit.observations.trusted, 1.0, fit.noise.weights)
     counted = replace(fit, noise=replace(fit.noise, weights=weights))
@@ -386,7 +386,7 @@ def moment_again(fit: Fit, cause: Effect, doubted: NDArray[np.bool_]) -> Candida
 
 @cache
 def _subsets(count: int) -> NDArray[np.bool_]:
-    """Return all sets of some of `count` amounts (m, count)."""
+    """Return all subsets of `count` amounts (m, count)."""
     chosen = (np.arange(1, 2**count)[:, None] >> np.arange(count)) & 1
     return np.asarray(chosen, dtype=np.bool_)
 

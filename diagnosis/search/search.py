@@ -1,4 +1,4 @@
-"""Search the causes: add them one by one, remove redundant ones, and exchange causes for rivals."""
+"""Search for the causes: add them one by one, remove redundant ones, and exchange causes for rivals."""
 
 from __future__ import annotations
 
@@ -58,13 +58,13 @@ Named = frozenset[tuple[Key, int]]
 
 
 class Beside:
-    """A fit without one of its causes, with the candidates for its place.
+    """A fit without one of its causes, with the candidates to replace it.
 
     Attributes:
         others: the other causes.
         itself: the cause with its best first-order fit.
         gain: its present first-order gain, Δχ².
-        in_parts: the cause with the best choice of its amounts; None where there is no choice.
+        in_parts: the cause with the best choice of its amounts; None if there is no choice.
         candidates: hypotheses that are not yet causes, the most probable first.
     """
 
@@ -87,7 +87,7 @@ class Beside:
     def without(self) -> Fit:
         """Return the fit without the cause.
 
-        Another that begins beside it may have left rows to it, and begins at another moment without it.
+        Another cause that begins nearby may have left rows to this one, and gets another moment without it.
         """
         fit = improved(self._fit.starting(self.others))
         if not self._cause.kind.begins:
@@ -102,14 +102,14 @@ class Beside:
 
     @property
     def lead(self) -> float:
-        """First-order lead of the cause over the best candidate for its place [nats]."""
+        """First-order lead of the cause over the best candidate to replace it [nats]."""
         return 0.5 * (self.itself.gain - max((one.gain for one in self.candidates), default=0.0))
 
     def cost_of(self, candidate: Candidate) -> float:
-        """Return what the numbers of a candidate cost beyond those of the cause [nats].
+        """Return the cost of a candidate's numbers beyond those of the cause [nats].
 
-        Each number of an effect is known to a small part of the effect's size, so that the simpler one is favoured by
-        more than by the number of its parameters.
+        Each number of an effect is known to a small fraction of the effect's size, so that the simpler effect is
+        favoured by more than the number of its parameters.
         """
         return cost(candidate.gain, candidate.dof) - cost(self.itself.gain, self.itself.dof)
 
@@ -124,7 +124,7 @@ class Beside:
         return improved(self._fit.starting(self.others), least).log_likelihood > least
 
     def elsewhere(self) -> Fit | None:
-        """Refit with a better moment or period of the cause; None where there is none."""
+        """Refit with a better moment or period of the cause; None if there is none."""
         fit, cause = self._fit, self._cause
         least = fit.log_likelihood + _Settings.elsewhere
         tried = [self.itself] if self.itself.gain > self.gain + _Settings.elsewhere else []
@@ -139,7 +139,7 @@ class Beside:
         return None
 
     def exchanged(self, candidate: Candidate, least: float) -> Fit:
-        """Refit with a candidate in the place of the cause; the best such fit is kept."""
+        """Refit with a candidate instead of the cause; the best such fit is kept."""
         effect = candidate.effect
         known = self._tried.get(effect.identity)
         if known is None or known.log_likelihood < least:
@@ -168,7 +168,7 @@ class Search:
         self.ended_early = False
 
     def run(self, start: Fit) -> Fit:
-        """Find the causes on top of the parameters that `start` has fitted.
+        """Find the causes in addition to the parameters that `start` has fitted.
 
         Afterwards `ended_early` is True if the number of steps ended the search before it converged.
         """
@@ -229,10 +229,10 @@ class Search:
         return tried, worth + (beyond_single_rows(fit, tried) if alike else 0.0)
 
     def for_zero(self, fit: Fit, cause: Candidate, other: Candidate) -> float:
-        """Return what favours `other` in the place of a cause if one is a joint offset that the other contains [nats].
+        """Return the bonus for `other` instead of a cause if one is a joint offset that the other contains [nats].
 
-        A link turned about its joint's axis, or about the one before, is that joint's offset. Its further numbers have
-        to be worth a name beside the offset.
+        A link rotated about its joint's axis, or about the previous one, is that joint's offset. Its further numbers
+        must be worth a name in addition to the offset.
         """
         if contains(fit, cause.effect, other.effect):
             return WorthSettings.named_nats + self.doubt(other)
@@ -257,7 +257,7 @@ class Search:
         self._trials[candidate.effect.key] = candidate.trials
         others = list(beside)
         zeros = [cause for cause in others if cause.kind.is_zero]
-        # All joint offsets together have one name.
+        # All joint offsets together count as one name.
         first = self.multiplicity - float(np.log(1 + len(others) - max(len(zeros) - 1, 0)))
         is_another = candidate.effect.kind.is_zero and any(one.kind.is_zero for one in others)
         return (min(first, WorthSettings.another_nats) if is_another else first) + float(np.log(candidate.trials))
@@ -275,7 +275,7 @@ class Search:
         return min(worth, self.agreed(beside.without, beside.itself)) if remembers(cause) else worth
 
     def agreed(self, fit: Fit, candidate: Candidate) -> float:
-        """Return the worth of a candidate by the agreement of blocks of time, which may be correlated inside [nats]."""
+        """Return a candidate's worth by the agreement of blocks of time, which may be correlated inside [nats]."""
         effect, blocks = candidate.effect, Blocks.cut(len(fit.observations))
         columns = instruments(fit, effect)
         chance = block_p_value(fit, columns, blocks)
@@ -304,7 +304,7 @@ class Search:
         return [c for c in ranked[: 3 * _Settings.most] if c.gain >= floor][: _Settings.most]
 
     def _reviewed(self, fit: Fit) -> Fit:
-        """Review one cause after another, until each has been since the last change that may concern it."""
+        """Review one cause after another, until each was reviewed after the last change that may concern it."""
         waiting = [cause.identity for cause in fit.causes]
         while waiting and len(self._seen) < _Settings.most_sets:
             cause = next(effect for effect in fit.causes if effect.identity == waiting[0])
@@ -324,9 +324,9 @@ class Search:
         return fit
 
     def _leads_clearly(self, fit: Fit, cause: Effect) -> bool:
-        """Return True if a cause led by more, when it was last reviewed, than the fit has changed since.
+        """Return True if a cause's lead at its last review exceeds the change of the fit since then.
 
-        A moment, and the choice of a link's numbers, may be better elsewhere however clear the cause is.
+        Causes that begin at a moment or have a choice of numbers are never clear: another choice may be better.
         """
         if cause.kind.begins or cause.kind.in_parts or cause.identity not in self._leads:
             return False
@@ -353,7 +353,7 @@ class Search:
         return known[cause.identity]
 
     def _second_thoughts(self, fit: Fit, cause: Effect) -> Fit | None:
-        """Return the fit with a cause refined, dropped or exchanged; None if it stays as it is."""
+        """Return the fit with a cause refined, dropped or exchanged; None if it stays unchanged."""
         beside = self.beside(fit, cause)
         if (there := beside.elsewhere()) is not None:
             return there
@@ -419,11 +419,11 @@ def named(causes: Sequence[Effect]) -> Named:
 
 
 def contains(fit: Fit, link: Effect, zero: Effect) -> bool:
-    """Return True if numbers of a link, and more, can do what a joint offset does, as far as the data of a fit tell."""
+    """Return True if some numbers of a link can do the same as a joint offset, as far as the data of a fit show."""
     if not (link.kind.in_parts and zero.kind.is_zero and len(link.amounts) > len(zero.amounts)):
         return False
     if all(cause.identity != link.identity for cause in fit.causes):
-        # A turn by some degrees is not linear about its own size.
+        # A rotation by some degrees is not linear about its own size.
         link = link.with_values(np.zeros_like(link.values))
     columns = fit.weighted(amount_columns(fit.run, [zero, link, *fit.simulation.effects[: fit.nuisances]]))
     flat, own = columns.reshape(fit.left.size, -1), len(zero.amounts)
@@ -433,7 +433,7 @@ def contains(fit: Fit, link: Effect, zero: Effect) -> bool:
 
 
 def are_a_description(causes: Sequence[Effect]) -> bool:
-    """Return True if causes describe the error and do not explain it: too many of them begin at a moment."""
+    """Return True if causes only describe the error: too many of them begin at a moment."""
     return sum(cause.kind.begins for cause in causes) > _Settings.most_moments
 
 

@@ -1,7 +1,7 @@
 """Sets of causes about one fit, each with its evidence beside the background.
 
-Everything is linearised about the fit: a set costs its normal equations, whatever the number of rows (MacKay 1992,
-"Bayesian interpolation"; Tipping and Faul 2003, "Fast marginal likelihood maximisation").
+Everything is linearised about the fit: a set costs its normal equations, independent of the number of rows (MacKay
+1992, "Bayesian interpolation"; Tipping and Faul 2003, "Fast marginal likelihood maximisation").
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ class Together:
     sigma: float  # size of the noise, in units of the stated one
     spent: FloatArray  # effective number of data that determine each scale (4,)
     amounts: FloatArray  # amounts of all its columns (p,)
-    factor: FloatArray  # lower Cholesky factor (p, p) of their precision; what is above its diagonal has no meaning
+    factor: FloatArray  # lower Cholesky factor (p, p) of their precision; entries above its diagonal have no meaning
     columns: NDArray[np.intp]  # indices of its columns (p,)
 
     @cached_property
@@ -96,7 +96,7 @@ class Sets:
         columns, amounts = fit.columns, fit.effect_columns.shape[2]
         causes = sum(len(effect.amounts) for effect in fit.causes)
         found = [effect.values[effect.amounts] for effect in fit.causes]
-        # What robot.toml does not know counts from where the fit has it, however far from its nominal place.
+        # Parameters unknown to robot.toml count from their fitted values, however far from nominal.
         now = np.concatenate([np.zeros(amounts - causes), *found, fit.tolerated])
         rows = fit.left.size
         target = fit.left.ravel() + columns.reshape(rows, -1) @ now
@@ -132,23 +132,23 @@ class Sets:
         self._groups = [tuple(group) for group in dict.fromkeys(map(tuple, groups.values()))]
         self._known: dict[frozenset[int], Together] = {}
         known = {cause.identity for cause in fit.causes}
-        # The moment of each was sought without the others, so it is right for one of them at most.
+        # The moment of each was found without the others, so it is right for at most one of them.
         self._begins = {k for k, one in enumerate(self.effects) if one.kind.begins and one.identity not in known}
-        # The camera's pose and scale and the marker's place, which tolerances of the links beside them can follow.
+        # The camera's pose and scale and the marker's position, which tolerances of adjacent links can follow.
         self._poses = [k for k, one in enumerate(self.effects) if one.kind.is_like_tolerances and not one.kind.at_joint]
-        # A pose is off by 0.05 mm or by 50. A scale is off as prints are, by a few percent.
+        # A pose may be off by 0.05 mm or by 50. A scale is off by a few percent, as prints are.
         self._sized = [k for k in self._poses if not self.effects[k].kind.scales_all]
 
     def climbed(self, starts: Iterable[tuple[int, ...]]) -> list[Together]:
-        """Improve each start by single changes, and return the sets reached, without causes that cannot be.
+        """Improve each start by single changes, and return the sets reached, without impossible causes.
 
-        Without them different sets may be the same.
+        Without them different sets may become equal.
         """
         seen: dict[frozenset[int], Together] = {}
         reached = {self.possible(self._climbed(start, seen)).chosen: None for start in starts}
         best = max(map(self.of, reached), key=lambda one: one.worth)
         if best.scales.several_times == 0.0:
-            # Beside tolerances that have followed a cause it seems to be worth nothing, however small they are.
+            # Beside tolerances that have followed it a cause seems to be worth nothing, however small they are.
             exact, others = copy(self), dict[frozenset[int], Together]()
             exact._log_most, exact._known = _LOG_SMALLEST, {}
             near = dict.fromkeys(exact._climbed(start, others).chosen for start in ((), best.chosen))
@@ -168,7 +168,7 @@ class Sets:
         """Yield the starting sets: the fit's causes, none, all joint offsets, and all effects of each kind.
 
         Args:
-            links: also yield each cause that may have only some of its numbers, with all of them, and each pose.
+            links: also yield each pose, and each cause that may have a subset of its numbers, with all of them.
         """
         yield own
         yield ()
@@ -184,7 +184,7 @@ class Sets:
         yield from ((k,) for k in self._poses if links)
 
     def zeros_for_links(self, own: tuple[int, ...]) -> list[tuple[int, ...]]:
-        """Return the set with all joint offsets in the place of its links; an empty list if it has no links."""
+        """Return the set with all joint offsets instead of its links; an empty list if it has no links."""
         zeros = [k for k, effect in enumerate(self.effects) if effect.kind.is_zero]
         others = [k for k in own if not self.effects[k].kind.in_parts]
         return [tuple(dict.fromkeys((*others, *zeros)))] if len(others) < len(own) else []
@@ -209,7 +209,7 @@ class Sets:
         return here
 
     def _without_one(self, here: Together) -> Together | None:
-        """Remove one cause or a part of one, where that is more probable."""
+        """Remove one cause or a part of one, if that is more probable."""
         present = frozenset(here.chosen)
         groups = [group for group in self._groups if present.issuperset(group)]
         losses = self._losses(here, groups)
@@ -236,7 +236,7 @@ class Sets:
         return _better(tried, here)
 
     def _with_smaller_tolerances(self, here: Together) -> Together | None:
-        """Add a link's shifts or turns, or a pose, where tolerances are then so much smaller that it is more probable.
+        """Add a link's shifts or rotations, or a pose, if the smaller tolerances then make it more probable.
 
         Beside tolerances as large as the link's own error it seems to be worth nothing, however large they are.
         """
@@ -288,14 +288,14 @@ class Sets:
 
     @cached_property
     def _of_numbers(self) -> dict[Key, FloatArray]:
-        """Cost of each choice of the numbers of each cause that may have only some of them [nats]."""
+        """Cost of each choice of numbers, for each cause that may have a subset of them [nats]."""
         in_parts = {effect.key: effect for effect in self.effects if effect.kind.in_parts}
         return {key: np.log(ways_to_choose(effect)) for key, effect in in_parts.items()}
 
     def _promising(self, here: Together, least: float) -> list[tuple[int, ...]]:
         """Return the groups of candidates that may reach the worth `least`, the best first.
 
-        Their own worth is that with scales and noise held fixed; with scales of their own they may be worth more.
+        Their worth is computed with scales and noise held fixed; with their own scales they may be worth more.
         """
         present = frozenset(here.chosen)
         closed = present | (self._begins if present & self._begins else set())
@@ -323,13 +323,13 @@ class Sets:
         return [open_groups[k] for k in best[here.worth + worths[best] > least - SetSettings.comes_near_nats].tolist()]
 
     def _costs_of(self, chosen: Sequence[int], groups: Sequence[tuple[int, ...]], *, are_in: bool) -> FloatArray:
-        """Return the part of each of some groups in the cost of naming a set [nats], or what it would add to it."""
+        """Return the cost of naming that each group contributes to a set, or would add to it [nats]."""
         kinds = Counter(self._kinds[k] for k in chosen if not self._kinds[k].in_parts)
         numbers: Counter[Key] = Counter()
         for k in chosen:
             if self._kinds[k].in_parts:
                 numbers[self._keys[k]] += self._bits[k]
-        # Names have no order: so many ways to write the same set.
+        # Names are unordered: subtract the number of ways to write the same set.
         first = self._first - math.log(max(len(kinds) + len(numbers) + (not are_in), 1))
         costs = []
         for group in groups:
@@ -344,7 +344,7 @@ class Sets:
         return np.array(costs)
 
     def of(self, chosen: tuple[int, ...], near: Together | None = None) -> Together:
-        """Fit the scales and the noise of a set of causes by maximum evidence; each set once, whatever is near."""
+        """Fit the scales and the noise of a set of causes by maximum evidence; each set once, from any `near`."""
         key = frozenset(chosen)
         if key not in self._known:
             self._known[key] = self._fitted(chosen, near)
@@ -392,7 +392,7 @@ class Sets:
         return Together(chosen, worth, scales, logs, group, sigma, spent[:SCALES], amounts, factor, columns)
 
     def shown(self, here: Together) -> NDArray[np.bool_]:
-        """Return True for each scale without whose tolerances the data would be much less probable (4,)."""
+        """Return True for each scale whose tolerances make the data much more probable (4,)."""
         whole = self._worth(here, here.logs)
         without = []
         for g in range(SCALES):
@@ -402,7 +402,7 @@ class Sets:
         return whole - np.array(without) > SetSettings.shown_nats
 
     def largest(self, here: Together) -> FloatArray:
-        """Return the largest scales (4,), each beside the others as they are, that the data do not rule out."""
+        """Return the largest scale of each kind (4,) that the data do not rule out, given the others."""
         found = np.array(here.scales)
         for g in range(SCALES):
             logs, best = here.logs.copy(), -np.inf
@@ -416,7 +416,7 @@ class Sets:
         return found
 
     def _group(self, columns: NDArray[np.intp], chosen: Sequence[int]) -> tuple[NDArray[np.int64], FloatArray]:
-        """Return the index of each column's prior width (p,), -1 where it is 1, and the largest logarithms of these.
+        """Return the index of each column's prior width (p,), -1 for a width of 1, and the largest logarithms of these.
 
         First come the scales of tolerances, then the sizes of poses.
         """
@@ -443,7 +443,7 @@ class Sets:
         self, inner: FloatArray, toward: FloatArray, group: np.ndarray, logs: FloatArray, sigma: float
     ) -> _Solution:
         """Return the factor of the precision, prior variances (p,) and amounts (p,), in units of `_units`."""
-        # The last of the widths stands for columns that have none of their own.
+        # The last width stands for columns without one of their own.
         variances = np.append(np.exp(2.0 * logs), 1.0)[group]
         precision = inner / sigma**2
         diagonal = precision.reshape(-1)[:: len(precision) + 1]
@@ -482,7 +482,7 @@ def _columns(fit: Fit, effects: Sequence[Effect]) -> Iterator[FloatArray]:
 
 
 def _parts(effect: Effect) -> list[tuple[object, ...]]:
-    """Return the groups in which one number of an effect may come: its shifts or its turns, and all of it."""
+    """Return the groups that contain one number of an effect: its shifts or its rotations, and all of it."""
     if not effect.kind.in_parts:
         return []
     unit = effect.parameters[effect.amounts[0]].name.rpartition("_")[2]

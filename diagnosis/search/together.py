@@ -50,14 +50,14 @@ def together(start: Fit, hypotheses: Sequence[Effect], tell: Callable[[str], Non
     The best sets to first order are refitted and compared again about their own parameters, until no other is near.
 
     Args:
-        start: without a background.
+        start: a fit without a background.
         tell: called with short messages on progress.
     """
     known = [_Place(start.tolerating(Scales()), hypotheses, ())]
     while len(known) < _Settings.most_refitted:
         looked_at = Counter(place.name for place in known)
         best = max(known, key=lambda place: place.here.worth)
-        # A set that was fitted far from its own parameters is fitted once more, from where it seems better than all.
+        # A set fitted far from its own parameters is fitted once more, from where it seems better than all.
         proposals = [
             (one.worth, place, one)
             for place in known
@@ -80,9 +80,9 @@ def together(start: Fit, hypotheses: Sequence[Effect], tell: Callable[[str], Non
 
 
 def in_place_of_tolerances(fit: Fit, hypotheses: Sequence[Effect]) -> list[tuple[Effect, float]]:
-    """Return what may be there, beside a fit's causes, instead of tolerances several times a workshop's.
+    """Return possible causes, beside those of a fit, instead of tolerances of several times a workshop's.
 
-    These are links, the camera's pose and scale, and the marker's place: beside one of them the tolerances may be
+    These are links, the camera's pose and scale, and the marker's position: beside one of them the tolerances may be
     smaller.
 
     Returns:
@@ -124,7 +124,7 @@ def is_at_limit(scales: Scales | None) -> bool:
 
 
 def beyond_tolerances(fit: Fit, cause: Effect, doubt: float) -> bool | None:
-    """Return True if a cause is more probable than larger tolerances; None if tolerances cannot stand for it.
+    """Return True if a cause is more probable than larger tolerances; None if tolerances cannot replace it.
 
     Args:
         doubt: minimum cost of naming it [nats].
@@ -134,16 +134,16 @@ def beyond_tolerances(fit: Fit, cause: Effect, doubt: float) -> bool | None:
     everything = [Candidate(one, 0.0, 1) for one in fit.causes]
     others = [one for one in everything if one.effect is not cause]
     whole = Sets(fit, everything, doubt).of(tuple(range(len(everything))))
-    # Two causes may each seem to be needed beside tolerances that only both together make small. Whether to name them
-    # is one decision then, although each name has been charged with it.
+    # Each of two causes may seem necessary beside tolerances that only both together make small. Naming them is then a
+    # single decision, although each name has been charged for it.
     fewer = Sets(fit, others, doubt).climbed((tuple(range(len(others))), ()))
     return all(whole.worth > one.worth - WorthSettings.named_nats * (len(others) - len(one.chosen)) for one in fewer)
 
 
 def _beside_tolerances(fit: Fit, cause: Effect) -> float:
-    """Return the share of what a cause changes (squares) that other effects and tolerances of any size cannot follow.
+    """Return the share of a cause's squared change that other effects and tolerances of any size cannot follow.
 
-    They can follow a joint's zero, which is a turn of its link, and a wrong ratio of a joint that moves little.
+    They can follow a joint offset, which is a rotation of its link, and a wrong ratio of a joint that moves little.
     """
     places = fit.places(cause)[: len(cause.amounts)]
     flat = fit.columns.reshape(fit.left.size, -1)
@@ -165,7 +165,7 @@ class _Place:
         if self.here.worth > max((place.here.worth for place in others), default=-np.inf) + SetSettings.comes_near_nats:
             starts = self._sets.starts(own, links=not others)
         else:
-            # A fit that is not clearly better than others leads on from what these have reached.
+            # A fit that is not clearly better than others continues from the sets that these have reached.
             reached = (self._sets.again(place.numbers_of(one)) for place in others for one in place.reached)
             starts = [own, *reached, *self._sets.zeros_for_links(own)]
         self.reached = self._sets.climbed(dict.fromkeys(starts))
@@ -181,16 +181,16 @@ class _Place:
     def with_all_zeros(self) -> Together:
         """The set with all joint offsets in addition.
 
-        Beside tolerances that stand for them they seem to be worth nothing to first order: an offset moves the marker
-        along an arc.
+        Beside tolerances that replace them they seem to be worth nothing to first order, because an offset moves the
+        marker along an arc.
         """
         zeros = [k for k, effect in enumerate(self._sets.effects) if effect.kind.is_zero]
         return self._sets.possible(self._sets.of(tuple(dict.fromkeys((*self.here.chosen, *zeros)))))
 
     def with_one_less(self) -> Fit | None:
-        """Refit without the rigid cause that is needed least, where that is more probable; None where all are needed.
+        """Refit without the least necessary rigid cause, if that is more probable; None if all are necessary.
 
-        Without it tolerances may be larger, at angles where what is linear about this fit is so no more. The set may
+        Without it tolerances may grow to angles where the linearisation about this fit no longer holds. The set may
         have been fitted before, about other parameters.
         """
         fewer = []
@@ -202,14 +202,15 @@ class _Place:
         return best if best is not None and self._worth(best) > self.here.worth + SetSettings.still else None
 
     def numbers_of(self, one: Together) -> list[Effect]:
-        """Return the causes of a set, those of which some numbers may be free once for each."""
+        """Return the causes, separating the numbers of those that may have a subset of them."""
         return [self._sets.effects[k] for k in one.chosen]
 
     def refitted(self, one: Together) -> Fit:
         """Refit one of the sets about its own parameters.
 
-        Tolerances larger than a workshop's may have followed what other causes explain to angles where nothing is
-        linear any more. So the set is also fitted from an arm without tolerances, and the more probable fit returned.
+        Tolerances larger than a workshop's may have followed the errors of other causes to angles where the
+        linearisation no longer holds. So the set is also fitted from an arm without tolerances, and the more probable
+        fit is returned.
         """
         start = self.fit.starting(self._sets.causes(one))
         fits = [start.tolerating(one.scales).tolerating(one.scales)]
@@ -219,7 +220,7 @@ class _Place:
         return max(fits, key=self._worth)
 
     def _worth(self, fit: Fit) -> float:
-        """Return the evidence of a fit's own causes less the cost of naming them [nats]."""
+        """Return the evidence of a fit's own causes minus the cost of naming them [nats]."""
         return _own(fit, self._doubt).worth
 
 
@@ -240,16 +241,16 @@ def _sets_of(fit: Fit, candidates: Sequence[Candidate], doubt: float) -> Sets:
 
 
 def _absent(fit: Fit, hypotheses: Sequence[Effect]) -> list[Effect]:
-    """Return the hypotheses that are no causes of a fit, nor refine one, nor have a simpler name."""
+    """Return the hypotheses that are neither causes of a fit, nor refine one, nor have a simpler name."""
     present = {cause.key for cause in fit.causes}
     absent = [one for one in hypotheses if one.key not in present and not one.kind.refines]
     return [one for one in absent if not has_simpler_name(one, hypotheses, fit.simulation)]
 
 
 def _beside_links(fit: Fit, absent: Sequence[Effect]) -> list[Candidate]:
-    """Return the candidates; joint offsets, too, that are identifiable only without one of the fit's links.
+    """Return the candidates, including joint offsets that are identifiable only without one of the fit's links.
 
-    A link contains the zeros of the joints at both of its ends.
+    A link contains the offsets of the joints at both of its ends.
     """
     links = [cause for cause in fit.causes if cause.kind.in_parts]
     scan = Scan(fit, links)
@@ -261,7 +262,7 @@ def _beside_links(fit: Fit, absent: Sequence[Effect]) -> list[Candidate]:
 
 
 def _in_parts(candidate: Candidate) -> list[Candidate]:
-    """Return a candidate for each number of an effect that may have only some of them; else the candidate."""
+    """Return a candidate for each number of an effect that may have a subset of them; otherwise the candidate."""
     effect = candidate.effect
     if not effect.kind.in_parts:
         return [candidate]
@@ -270,7 +271,7 @@ def _in_parts(candidate: Candidate) -> list[Candidate]:
 
 
 def _at_rest(candidate: Candidate) -> Candidate:
-    """Return the candidate at zero amounts, where it is linear in them."""
+    """Return the candidate at zero amounts, about which it is linear."""
     if not candidate.effect.kind.is_linear:
         return candidate
     return Candidate(candidate.effect.with_amounts(0.0), candidate.gain, candidate.dof, candidate.trials)

@@ -59,7 +59,7 @@ class Family:
     undone: Callable[[FloatArray, FloatArray], FloatArray] | None = None
 
     def columns(self, run: Simulated) -> FloatArray:
-        """Return derivatives (n, 3, p) [m] of the measured positions by its parameters; p = a b where none are tied."""
+        """Return derivatives (n, 3, p) [m] of the measured positions by its parameters; p = a b if none are tied."""
         moved, functions = self.moved(run), self.functions(run)
         return (moved[:, :, :, None] * functions[:, None, None, :]).reshape(len(moved), 3, -1)
 
@@ -69,7 +69,7 @@ class Family:
         return moves if self.ties is None else (moves * self.amounts(run)[:, None, :]) @ self.ties
 
     def functions(self, run: Simulated) -> FloatArray:
-        """Return the functions (n, a) that each of `moved` may depend on; ones where they are tied."""
+        """Return the functions (n, a) that each of `moved` may depend on; ones if they are tied."""
         return self.amounts(run) if self.ties is None else np.ones((len(run.motion), 1))
 
     def along(self, functions: FloatArray) -> Family:
@@ -143,7 +143,7 @@ def _turned(what: str, calibration: StereoCalibration, axes: FloatArray) -> Fami
 
 
 def _giving(run: Simulated, k: int) -> list[Family]:
-    """Return families of a joint's support yielding under the arm's weight: in any way, or by springs on its axes."""
+    """Return families of a joint's support deflecting under the arm's weight: in any way, or by springs on its axes."""
     what = f"what carries {run.simulation.robot.joints[k]} gives under the arm's weight"
     found = [Family(what, "body", None, (), False, _link(k), loads) for loads in (_moments(k), _wrenches(k))]
     supports = run.simulation.gravity.in_supports(k)
@@ -200,7 +200,7 @@ def _camera(run: Simulated) -> FloatArray:
 
 
 def _late(run: Simulated) -> FloatArray:
-    """Return displacements per second by which the images are late."""
+    """Return displacements per second of delay of the images."""
     return run.columns(Effect.at(run.simulation.robot, "camera_latency"))
 
 
@@ -244,7 +244,7 @@ def _any_of_time(count: int) -> Columns:
 
 
 def _shares_of_time(run: Simulated) -> FloatArray:
-    """Return the time (n, 1), from -1/2 to 1/2: lateness in the mean has a name."""
+    """Return the time (n, 1), from -1/2 to 1/2: a constant delay is a named effect."""
     clock = run.motion.clock
     return (clock - clock[0])[:, None] / max(float(clock[-1] - clock[0]), 1e-9) - 0.5
 
@@ -271,7 +271,7 @@ def _wrenches(k: int) -> Columns:
 
 
 def _link_about(k: int, T: FloatArray) -> Columns:
-    """Return columns of the link before a joint, moved along and turned about a frame with the joint at T (4, 4)."""
+    """Return columns of the link before a joint, moved along and rotated about a frame with the joint at T (4, 4)."""
 
     def moves(run: Simulated) -> FloatArray:
         along, about = np.split(_link(k)(run) @ np.kron(np.eye(2), T[:3, :3].T), 2, axis=2)
@@ -323,12 +323,12 @@ def _one(run: Simulated) -> FloatArray:
 
 
 def _with_one(amounts: FloatArray) -> FloatArray:
-    """Add a constant: a part of the error that depends on nothing belongs to the same cause."""
+    """Add a constant: a constant part of the error belongs to the same cause."""
     return np.concatenate([np.ones((len(amounts), 1)), amounts], axis=1)
 
 
 def joints_of(family: Family, numbers: FloatArray, run: Simulated) -> frozenset[int]:
-    """Return the joints that err or on which the error depends, by their indices in q.
+    """Return the erring joints and those that the error depends on, by their indices in q.
 
     Args:
         numbers: parameters of the family (p,).
@@ -340,9 +340,9 @@ def joints_of(family: Family, numbers: FloatArray, run: Simulated) -> frozenset[
 
 
 def shares(family: Family, numbers: FloatArray, run: Simulated) -> FloatArray:
-    """Return the share of the error's variance due to each joint, the others given (d,).
+    """Return the share of the error's variance due to each joint, given the others (d,).
 
-    It is half the mean square change when only this joint is taken from another row (Jansen 1999).
+    It is half the mean square change if only this joint is taken from another row (Jansen 1999).
 
     Args:
         numbers: parameters of the family (p,).

@@ -1,6 +1,6 @@
 """Fit unnamed families of linear functions that compete with the named effects.
 
-An effect is then not named where another error is at work.
+So no effect is named if a different error is present.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Way:
 
     @classmethod
     def of(cls, family: Family, start: Fit, moved: FloatArray | None = None) -> Way:
-        """Prepare the whole family; its displacements may be known."""
+        """Prepare the whole family; its displacements `moved` may be given."""
         functions = family.functions(start.run)
         moved = start.observations.whitened(family.moved(start.run)) if moved is None else moved
         # Lengths (m, a) of the columns, which are products of motions and functions.
@@ -100,7 +100,7 @@ class Way:
         """Return the products (p, r) of the columns with others (n, 3, r).
 
         Args:
-            along: the same of `moved` (n, m, r), row by row; not needed for a single function of each motion.
+            along: products of `moved` with the others (n, m, r), row by row; not needed for one function per motion.
         """
         if along is None:
             return self.columns.T @ others.reshape(3 * len(others), -1)
@@ -143,7 +143,7 @@ class Apart:
 
     @property
     def choice(self) -> int:
-        """Number of further parameters spent on choosing parts of families."""
+        """Number of additional parameters spent on the choice of parts of families."""
         return sum(way.choice for way in self.chosen)
 
 
@@ -226,7 +226,7 @@ class UnnamedFamilies:
             explained = float(np.square(vectors[:, told].T @ toward / np.sqrt(values[told])).sum())
             most, numbers = _nats(explained, rss, rows) - self._doubt_of(way), int(told.sum())
             if numbers >= free:
-                # As many numbers as residuals leave no noise, whatever the rows are.
+                # As many numbers as residuals leave no noise.
                 most = -np.inf
             ranked.append((most - FamilySettings.number * numbers, way, None))
             for rank in (rank for rank in FamilySettings.ranks if rank < min(way.moves, way.amounts)):

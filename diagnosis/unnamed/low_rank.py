@@ -1,4 +1,4 @@
-"""Fit low-rank tables of numbers: a few functions drive all motions, however many of both there are."""
+"""Fit low-rank tables of numbers: a few functions drive all motions, for any number of both."""
 
 from __future__ import annotations
 

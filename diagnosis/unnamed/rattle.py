@@ -1,4 +1,4 @@
-"""Find a marker that is loose on the hand: it rests on either side of its play, at each row on an unknown one."""
+"""Find a marker that is loose on the hand: at each row it rests on an unknown side of its play."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Rattle:
 
 
 def rattle(fit: Fit) -> Rattle | None:
-    """Return the play of the marker that the residuals of a fit show; None where they do not lie on two sides."""
+    """Return the play of the marker detected in the residuals of a fit; None if they do not lie on two sides."""
     play = _two_sided(fit)
     return play if play is not None and play.is_clear else None
 
@@ -71,9 +71,9 @@ def rattle(fit: Fit) -> Rattle | None:
 def rattle_beside(fit: Fit) -> Rattle | None:
     """Return the play of the marker, estimated together with the other parameters of a fit.
 
-    The numbers of the fit may have followed the sides, and tolerances may hide them. So sides that are not clear yet
-    are taken out as well, and the fit and its tolerances follow what is left. Tolerances are at first no larger than a
-    workshop's: larger ones are likely to have followed the sides.
+    The parameters may have followed the sides, and tolerances may hide them. So sides that are not clear yet are
+    removed as well, and the fit and its tolerances follow the remainder. Initially the tolerances are limited to a
+    workshop's: larger ones have probably followed the sides.
     """
     if fit.background.scales is not None and not fit.is_exact:
         fit = fit.tolerating(fit.background.scales.no_larger)
@@ -94,14 +94,14 @@ def _two_sided(fit: Fit) -> Rattle | None:
     """Return the most probable play, however small; None if the residuals are too few or have no noise."""
     rows = fit.noise.weights > 0.0
     if fit.is_exact or rows.sum() < 2 * _Settings.fewest:
-        # With the play taken out of them, positions of a simulation have no noise to compare it with.
+        # With the play removed, positions of a simulation have no noise to compare it with.
         return None
     left = _on_link(fit)
     variances, axes = np.linalg.eigh(np.cov(left[rows].T))
     along = left @ axes[:, 2]
     ways = np.einsum("nji,j->ni", _turns(fit), axes[:, 2])
     means, sigma, worth, sides = _two_sides(along, rows)
-    # Rows that the instrument sees less exactly than others look like a second side.
+    # Rows that are measured less accurately than others look like a second side.
     stated = np.sqrt(np.einsum("ni,nij,nj->n", ways, fit.observations.own, ways))
     worth = min(worth, _two_sides(along / stated, rows)[2])
     alike = _alike(sides, rows, fit.observations.motion.begins)
@@ -122,7 +122,7 @@ def _two_sided(fit: Fit) -> Rattle | None:
 
 
 def _unfollowed(play: Rattle, fit: Fit) -> Rattle:
-    """Return the play with these sides, at its size when the fit and its tolerances absorb no part of it."""
+    """Return the play with these sides, at the size that it has if the fit and its tolerances absorb no part of it."""
     n, observations = len(play.sides), fit.observations
     by_link = np.swapaxes(_turns(fit), 1, 2) * play.sides[:, None, None]
     taken_out = np.broadcast_to(observations.play, observations.x.shape)[:, :, None]
@@ -137,13 +137,13 @@ def _unfollowed(play: Rattle, fit: Fit) -> Rattle:
 
 
 def _alike(sides: FloatArray, rows: NDArray[np.bool_], begins: NDArray[np.bool_]) -> float:
-    """Return what it is worth that neighbouring rows lie on the same side: their mutual information [nats]."""
+    """Return the evidence that neighbouring rows lie on the same side: their mutual information [nats]."""
     follows = (rows & ~begins)[1:] & rows[:-1]
     upper = 0.5 * (1.0 + sides)
     before, after = (np.stack([1.0 - own, own]) for own in (upper[:-1][follows], upper[1:][follows]))
     both = before @ after.T + 1e-9
     apart = np.outer(both.sum(axis=1), both.sum(axis=0)) / both.sum()
-    # One more number: how often the side changes.
+    # One additional number: the rate at which the side changes.
     return max(float((both * np.log(both / apart)).sum() - 0.5 * np.log(max(both.sum(), 1.0))), 0.0)
 
 
@@ -162,7 +162,7 @@ def likelihood(fit: Fit) -> float:
 
 
 def _likelihood(fit: Fit, rows: NDArray[np.bool_]) -> float:
-    """Return the same [nats] where some rows (n,) are the marker, and the other trusted ones outliers."""
+    """Return the same [nats] if some rows (n,) are the marker, and the other trusted ones outliers."""
     observations, scales = fit.observations, fit.background.scales
     total, count = int(observations.trusted.sum()), int(rows.sum())
     off = max(total - count, 0)
@@ -209,7 +209,7 @@ def _two_sides(values: FloatArray, rows: NDArray[np.bool_]) -> tuple[FloatArray,
 def _split(values: FloatArray) -> tuple[FloatArray, float, float]:
     """Return the means (2,) of the lower and the upper values (n,), cut where this is most probable; width, and share.
 
-    One side may have few rows, so none of the usual quantiles need lie on it.
+    One side may have few rows, so possibly none of the usual quantiles lies on it.
     """
     ordered = np.sort(values - values.mean())
     n, below = len(ordered), np.arange(_Settings.fewest, len(ordered) - _Settings.fewest + 1)

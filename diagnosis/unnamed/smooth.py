@@ -83,7 +83,7 @@ def smooth_model(alone: Fit, apart: Apart, families: Sequence[Family], blocks: B
 def _learnt(
     fit: Fit, lasting: Sequence[Family], timed: Sequence[Family], blocks: Blocks
 ) -> tuple[Fit, _Functions, _Amounts]:
-    """Fit the amounts of all functions, following the curvature of erring joints while held-out errors allow."""
+    """Fit the amounts of all functions, following the curvature of erring joints while held-out errors allow it."""
     functions = _Functions(fit, lasting)
     amounts = _Amounts(fit, functions.columns, _timed(fit, timed), blocks)
     for _ in range(_Settings.rounds if any(family.kind == "joint" for family in lasting) else 0):
@@ -154,7 +154,7 @@ class _Functions:
         return model, float(np.sqrt(np.square(off).sum(axis=1).mean()))
 
     def shift(self, q: FloatArray, amounts: FloatArray) -> FloatArray:
-        """Return the displacement (n, 3) [m] at readings (n, d) by amounts (p,), with erring joints actually turned."""
+        """Return the displacement (n, 3) [m] at readings (n, d) by amounts (p,), rotating erring joints exactly."""
         run = self._run(q)
         shares, errors = amounts / self._scales, np.zeros_like(run.motion.q)
         shift, first = np.zeros((len(errors), 3)), 0
@@ -205,9 +205,7 @@ class _Functions:
         return np.concatenate([np.cos(angles), np.sin(angles[:, 1:])], axis=1)
 
     def _of_place(self, x: FloatArray) -> FloatArray:
-        """Return cubic functions (n, 3, 60) of the marker's position; those of its rays have poles and cannot be
-        stored.
-        """
+        """Return cubic functions (n, 3, 60) of the marker's position; those of its rays cannot be stored (poles)."""
         place = (x - self._centre) / self._spread
         products = [np.ones((len(x), 1)), place]
         for degree in (2, 3):
@@ -250,7 +248,7 @@ class _Amounts:
 
     @property
     def of_functions(self) -> FloatArray:
-        """Amounts of the functions that last (p,)."""
+        """Amounts of the time-independent functions (p,)."""
         return self._all[self._causes :][: self._lasting]
 
     @property

@@ -18,7 +18,7 @@ def reported(x: FloatArray, calibration: StereoCalibration, turn: FloatArray) ->
     """Return the triangulated points (n, 3) [m] of true points (n, 3) [m] in the left optical frame.
 
     Args:
-        turn: of the right camera, as a rotation vector (3,) in its own optical frame [rad].
+        turn: rotation of the right camera, as a rotation vector (3,) in its own optical frame [rad].
     """
     baseline = np.array([calibration.baseline_m, 0.0, 0.0])
     # Row vectors times R apply the inverse rotation: into the rotated camera's frame.

@@ -48,7 +48,7 @@ class EmulatedServo(ABC):
 
     @abstractmethod
     def write(self, address: int, data: bytes, t: float) -> object:
-        """Write bytes of the control table where that is allowed."""
+        """Write bytes of the control table as far as the servo allows it."""
 
     @abstractmethod
     def reboot(self, t: float) -> None:

@@ -29,7 +29,7 @@ class BenchArm(ABC):
     """The devices behind the ports of an emulated arm.
 
     Attributes:
-        unit: what `count` counts.
+        unit: the unit of `count`, in the plural.
     """
 
     unit: ClassVar[str]

@@ -1,4 +1,4 @@
-"""Faults of an answer in transit, and those that the command line asks for: `late=0.1`, `mute@elbow`, `unplug`.
+"""Faults of an answer in transit, as requested on the command line: `late=0.1`, `mute@elbow`, `unplug`.
 
 Faults of a servo are set on the servo.
 """

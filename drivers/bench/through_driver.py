@@ -37,7 +37,7 @@ OpenBench = Callable[[Mapping[str, Angle]], AbstractContextManager[Behind]]
 class ThroughDriver:
     """A `JointSource` that passes each reading of another source through an emulator and a driver.
 
-    The driver does all its work, down to the bytes. The other source's clock stands still meanwhile, so its time stamps
+    The driver does all its work, down to the bytes. The other source's clock stands still meanwhile, so its timestamps
     are kept. Only the encoder resolution changes the angles.
     """
 

@@ -1,6 +1,6 @@
 """An arm of Dynamixel servos as a `JointSource`: their settings, read methods and answers.
 
-`drivers/servos/joints.py` makes joint readings of the answers.
+`drivers/servos/joints.py` converts the answers to joint readings.
 """
 
 from __future__ import annotations

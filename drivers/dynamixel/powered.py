@@ -143,7 +143,7 @@ class PoweredJoints(ABC):
 
     @abstractmethod
     def _goals(self, now: float, q: FloatArray, samples: Mapping[str, Sample | None]) -> list[int]:
-        """Return the goal registers, joint by joint; q (d,) are the angles of the whole arm [rad]. Raise Drop."""
+        """Return the goal registers, joint by joint; q (d,) are the angles of the whole arm [rad]; raise Drop."""
 
     @abstractmethod
     def _said_on(self) -> str:
@@ -174,7 +174,7 @@ class PoweredJoints(ABC):
         return f"{self.name} is off, the torque of {', '.join(self._joints)} verified off"
 
     def _end(self) -> tuple[str, ...]:
-        """Switch torque off on request; return the joints that could not be verified off."""
+        """Switch torque off on request; return the joints whose torque could not be verified off."""
         unsure = self._let_go()
         self.state, self._why = "off", ""
         if not unsure:
@@ -230,7 +230,7 @@ class PoweredJoints(ABC):
         log.error("%s", "; ".join(self.complaints))
 
     def _let_go(self) -> tuple[str, ...]:
-        """Switch torque off: all servos at once, then verify each. Return the joints that could not be verified."""
+        """Switch torque off on all servos at once, then verify each; return the joints that could not be verified."""
         # A failure of one servo must not keep the others from being switched off.
         with suppress(Exception):
             self._write_all("torque", dict.fromkeys(self._joints, 0))
@@ -300,7 +300,7 @@ class PoweredJoints(ABC):
             self._buses[bus].sync_write(register, by_id)
 
     def _write(self, servo: IdentifiedServo, name: str, value: int) -> None:
-        """Write a register and read it back. Raise RequestError if the value differs."""
+        """Write a register and read it back; raise RequestError if the value differs."""
         register = servo.model.layout[name]
         found = None
         for _ in range(HandshakeSettings.attempts):
@@ -311,7 +311,7 @@ class PoweredJoints(ABC):
         raise RequestError(f"joint {servo.joint!r} (ID {servo.id}): {name} was set to {value} and is {found}")
 
     def _read(self, servo: IdentifiedServo, name: str) -> int:
-        """Return the value of a register. Raise RequestError without an answer."""
+        """Return the value of a register; raise RequestError without an answer."""
         bus, register = self._buses[servo.bus], servo.model.layout[name]
         exchange = None
         for _ in range(HandshakeSettings.attempts):

@@ -65,7 +65,7 @@ class ZeroForceConfig(PoweredConfig, frozen=True, forbid_unknown_fields=True, kw
         return self.joints[servo.joint].torque_constant or torque / current
 
     def mistakes(self, servos: Sequence[ServoConfig], models: Mapping[str, Model]) -> Iterator[Mistake]:
-        """Yield what is wrong with the table for these servos, whose models are known."""
+        """Yield the mistakes of the table for these servos, whose models are known."""
         by_joint = {servo.joint: servo for servo in servos}
         for joint, table in self.joints.items():
             keys = ("joints", joint)
@@ -95,7 +95,7 @@ class GazeConfig(PoweredConfig, frozen=True, forbid_unknown_fields=True, kw_only
     max_speed_deg_s: Annotated[float, Meta(gt=0, le=180)] = 30.0  # of the head's joints
 
     def mistakes(self, servos: Sequence[ServoConfig], models: Mapping[str, Model]) -> Iterator[Mistake]:
-        """Yield what is wrong with the table for these servos, whose models are known."""
+        """Yield the mistakes of the table for these servos, whose models are known."""
         by_joint = {servo.joint: servo for servo in servos}
         for joint in self.joints:
             if joint not in by_joint:

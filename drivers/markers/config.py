@@ -34,7 +34,7 @@ class SourceTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     body: str | int | None = None  # the body whose positions are used; without it, only one may be sent
     unit: Literal["m", "mm"] = "m"  # of the positions and their covariances that are sent
     sigma_m: Positive = 1e-3  # 1-sigma per axis of a position that comes without a covariance [m]
-    latency_s: float = 0.0  # from the measurement to its time stamp [s]; `bodyschema calibrate latency` measures it
+    latency_s: float = 0.0  # from the measurement to its timestamp [s]; `bodyschema calibrate latency` measures it
     latency_sigma_s: NonNegative | None = None  # its 1-sigma [s]
     max_delay_s: Positive = 0.1  # a message is rejected if it arrives this much later than the fastest one
     # xyz, rpy: pose of the source's frame in the measurement frame [m], [rad]; for several sources
@@ -71,7 +71,7 @@ class SourceTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
     @property
     def endpoint(self) -> str:
-        """Where it listens or connects to, as protocol/host:port."""
+        """The endpoint it listens on or connects to, as protocol/host:port."""
         raise NotImplementedError
 
     def mistakes(self) -> Iterator[Mistake]:
@@ -167,10 +167,10 @@ KINDS: Mapping[str, type[AnySource]] = {
 
 
 def source_tables(raw: object, file: Path, text: str) -> tuple[AnySource, ...]:
-    """Return the sources of the value `raw` of marker_source.
+    """Return the sources in the value `raw` of marker_source.
 
     Raises:
-        ConfigError: a kind is unknown, a key unknown or wrong, or two sources have the same name.
+        ConfigError: a kind or key is unknown, a value is wrong, or two sources have the same name.
     """
     entries = raw if isinstance(raw, list) else [raw]
     found: list[AnySource] = []
@@ -203,7 +203,7 @@ def _source(entry: object, file: Path, text: str) -> AnySource:
 
 
 def _entry_alone(text: str, place: int) -> str:
-    """Return the text with all other entries of the array of tables blank, so that lines keep their numbers."""
+    """Return the text with all other entries of the array of tables blanked, so that line numbers stay the same."""
     lines = text.splitlines()
     begin = (line_in_entry(text, TABLE, place) or 1) - 1
     end = next((k for k in range(begin + 1, len(lines)) if lines[k].lstrip().startswith("[")), len(lines))

@@ -1,4 +1,4 @@
-"""The JSON that programs send by UDP or on a zenoh key: docs/marker_sources.md."""
+"""The JSON that programs send by UDP or on a zenoh key, defined in docs/marker_sources.md."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _decode = msgspec.json.Decoder(Datagram).decode
 
 
 def decode_datagram(payload: bytes, _: bytes = b"") -> Iterator[Report]:
-    """Yield the position in a datagram; raise Unusable if it is no such JSON, or not finite."""
+    """Yield the position in a datagram; raise Unusable if it is not such JSON, or not finite."""
     if len(payload) > LARGEST_BYTES:
         raise Unusable(Fault.MALFORMED, f"{len(payload)} bytes are more than a position has")
     try:

@@ -65,17 +65,17 @@ class Common:
 
 
 class Member:
-    """A source among several.
+    """One of several sources.
 
     Attributes:
-        name: in messages.
-        pose: of the source's frame in the measurement frame, (4, 4).
+        name: name in messages.
+        pose: pose of the source's frame in the measurement frame, (4, 4).
         newest_t: time of its newest position or miss [s].
-        common: its positions beside the leading source's.
+        common: its positions paired with those of the leading source.
     """
 
     def __init__(self, name: str, source: MarkerSource, pose: FloatArray) -> None:
-        from scipy.spatial.transform import Rotation  # not while positions come: it takes half a second
+        from scipy.spatial.transform import Rotation  # takes half a second, so not while positions arrive
 
         self.name, self.source, self.pose = name, source, pose
         self._turn = Rotation.from_matrix(pose[:3, :3])
@@ -97,7 +97,7 @@ class Member:
             self.fixed_at = now
 
     def at(self, t: float, sigma_s: float) -> tuple[FloatArray, FloatArray] | None:
-        """Return position [m] and covariance [m²] at time `t` [s], which is known to `sigma_s`; None if unknown."""
+        """Return position [m] and covariance [m²] at time `t` [s], whose 1-sigma is `sigma_s`; None if unknown."""
         after = next((k for k, fix in enumerate(self.fixes) if fix.t >= t), 0)
         if after == 0:
             return None
@@ -113,7 +113,7 @@ class Member:
         return first.x + share * (second.x - first.x), cov
 
     def verdict(self, leader: str) -> str | None:
-        """Return what its positions disagree in with the leader's, with the remedy; None if they agree."""
+        """Describe the disagreement of its positions with the leader's, with the remedy; return None if they agree."""
         common = list(self.common)  # another thread may add to it
         if len(common) < _Settings.fewest_judged:
             return None
@@ -149,10 +149,10 @@ class Member:
 
 
 class FusedMarkers:
-    """`MarkerSource` that fuses several sources with different frames and time stamps.
+    """`MarkerSource` that fuses several sources with different frames and timestamps.
 
     The first source that sees the marker leads. The others' positions are interpolated to its times, and all are
-    averaged with their full covariances as weights. Where they contradict each other, there is no position.
+    averaged with their full covariances as weights. If they contradict each other, there is no position.
 
     Attributes:
         members: the sources, in the order of preference.
@@ -165,7 +165,7 @@ class FusedMarkers:
 
     @property
     def health(self) -> tuple[str, ...]:
-        """What sources disagree, with the remedy."""
+        """Disagreements between sources, with the remedy."""
         verdicts = (member.verdict(self.members[0].name) for member in self.members[1:])
         return tuple(verdict for verdict in verdicts if verdict is not None)
 
@@ -251,7 +251,10 @@ Positions = list[tuple[FloatArray, FloatArray]]
 
 
 def _agreeing(found: Positions) -> Positions:
-    """Return those that agree with the mean of the others, without the worst until all do; empty if no two agree."""
+    """Return the positions that agree with the mean of the others, after removing the worst until all do.
+
+    Return nothing if no two agree.
+    """
     left = list(found)
     while len(left) > 1:
         chi2 = []

@@ -25,7 +25,7 @@ SMALLEST_TRANSFORM = 72  # bytes: stamp, two names, seven numbers
 
 
 def decoder(table: Ros2Table) -> Callable[[bytes, bytes], Iterator[Report]]:
-    """Return what decodes the messages of `table` from CDR and rmw_zenoh's attachment.
+    """Return the decoder for messages of `table`, called with their CDR and rmw_zenoh's attachment.
 
     It raises Malformed for other bytes, and Unusable for a message in another frame.
     """
@@ -86,7 +86,7 @@ class KeyReceiver:
         self._link: ZenohLink | None = None
 
     def open(self) -> None:
-        """Subscribe; raise SourceLost if the router is not there."""
+        """Subscribe; raise SourceLost if the router is not reachable."""
         try:
             session = open_session(self._table.router)
         except SourceLost as error:
@@ -133,7 +133,7 @@ class KeyReceiver:
 
 
 def topic_receiver(table: Ros2Table, clock: Clock) -> tuple[KeyReceiver, Callable[[bytes, bytes], Iterable[Report]]]:
-    """Return the subscription to a ROS 2 topic, and what decodes its messages."""
+    """Return the subscription to a ROS 2 topic, and the decoder of its messages."""
     topic = table.topic.strip("/")
     if table.via == "ros2dds":
         return KeyReceiver(table, topic, clock), decoder(table)

@@ -71,7 +71,7 @@ class Packet:
     """A message as it arrived."""
 
     payload: bytes
-    sender: Hashable  # tells senders apart
+    sender: Hashable  # identifies the sender
     arrived: float  # time of arrival [s]
     attached: bytes = b""  # attachment of rmw_zenoh; empty without one
 
@@ -82,7 +82,7 @@ class Report:
 
     x: tuple[float, ...] | None  # position, 3 numbers; None where the body is not tracked
     stamp_ns: int | None = None  # time on the sender's clock [ns]; None without one
-    age_s: float = 0.0  # by how much the measurement is older than its stamp, by the sender's own clock [s]
+    age_s: float = 0.0  # age of the measurement at its stamp, by the sender's own clock [s]
     seq: int | None = None  # number of the message among all of its sender, for counting lost ones
     turn: tuple[float, ...] | None = None  # quaternion (x, y, z, w), or None
     cov: tuple[float, ...] | None = None  # 9 numbers by rows, or 36 with the rotation's; or None

@@ -1,4 +1,4 @@
-"""Positions that another program sends, as a `MarkerSource`."""
+"""Positions sent by another program, as a `MarkerSource`."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Ledger:
         self._lock = threading.Lock()
 
     def note(self, t: float, what: Fault | str, detail: str = "", count: int = 1) -> bool:
-        """Count messages at time `t` [s]; return True once there are enough of this fault to tell a person."""
+        """Count messages at time `t` [s]; return True once this fault is frequent enough to report."""
         with self._lock:
             if not self._buckets or t - self._buckets[-1][0] >= _Settings.bucket_s:
                 self._buckets.append((t, Counter()))
@@ -79,9 +79,9 @@ class Ledger:
         return counts
 
     def complaints(self, now: float, name: str) -> Iterator[str]:
-        """Yield what is wrong with the messages of the last seconds, with the remedy."""
+        """Yield the faults of the messages of the last seconds, with the remedy."""
         counts = self.lately(now)
-        # Other bodies matter only where the marker's does not come; that it is hidden counts as a rejected fix.
+        # Other bodies matter only if the marker's own is missing; a hidden marker counts as a rejected fix.
         usual = {Fault.NOT_TRACKED} | ({Fault.OTHER_BODY} if counts[USED] or counts[Fault.NOT_TRACKED] else set())
         whole = sum(count for what, count in counts.items() if what not in usual)
         for fault in Fault:
@@ -103,13 +103,13 @@ Decode = Callable[[bytes, bytes], Iterable[Report]]
 
 
 class Receiver(Protocol):
-    """The wire that messages come over."""
+    """The connection that messages arrive on."""
 
     def open(self) -> None:
-        """Open it; raise SourceError if that is not possible."""
+        """Open it; raise SourceError if that fails."""
 
     def close(self) -> None:
-        """Close it; again does no harm."""
+        """Close it; closing it again does no harm."""
 
     def receive(self, until: float) -> Packet | None:
         """Return the next message; None when none arrives by `until` [s].
@@ -119,15 +119,15 @@ class Receiver(Protocol):
         """
 
     def silence(self) -> str:
-        """Return why nothing may be coming, and what to do."""
+        """Return a possible reason why nothing arrives, with the remedy."""
         ...
 
 
 class MarkerStream:
-    """A `MarkerSource` of messages: decoded, checked, and dated on this machine's clock.
+    """A `MarkerSource` of messages: decoded, checked, and timestamped on this machine's clock.
 
     The sender's clock is mapped to ours by the fastest messages. Unusable messages are dropped and counted; `health`
-    names them with the remedy.
+    reports them with the remedy.
     """
 
     def __init__(self, table: SourceTable, receiver: Receiver, decode: Decode, clock: Clock) -> None:
@@ -175,7 +175,7 @@ class MarkerStream:
         return self._waiting.popleft()
 
     def _forget(self) -> None:
-        """Reset everything that was learnt from earlier messages."""
+        """Reset everything learnt from earlier messages."""
         self._waiting: deque[MarkerFix | MarkerMiss] = deque()
         self._heard = self._clock.now()
         self._silence: str | None = None
@@ -183,7 +183,7 @@ class MarkerStream:
         self._sender_heard = -math.inf
         self._clock_of: Sender = Sender(self._table.max_delay_s)
         self._numbers: dict[Hashable, _Numbers] = {}
-        self._unread = 0  # messages since the last number that came
+        self._unread = 0  # messages since the last one with a number
         self._bodies: dict[str, float] = {}
         self._frame: str | None = None
         self._first_turn: tuple[float, ...] | None = None
@@ -306,8 +306,8 @@ class MarkerStream:
         return frozen_array(x)
 
     def _covariances(self, report: Report) -> tuple[FloatArray, FloatArray | None]:
-        """Return the covariances of position [m²] and rotation [rad²], (3, 3) each; of the rotation if it was sent."""
-        if report.cov is None or not any(report.cov):  # ROS: all zeros where unknown
+        """Return the covariances of position [m²] and rotation [rad²], (3, 3) each; None if no rotation was sent."""
+        if report.cov is None or not any(report.cov):  # ROS: all zeros if unknown
             sigma_m = max(self._table.sigma_m, self._table.metres * report.spread)
             return frozen_array(sigma_m**2 * np.eye(3)), None
         size = math.isqrt(len(report.cov))
@@ -328,7 +328,7 @@ class MarkerStream:
         return 0.5 * (cov + cov.T)
 
     def _turned(self, turn: tuple[float, ...] | None) -> FloatArray | None:
-        """Return the unit quaternion; None until it changes: trackers of points fill in one rotation for all."""
+        """Return the unit quaternion, but None until it changes: trackers of points send a constant rotation."""
         if turn is None or not any(turn):
             return None
         length = math.sqrt(sum(part * part for part in turn))
@@ -341,7 +341,7 @@ class MarkerStream:
 
 
 class _Numbers:
-    """The numbers of a sender's messages."""
+    """The sequence numbers of a sender's messages."""
 
     def __init__(self) -> None:
         self._newest: int | None = None
@@ -349,11 +349,11 @@ class _Numbers:
         self._missing: deque[range] = deque(maxlen=100)  # bounds the time for each message
 
     def count(self, seq: int, unread: int) -> tuple[int, Fault | None]:
-        """Return how many were lost before `seq`, and the fault if it is not a newer one.
+        """Return the number of messages lost before `seq`, and the fault if it is not a newer one.
 
         Args:
-            seq: number of a message. One that was taken for lost and comes late counts as -1.
-            unread: how many messages came since the one before whose numbers could not be read.
+            seq: number of a message. A late one that was counted as lost counts as -1.
+            unread: number of messages since the previous one whose numbers could not be read.
         """
         before = self._newest
         if before is None or seq > before:
@@ -382,7 +382,7 @@ def stream_checks(stream: MarkerStream, clock: Clock, read_s: float = _Settings.
     """Yield checks of the positions that come, of their rate and time, and of the messages that cannot be used.
 
     Args:
-        stream: not open; it is closed again afterwards.
+        stream: a closed stream; it is closed again afterwards.
     """
     subject = f"marker source {stream.name}"
     try:

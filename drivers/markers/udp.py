@@ -26,13 +26,13 @@ class _Settings:
 
 
 def listening(host: str, port: int, *, shared: bool = False) -> socket.socket:
-    """Return a socket on host and port, whose datagrams the kernel dates.
+    """Return a socket on host and port, whose datagrams are timestamped by the kernel.
 
     Args:
-        shared: other programs may listen there too, as is usual for multicast.
+        shared: True if other programs may listen there too, as is usual for multicast.
 
     Raises:
-        OSError: that is not possible.
+        OSError: the address cannot be used.
     """
     found = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
@@ -49,7 +49,7 @@ def listening(host: str, port: int, *, shared: bool = False) -> socket.socket:
 
 
 def received(found: socket.socket, clock: Clock) -> tuple[bytes, tuple[str, int], float] | None:
-    """Return the next datagram, its sender, and its time of arrival [s]; None if none is there."""
+    """Return the next datagram, its sender, and its time of arrival [s]; None if none has arrived."""
     try:
         payload, ancillary, _, sender = found.recvmsg(_Settings.largest_bytes, socket.CMSG_SPACE(STAMP.size))
     except (BlockingIOError, ConnectionRefusedError):
@@ -76,7 +76,7 @@ class UdpReceiver:
         self._strangers = 0
 
     def open(self) -> None:
-        """Listen; raise SourceLost if another program does so already, or the address is not this machine's."""
+        """Listen; raise SourceLost if another program already does, or the address is not this machine's."""
         try:
             self._socket = listening(self._table.host, self._table.port)
         except OSError as error:

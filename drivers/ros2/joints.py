@@ -187,13 +187,13 @@ class Ros2Joints:
 
     A reading refers to one time: that of a message. If several nodes publish the joints, the others are interpolated to
     it. Doubtful messages are dropped and counted. SourceLost is raised when the router goes away or a joint jumps. A
-    silent robot is waited for.
+    silent robot only delays the next reading.
 
     Attributes:
         joints: names of the joints in the order of q.
         refused: messages and readings that were not used, by reason.
         lost: messages that never arrived, by the senders' own count.
-        stamp_ns: the robot's own stamp of the newest reading [ns], or None before any.
+        stamp_ns: the robot's own timestamp of the newest reading [ns]; None before the first.
     """
 
     def __init__(
@@ -219,7 +219,7 @@ class Ros2Joints:
 
     @property
     def health(self) -> tuple[str, ...]:
-        """Current problems, and what to do."""
+        """Current problems, with the remedy."""
         return () if self._complaint is None else (self._complaint,)
 
     def __enter__(self) -> Self:
@@ -255,7 +255,7 @@ class Ros2Joints:
                 return None
 
     def _forget(self) -> None:
-        """Reset everything that was learnt from earlier messages."""
+        """Reset everything learnt from earlier messages."""
         self._senders: dict[Who, Sender] = {}
         self._gates = Gates(self._fastest, self._slack)
         self._owners: list[tuple[Who, float] | None] = [None] * len(self.joints)
@@ -315,7 +315,7 @@ class Ros2Joints:
         return self._merging.put(told, sigma_s, message.header.stamp_ns, places, q) if verdict else None
 
     def _told(self, who: Who, message: JointState, places: Sequence[int], arrived: float) -> float | Refusal:
-        """Return the time of the message's positions [s], or why it cannot be used."""
+        """Return the time of the message's positions [s], or the reason to reject it."""
         owners = [owner for place in places if (owner := self._owners[place]) is not None]
         if any(owner != who and arrived - heard < RIVAL_AFTER_S for owner, heard in owners):
             return Refusal.RIVAL
@@ -411,7 +411,7 @@ def _begins(robot: Ros2Joints, clock: Clock) -> bool:
 
 
 def _parted(complaints: Sequence[str]) -> tuple[str, str]:
-    """Split a complaint into what was found and its last part, what to do."""
+    """Split a complaint into the finding and its last part, the remedy."""
     if not complaints:
         return "too few joint states come", "let the robot's nodes publish more often"
     *said, fix = LAST_PART.split(complaints[0])

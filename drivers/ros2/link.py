@@ -44,7 +44,7 @@ class Link(Protocol):
         ...
 
     def receive(self, until: float) -> Sample | None:
-        """Return the next message; None when none arrives by `until` [s], or the router is gone."""
+        """Return the next message; None if none arrives by `until` [s] or the router is gone."""
 
     def tokens(self) -> Sequence[str]:
         """Return the liveliness tokens of all known publishers."""
@@ -74,10 +74,10 @@ def session_config(mode: str, *, listen: Sequence[str] = (), connect: Sequence[s
 
 
 def open_session(router: str, start: str = "ros2 run rmw_zenoh_cpp rmw_zenohd") -> zenoh.Session:
-    """Open a session with this router only: it neither listens nor scouts. `start` is the command that starts it.
+    """Open a session with this router only: it neither listens nor scouts. `start` is the router's start command.
 
     Raises:
-        SourceLost: the router is not there.
+        SourceLost: the router is not reachable.
     """
     try:
         return zenoh.open(session_config("client", connect=[router]))
@@ -133,7 +133,7 @@ def open_zenoh(config: Ros2Config, clock: Clock) -> Link:
     """Subscribe to the joint states of the configured robot. The type's hash is a wildcard, so any ROS 2 version works.
 
     Raises:
-        SourceLost: the router is not there.
+        SourceLost: the router is not reachable.
     """
     key = rmw.topic_key(config.domain, config.topic, JOINT_STATE, rmw.ANY)
     if config.via == "ros2dds":

@@ -40,7 +40,7 @@ class MarkerPublisher:
         return self._marker.message == "pose"
 
     def __enter__(self) -> Self:
-        """Open the topic; raise SourceLost if the router is not there."""
+        """Open the topic; raise SourceLost if the router is not reachable."""
         self._session = session = open_session(self._config.router)
         domain, topic, name = self._config.domain, self._marker.topic, str(session.info.zid())
         tokens = (rmw.node_token(domain, name, NODE), rmw.publisher_token(domain, name, NODE, topic, self._kind))

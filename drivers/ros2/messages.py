@@ -56,7 +56,7 @@ def decode_joint_state(data: bytes) -> JointState:
     """Decode a message that extends over all of `data`.
 
     Raises:
-        Malformed: not such a message. No length field makes it read beyond `data`.
+        Malformed: it is not such a message. A false length field never causes a read beyond `data`.
     """
     reader = CdrReader(data)
     message = JointState(read_header(reader), reader.strings(), reader.float64s(), reader.float64s(), reader.float64s())

@@ -1,6 +1,6 @@
 """Conventions of rmw_zenoh: topic keys, attachments of messages, and liveliness tokens of nodes.
 
-After docs/design.md of ros2/rmw_zenoh.
+Source: docs/design.md of ros2/rmw_zenoh.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Decide if a message is plausible, and at what time its positions were true."""
+"""Check that a message is plausible, and find the time at which its positions were true."""
 
 from __future__ import annotations
 
@@ -44,8 +44,8 @@ class _Settings:
 class StampClock:
     """Estimate of the host's time at which a message was stamped.
 
-    A message may take long, but its delay is never negative. The fastest of all shows the offset of the clocks, up to
-    its own delay. The ratio of the clock rates is estimated as well.
+    A message may take long, but its delay is never negative. The fastest of all messages shows the offset of the
+    clocks, up to its own delay. The ratio of the clock rates is estimated as well.
     """
 
     def __init__(self, max_delay_s: float) -> None:
@@ -58,9 +58,9 @@ class StampClock:
         self._begin(0)
 
     def time_of(self, stamp_ns: int, arrived: float) -> float | None:
-        """Return the host's time [s] at `stamp_ns`, later than that of any earlier stamp.
+        """Return the host's time [s] at `stamp_ns`, later than that of any earlier timestamp.
 
-        Return None when stamp and arrival do not fit together.
+        Return None if timestamp and arrival contradict each other.
         """
         if self._is_early(stamp_ns, arrived):
             return None
@@ -91,15 +91,15 @@ class StampClock:
         return math.hypot(_Settings.quickest_sigma_s, unseen_s, median(self._delays) if self._delays else 0.0)
 
     def lateness_s(self, stamp_ns: int, arrived: float) -> float:
-        """Return how much later a message arrived than the fastest would have [s]; infinite before any."""
+        """Return by how much later a message arrived than the fastest would have [s]; infinite before the first."""
         if self._last is None:
             return math.inf
         return arrived - self._last[1] - (stamp_ns - self._last[0]) * TICK_S
 
     def _note_delay(self, delay_s: float, stamp_ns: int, arrived: float) -> None:
-        """Restart if a first message with a wrong stamp makes all others late.
+        """Restart if a first message with a wrong timestamp makes all others late.
 
-        This is done at the start only. Later on, when all are late, the network is slow.
+        This is done at the start only. Later, if all are late, the network is slow.
         """
         self._least_s = min(self._least_s, delay_s) if arrived > self._began else math.inf
         if arrived - self._began < _Settings.late_for_s:
@@ -109,7 +109,7 @@ class StampClock:
             self._begin(stamp_ns)
 
     def _is_early(self, stamp_ns: int, arrived: float) -> bool:
-        """Return True if the message arrived before its stamp. A single wrong stamp must not make all others late."""
+        """Return True if the message arrived before its timestamp. A single wrong one must not make all others late."""
         if self._last is None:
             self._begin(stamp_ns)
             self._began = arrived
@@ -222,7 +222,7 @@ class Gates:
 
     @property
     def jumped(self) -> bool:
-        """True if a joint moved elsewhere from one message to the next and stays there."""
+        """True if a joint jumped elsewhere between two messages and stays there."""
         return any(gate is not None and gate.jumped for gate in self._gates)
 
     def _offer(self, t: float, place: int, q: float) -> bool | None:

@@ -65,7 +65,7 @@ class Board:
     """A board's lines since it was opened.
 
     Attributes:
-        restarted: the board was restarted, by its header or its clock.
+        restarted: True if the board was restarted, by its header or its clock.
     """
 
     def __init__(self, byte_s: float, delay_s: float) -> None:

@@ -212,7 +212,7 @@ class SerialLineJoints:
         raise SourceLost(f"the board on {self._config.port} {what}", retry_s=SerialLineSettings.retry_s)
 
     def _found(self, header: Header) -> list[Encoder]:
-        """Return the encoders. Raise SourceError with a table of all if one differs from robot.toml."""
+        """Return the encoders; raise SourceError with a table of all if one differs from robot.toml."""
         rows, encoders = [("joint", "encoder", "expected", "found")], list[Encoder]()
         places = list(header.encoders)
         for config in self._wanted:
@@ -267,7 +267,7 @@ class SerialLineJoints:
             raise SourceLost(f"the encoders cannot be read: {self._why}", retry_s=SerialLineSettings.retry_s)
 
     def _raw(self, timed: Timed) -> list[int] | None:
-        """Return the raw positions of the joints; None when an encoder has none."""
+        """Return the raw positions of the joints; None if an encoder has no value."""
         ticks = [timed.reading.ticks[encoder.place] for encoder in self.encoders]
         self._note_failing({e.joint for e, tick in zip(self.encoders, ticks, strict=True) if tick is None})
         raw = [tick for tick in ticks if tick is not None]
@@ -278,7 +278,7 @@ class SerialLineJoints:
         if raw is None:
             return None
         if not self._is_sure(timed):
-            self._believed_s = self._clock.now()  # the encoders are all there
+            self._believed_s = self._clock.now()  # no encoder is missing
             return None
         counts = self._turns.continued(raw)
         refused = self._gate.offer(timed.t, counts)

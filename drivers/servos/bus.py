@@ -59,7 +59,7 @@ class Request:
     ids: tuple[int, ...]  # servos that answer, in this order
     size: int  # data bytes wanted from each
     protocol: int  # version of the vendor's protocol
-    spare: int = 0  # how many extra bytes may be requested, to tell its answers from late ones to an earlier request
+    spare: int = 0  # extra bytes that may be requested, to distinguish its answers from late ones to an earlier one
     is_fast: bool = False  # all answer in one packet
 
 
@@ -96,10 +96,10 @@ class Counts:
 
 
 class Owed:
-    """Overdue answers. Each may still arrive, and must not pass for the answer to a later request.
+    """Overdue answers. Each may still arrive, and must not be taken for the answer to a later request.
 
-    An answer is identified by its servo and its number of bytes. So a servo with an overdue answer is asked for a byte
-    more.
+    An answer is identified by its servo and its number of bytes. So a servo with an overdue answer is asked for one
+    byte more.
     """
 
     def __init__(self) -> None:
@@ -142,10 +142,10 @@ class Owed:
 class Bus(ABC):
     """Servos behind one port. A late answer is never taken for the answer to a later request.
 
-    After a time-out a servo is asked for another number of bytes until its late answer can no longer arrive. Where only
-    the number of bytes distinguishes answers, no two of five consecutive requests use the same one: an answer that
-    arrives twice is not taken for the answer to one of the next. After unintelligible bytes the line has to be silent
-    before the next request.
+    After a time-out a servo is asked for another number of bytes until its late answer can no longer arrive. If only
+    the number of bytes distinguishes answers, no two of five consecutive requests use the same one, so that an answer
+    that arrives twice is not taken for the answer to one of the next. After unintelligible bytes the line has to be
+    silent before the next request.
 
     Attributes:
         return_delay_s: return delay by ID; the longest delay is assumed for unknown ones.
@@ -295,7 +295,7 @@ class Bus(ABC):
         return Exchange(tuple(answers), trouble, next(iter(culprits), None))
 
     def _next(self, inbox: Inbox, take: Take[Taken]) -> tuple[Taken | None, Trouble | None]:
-        """Return the next answer that is not overdue, or why there is none."""
+        """Return the next answer that is not overdue, or the reason why it is missing."""
         try:
             while True:
                 late = self._owed_size(inbox.received, inbox.at)
@@ -358,14 +358,14 @@ class Inbox:
         return self.at - self.late
 
     def fill(self) -> bool:
-        """Wait for more. Return False when nothing arrives in time."""
+        """Wait for more. Return False if nothing arrives in time."""
         data = self._port.receive(self._deadline)
         self.received += data
         self.arrived = self._clock.now()
         return bool(data)
 
     def silence(self) -> Trouble:
-        """Return the trouble that it means if nothing more arrives."""
+        """Return the trouble to report if nothing more arrives."""
         return Trouble.GARBLED if len(self.received) > self.at else Trouble.TIMEOUT
 
 

@@ -1,4 +1,4 @@
-"""Check one servo's answers: is this its present position?"""
+"""Check that an answer is one servo's present position."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Channel(ABC):
         return sample
 
     def question(self, answer: Answer) -> tuple[str, float]:
-        """Return the key of the request that it answers."""
+        """Return the key of the request that was answered."""
         return self.servo.bus, answer.asked
 
     @abstractmethod
@@ -123,8 +123,8 @@ class Channel(ABC):
 def middle(samples: Sequence[Sample]) -> tuple[float, float]:
     """Return the middle of the time in which the positions were taken [s], and its largest possible error [s].
 
-    The answers to one request can only be delayed together, since the servos answer in the pace of the wire. So one
-    delay, within the bounds of all, shifts them all. Each request has its own delay.
+    The servos answer in the pace of the wire, so the answers to one request can only be delayed together: one delay,
+    within the bounds of all, shifts them all. Each request has its own delay.
     """
     total = unsure = 0.0
     for question in {sample.question for sample in samples}:
@@ -166,7 +166,7 @@ class Drive(Protocol):
 
     @property
     def complaints(self) -> tuple[str, ...]:
-        """Current problems, and what to do; from any thread."""
+        """Current problems, with the remedy; from any thread."""
         ...
 
     def open(self, buses: Mapping[str, Bus], servos: Sequence[IdentifiedServo]) -> None:

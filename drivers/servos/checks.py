@@ -1,4 +1,4 @@
-"""Check an arm's servos and the reading rate they allow. Writes nothing: torque stays as it is."""
+"""Check an arm's servos and the reading rate they allow. Nothing is written: torque stays unchanged."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def _pace(
     clock: Clock,
     read_s: float,
 ) -> Iterator[Check]:
-    """Read at the highest rate for a while."""
+    """Read at the highest rate for a while; yield a check of the rate reached."""
     plans = plans_of(vendor, buses, servos, config)
     requests = {name: plan.requests for name, plan in plans.items()}
     before = {name: (bus.counts.exchanges, dict(bus.counts.troubles)) for name, bus in buses.items()}

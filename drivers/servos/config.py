@@ -1,4 +1,4 @@
-"""The table of a servo vendor in robot.toml: what is the same in all."""
+"""The part of a servo vendor's table in robot.toml that all vendors share."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .model import Model, no_driver
 
 
 class ServoBusConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Keys of a port with servos behind it, whatever their make; each make says at which rates they talk."""
+    """Keys of a port with servos behind it, common to all vendors; each vendor defines the possible baud rates."""
 
     port: str  # best one of /dev/serial/by-id, which stays the same when it is plugged in again
     baud: int = 1_000_000  # as the servos are set [bit/s]
@@ -29,7 +29,7 @@ BusT = TypeVar("BusT", bound=ServoBusConfig)
 
 
 def require_each(joints: Sequence[str], given: Sequence[str], what: str, table: str, file: Path, text: str) -> None:
-    """Raise ConfigError if one of `joints` is not among those of the array of tables."""
+    """Raise ConfigError if one of `joints` has no entry in the array of tables."""
     missing = [joint for joint in joints if joint not in given]
     if missing:
         raise ConfigError(
@@ -71,7 +71,7 @@ class ServosConfig(msgspec.Struct, Generic[BusT], frozen=True, forbid_unknown_fi
         return self.models[servo.model]
 
     def check(self, joints: Sequence[str], file: Path, text: str) -> None:
-        """ConfigError when the servos are not one for each of `joints`, each with a bus and an ID of its own."""
+        """Raise ConfigError unless each of `joints` has one servo, with an existing bus and a unique ID on it."""
         table = f"drivers.{self.table}.servos"
         for place, what, key, remedy in self._mistakes(joints):
             raise ConfigError(what, file=file, line=line_in_entry(text, table, place, key), remedy=remedy)

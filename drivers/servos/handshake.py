@@ -1,4 +1,4 @@
-"""Before the first reading: who is there, is it what robot.toml says, and is its torque off."""
+"""Handshake before the first reading: identify the servos, compare them with robot.toml, and verify torque off."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def require_all(findings: Iterable[Finding], ports: str) -> list[IdentifiedServo
 
 
 def switch_torque_off(bus: Bus, servo: IdentifiedServo) -> IdentifiedServo:
-    """Switch its torque off where it is on, and make sure; the servo with what it was like.
+    """Switch the servo's torque off and verify it; return the servo with its former torque state.
 
     Raises:
         SourceLost: it does not answer.
@@ -124,7 +124,7 @@ def torque_is_on(bus: Bus, servo: IdentifiedServo) -> bool:
 
 
 def restore_torque(bus: Bus, servo: IdentifiedServo) -> None:
-    """Switch its torque on again where it was on, its goal being where it is."""
+    """Restore torque that was on, with the present position as the goal."""
     layout = servo.model.layout
     position, trouble = read_register(bus, servo.model, servo.id, layout["position"])
     if position is None:

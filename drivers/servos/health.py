@@ -22,8 +22,8 @@ class Health:
     """State of the servos of an arm.
 
     Attributes:
-        supplies: voltage [V] and temperature [°C] of the servos, where they are known, by joint.
-        absent: why a servo was not found, by joint.
+        supplies: voltage [V] and temperature [°C] of the servos, if known, by joint.
+        absent: reason why a servo was not found, by joint.
         away: names of the buses whose ports cannot be opened.
     """
 
@@ -37,7 +37,7 @@ class Health:
 
     @property
     def complaints(self) -> tuple[str, ...]:
-        """Current problems of servos, and what to do."""
+        """Current problems of servos, with the remedy."""
         return tuple(f"joint {joint!r}: {'; '.join(self._reasons(bits))}" for joint, bits in list(self._alerts.items()))
 
     def note_alert(self, joint: str, bits: int) -> None:
@@ -103,7 +103,7 @@ class Inspection:
         self._looked = 0
 
     def go_on(self) -> None:
-        """Inspect the next servo, if it is time.
+        """Inspect the next servo if it is due.
 
         Raises:
             SourceLost: its torque is on, and none of our drives switched it on.
@@ -131,7 +131,7 @@ class Inspection:
         return None
 
     def _is_confirmed(self, servo: IdentifiedServo, exchange: Exchange) -> bool:
-        """Ask again for an alert or torque where the checksum lets one in 256 wrong answers through."""
+        """Confirm an alert or torque by asking again if the checksum lets one in 256 wrong answers through."""
         told = _state_in(servo, exchange)
         if not any(told) or not self._buses[servo.bus].is_weak(self._state_request(servo)):
             return True

@@ -1,6 +1,6 @@
 """An arm of bus servos of any vendor as a `JointSource`.
 
-`daemon/sampler/sampler.py` makes pairs of its readings.
+`daemon/sampler/sampler.py` turns its readings into pairs.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class ServoJoints:
         joints: names of the joints in the order of q.
         drives: may move the joints on request.
         servos: as found at the last opening, in the order of the joints.
-        epoch: how often it was opened. Only this comparison connects positions of different epochs.
+        epoch: number of openings. Only the comparison above connects positions of different epochs.
     """
 
     vendor: ServoVendor
@@ -104,7 +104,7 @@ class ServoJoints:
 
     @property
     def health(self) -> tuple[str, ...]:
-        """Current problems of servos, and what to do."""
+        """Current problems of servos, with the remedy."""
         of_drives = (text for drive in self.drives for text in drive.complaints)
         return (*self._health.complaints, *self._slow, *of_drives)
 
@@ -315,7 +315,7 @@ class ServoJoints:
         return [f"bus {name}: {complaint}" for name, plan in self._plans.items() for complaint in plan.complaints]
 
     def _ask_all(self) -> list[Sample] | None:
-        """Ask all buses at the same time and return a sample of each joint; None when one is missing or doubtful."""
+        """Ask all buses at the same time and return a sample of each joint; None if one is missing or doubtful."""
         samples: dict[int, Sample] = {}
         for questions in zip_longest(*(plan.requests for plan in self._plans.values())):
             asked = [(bus, q) for bus, q in zip(self._buses.values(), questions, strict=True) if q is not None]
@@ -351,7 +351,7 @@ class ServoJoints:
             bus.settle()
 
     def _is_confirmed(self, bus: Bus, question: Request, channel: Channel, sample: Sample) -> bool:
-        """Ask again for a surprising position where the checksum lets one in 256 wrong answers through."""
+        """Confirm a surprising position by asking again if the checksum lets one in 256 wrong answers through."""
         if not bus.is_weak(question) or not channel.surprising:
             return True
         model = channel.servo.model
@@ -363,7 +363,7 @@ class ServoJoints:
         t, unsure = middle(samples)
         if not self._punctuality.is_usual(unsure):
             self._why = "an answer that was held up"
-            self._believed_s = self._clock.now()  # the servos are all there
+            self._believed_s = self._clock.now()  # no servo is missing
             return None
         counts = self._turns.continued([sample.ticks for sample in samples])
         refused = self._gate.offer(t, counts)

@@ -90,7 +90,7 @@ class Model:
 
     @property
     def protocol(self) -> int:
-        """Version of the vendor's protocol that it speaks."""
+        """Version of the vendor's protocol that the model uses."""
         return self.layout.protocol
 
 

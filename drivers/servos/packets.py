@@ -27,7 +27,7 @@ class Packets(Protocol):
         overhead: size of a status packet without its data [bytes].
         ping_size: data bytes in the answer to PING.
         refusals: bits of the error byte with which a servo rejects the request; the others report its health.
-        is_weak: the checksum lets one in 256 wrong answers through, and no servo clock reveals late ones.
+        is_weak: True if the checksum lets one in 256 wrong answers through, and no servo clock reveals late ones.
         pinged_only: message for a servo that answers PING but no READ.
     """
 
@@ -44,10 +44,10 @@ class Packets(Protocol):
     def write(self, id: int, address: int, data: bytes) -> bytes: ...
 
     def take(self, received: bytes | bytearray, at: int) -> Status | None:
-        """Return the status packet that begins at `at`; None when it is incomplete.
+        """Return the status packet that begins at `at`; None if it is incomplete.
 
         Raises:
-            Garbled: there is none.
+            Garbled: no status packet begins there.
         """
 
 

@@ -40,7 +40,7 @@ class ServoProtocol:
         return self.bus.packets_of(self.version)
 
     def told(self, head: bytes, id: int) -> Identity | None:
-        """Identify the servo by the start of its control table; None when it is not of this protocol."""
+        """Identify the servo by the start of its control table; return None if it is not of this protocol."""
         layouts = {model.layout.protocol: model.layout for model in self.models.values()}
         of_id = [layout for layout in layouts.values() if layout.value("id", head) == id]
         for layout in of_id:
@@ -231,7 +231,7 @@ def scan_port(
 
     Args:
         scanners: one per protocol.
-        tell: called with each step and with what was found.
+        tell: called with each step and each finding.
         bauds: rates to try; all by default.
         latency_s: longest time that the adapter holds bytes back.
     """

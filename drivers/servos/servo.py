@@ -1,4 +1,4 @@
-"""A servo of the arm, with its settings: from ticks to the joint's angle, and back."""
+"""A servo of the arm with its settings; convert ticks to the joint's angle and back."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ class IdentifiedServo:
 
     @property
     def version(self) -> str:
-        """Its firmware, as its maker writes it."""
+        """Firmware version in the vendor's notation."""
         return ".".join(map(str, self.model.layout["firmware"].bytes(self.firmware)))
 
     @property
     def label(self) -> str:
-        """Its number, for messages."""
+        """ID of the servo, for messages."""
         return f"ID {self.id}"
 
     @property

@@ -34,7 +34,7 @@ class Setting:
     follows: str = ""  # consequence of a change for a calibrated arm
 
     def value(self, text: str) -> int:
-        """Parse the user's value; raise ConfigError if it is no value of this setting, or out of range."""
+        """Parse the user's value; raise ConfigError if it is invalid for this setting, or out of range."""
         if text in self.words:
             return self.words[text]
         try:
@@ -68,7 +68,7 @@ class Setting:
 
 
 def setting_called(name: str, settings: Mapping[str, Setting], model: str) -> Setting:
-    """Return the setting of that name; raise ConfigError if the model's EEPROM has none that may be written."""
+    """Return the setting of that name; raise ConfigError if the model has no writable one."""
     if name not in settings:
         what = f"{model} has no setting {name!r} that may be written"
         raise ConfigError(what, remedy=did_you_mean(name, settings))

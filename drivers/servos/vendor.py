@@ -93,7 +93,7 @@ class ServoVendor:
 def plans_of(
     vendor: ServoVendor, buses: Mapping[str, Bus], servos: Sequence[IdentifiedServo], config: ServosConfig[Any]
 ) -> dict[str, Plan]:
-    """Return how the servos of each bus are read, by name of the bus."""
+    """Return the read methods of each bus, by name of the bus."""
     return {
         name: Plan(bus, vendor.ways(bus, [servo for servo in servos if servo.bus == name], config.buses[name]))
         for name, bus in buses.items()

@@ -1,4 +1,4 @@
-"""Changes what servos keep in their EEPROM: torque verified off, written, read back."""
+"""Edit the EEPROM settings of servos: verify torque off, write, read back."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class Outcome(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """A number that is to be written: `then` in the place of `now`."""
+    """A number to be written: `then` in place of `now`."""
 
     servo: IdentifiedServo
     setting: Setting
@@ -54,7 +54,7 @@ class Done:
 
 
 class EepromEditor:
-    """Servos whose EEPROM is looked at and changed. A context manager that opens ports (its buses) on demand."""
+    """Editor of servo EEPROM. A context manager that opens ports (its buses) on demand."""
 
     def __init__(self, vendor: ServoVendor, clock: Clock, open_at: OpenAt) -> None:
         self.vendor, self._clock, self._open_at = vendor, clock, open_at
@@ -83,7 +83,7 @@ class EepromEditor:
         return self._buses[port][1]
 
     def fitted(self, bus: Bus, config: ServoConfig, model: Model) -> IdentifiedServo:
-        """Return the servo as found on the bus; raise SourceError if it is another, or does not answer."""
+        """Return the servo found on the bus; raise SourceError if it is a different one or does not answer."""
         finding = identify(bus, config, model, self.vendor.models)
         if finding.servo is None:
             raise SourceError(
@@ -93,7 +93,7 @@ class EepromEditor:
         return finding.servo
 
     def model_at(self, bus: Bus, id: int) -> Model | None:
-        """Identify the model of the servo with an ID by trying all protocols of the vendor. None if unknown."""
+        """Identify the model of the servo with an ID by trying all protocols of the vendor. Return None if unknown."""
         for protocol, any_of_it in self._by_protocol.items():
             register = any_of_it.layout["model"]
             data, _ = read_register(bus, any_of_it, id, register)
@@ -131,7 +131,7 @@ class EepromEditor:
             switch_torque_off(bus, servo)
 
     def write(self, bus: Bus, change: Change) -> Done:
-        """Write it, and read it back. Not for rates, see `write_bauds`. Torque has to be off."""
+        """Write a change and read it back. Torque must be off. For baud rates use `write_bauds`."""
         self._unlock(bus, change.servo)
         done = self._tried(bus, change)
         for _ in range(HandshakeSettings.attempts - 1):
@@ -140,7 +140,7 @@ class EepromEditor:
         return self._locked(bus, done)
 
     def write_bauds(self, port: str, baud: int, then: int, changes: Sequence[Change]) -> list[Done]:
-        """Give servos of one port another rate [bit/s], and look for each there, else where it was."""
+        """Change the baud rate [bit/s] of servos of one port; verify each at the new rate, otherwise at its old one."""
         bus = self.bus(port, baud)
         for change in changes:
             self._unlock(bus, change.servo)

@@ -1,4 +1,4 @@
-"""Play between the encoder and its joint, with friction that keeps the joint in place."""
+"""Backlash between the encoder and its joint, with friction that keeps the joint in place."""
 
 from __future__ import annotations
 
@@ -85,12 +85,12 @@ def played(q: FloatArray, width: float) -> FloatArray:
     """Return output minus input (n,) of a backlash of `width` driven by q (n,), leading in its first direction.
 
     Between two runs it is driven straight from the last reading of one to the first of the next: the side at the end of
-        the run is known, and a long move ends on its own side.
+    the run is known, and a long move ends on its own side.
     """
     moves, half = np.diff(q), 0.5 * width
     leading = moves[np.flatnonzero(moves)[:1]]
     begun = q[0] - half * float(np.sign(leading[0])) if len(leading) else q[0]
-    # Each reading limits the output to its own range; so do several in a row, which are combined by doubling.
+    # Each reading limits the output to its own range; so do consecutive ones, which are combined by doubling.
     low, high, back = q - half, q + half, 1
     while back < len(q):
         earlier = low[:-back], high[:-back]

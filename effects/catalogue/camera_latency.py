@@ -1,4 +1,4 @@
-"""Images whose time stamps are late."""
+"""Images with late timestamps."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bodyschema.interfaces.records import FloatArray
 
 
 class CameraLatency(TimeEffect):
-    """Delay of the images' time stamps against the encoders."""
+    """Delay of the images' timestamps against the encoders."""
 
     name = "camera_latency"
     rank = 0
@@ -27,7 +27,7 @@ class CameraLatency(TimeEffect):
         return float(values[0])
 
     def jacobian(self, run: SimulationRun, effect: Effect) -> FloatArray:
-        # Include the encoder errors: they too are those of the earlier moment.
+        # Include the encoder errors, which also belong to the earlier moment.
         simulation, latency = run.simulation, run.simulation.latency_s
         step_s = 1e-5
         later, sooner = (simulation.unloaded(run.motion.earlier(latency + s)) for s in (step_s, -step_s))

@@ -1,4 +1,4 @@
-"""A camera that stands elsewhere."""
+"""A camera pose that differs from the description."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from bodyschema.robot.description import RobotDescription
 
 
 class CameraPose(CameraEffect):
-    """Pose of the camera in the frame that the description gives it."""
+    """Pose of the camera in its nominal frame."""
 
     name = "camera_pose"
     rank = 0

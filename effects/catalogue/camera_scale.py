@@ -1,4 +1,4 @@
-"""A tag, a ball or a calibration board of another size than stated, a wrong baseline, or an instrument's scale."""
+"""A wrong size of a tag, a ball or a calibration board, a wrong baseline, or an instrument's scale."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Play in a joint that hangs on the flank to which the weight pulls it."""
+"""Backlash in a joint that rests on the flank to which the weight pulls it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A joint that yields under the arm's weight."""
+"""A joint that deflects under the arm's weight."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ class JointRipple(EncoderEffect):
 
     @property
     def most_at_one_place(self) -> int:
-        # Teeth, strain wave, pole pairs and a screw have periods of their own.
+        # Teeth, strain wave, pole pairs and a screw have different periods.
         return 4
 
     def columns(self, motion: Motion, place: Place, values: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Lenses that still distort after rectification."""
+"""Lens distortion that remains after rectification."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from bodyschema.interfaces.records import FloatArray
 
 
 class LensDistortion(CameraEffect):
-    """Radial distortion left in the images."""
+    """Radial distortion that remains in the images."""
 
     name = "lens_distortion"
     rank = 4

@@ -12,7 +12,7 @@ from bodyschema.robot.urdf import PointMass
 
 
 class Payload(StructureEffect):
-    """A mass on the marker's link, and its moment; visible only where joints yield."""
+    """A mass on the marker's link, and its moment; visible only if joints deflect."""
 
     name = "payload"
     rank = 2

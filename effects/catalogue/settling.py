@@ -86,6 +86,6 @@ class _LiveSettling:
         self._missing: deque[float] = deque([0.0] * row_readings, maxlen=row_readings)
 
     def at(self, motion: Motion, move: float) -> float:
-        """Return minus the remaining lag [rad, m] after the move since the row before."""
+        """Return minus the remaining lag [rad, m] after the move since the previous row."""
         self._missing.append(self._fraction * move + self._memory * self._missing[0])
         return -self._missing[-1]

@@ -17,7 +17,7 @@ class _Settings:
 
 
 class ThermalDrift(TimeEffect):
-    """A shift of what is measured that grows from 0 towards its amounts, with a time constant."""
+    """A shift of the measurements that grows from 0 towards its amounts, with a time constant."""
 
     name = "thermal_drift"
     rank = 1

@@ -1,4 +1,4 @@
-"""A marker that sits elsewhere on the hand."""
+"""A marker at another position on the hand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Export the simulation to formats of other programs, with a list of what each of them cannot hold."""
+"""Export the simulation to formats of other programs, with a list of the effects that each cannot hold."""
 
 from .correction import write_correction
 from .mjcf import write_mjcf

@@ -1,4 +1,4 @@
-"""Sort the effects of a simulation by joint, and tell which a rigid-body simulator cannot hold."""
+"""Sort the effects of a simulation by joint, and list those that a rigid-body simulator cannot hold."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def moment_notes(simulation: Simulation) -> Iterator[str]:
 
 
 def geometry_of(simulation: Simulation) -> CalibratedGeometry:
-    """Return the geometry with all effects that it can hold; the described one where there are none."""
+    """Return the geometry with all effects that it can hold; the described one if there are none."""
     robot = simulation.robot
     described = CalibratedGeometry({}, robot.camera.pose, np.array(robot.robot.marker_xyz))
     return corrected_geometry(simulation) or described

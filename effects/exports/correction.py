@@ -1,7 +1,7 @@
 """Write correction.json, from which a controller computes true joint angles and the marker's pose.
 
 docs/exporting.md has the format, examples/correction its readers. It is a program of steps that fill registers. Every
-joint's frame is turned so that its axis is z.
+joint's frame is rotated so that its axis is z.
 """
 
 from __future__ import annotations
@@ -60,10 +60,10 @@ def write_correction(
 
     Args:
         heading: one line that names the origin.
-        pose_covariance: of the poses that the file gives, 6 x 6 row by row; None if it is not known.
+        pose_covariance: covariance of the file's poses, 6 x 6 row by row; None if unknown.
 
     Returns:
-        Sentences on what the file does not hold, or holds in another form.
+        Sentences on effects that the file does not hold, or holds in another form.
 
     Raises:
         OSError: the file cannot be written.
@@ -94,14 +94,14 @@ class _Program:
 
     def __init__(self, joints: int) -> None:
         self.readings = range(ANGLES + joints, ANGLES + 2 * joints)
-        # register of each joint's true angle, as far as the steps have come
+        # register of each joint's true angle after the steps so far
         self.angles = list(range(ANGLES, ANGLES + joints))
         self._registers = [0.0] * self.readings.stop
         self._steps: list[tuple[int, int, int, int, int]] = []
         self._constants: dict[tuple[float, ...], int] = {}
 
     def room(self, *numbers: float) -> int:
-        """Return the first of new registers that begin with these numbers."""
+        """Return the first of new registers that are initialised with these numbers."""
         self._registers += numbers
         return len(self._registers) - len(numbers)
 
@@ -149,7 +149,7 @@ def _add_encoders(simulation: Simulation, program: _Program) -> None:
 
 
 def _add_weights(simulation: Simulation, program: _Program) -> None:
-    """Add the steps by which joints give way to gravity."""
+    """Add the steps for the deflection of joints under gravity."""
     joints = range(len(simulation.robot.joints))
     springs = simulation.springs if simulation.bears_weight else np.zeros(len(joints))
     loose: dict[int, tuple[float, float, int]] = {}
@@ -169,13 +169,13 @@ def _add_weights(simulation: Simulation, program: _Program) -> None:
 
 
 class _Weights:
-    """What joints that give carry: the steps that compute gravity's torque about them.
+    """Loads of compliant joints: the steps that compute gravity's torque about them.
 
     Args:
-        gives: joints that give. Others have bodies here only if they carry one of them, or are carried by one.
+        gives: compliant joints. Others have bodies here only if they carry one of them, or are carried by one.
 
     Attributes:
-        unloaded: register of each joint's angle before it gives.
+        unloaded: register of each joint's angle before its deflection.
     """
 
     def __init__(self, simulation: Simulation, program: _Program, gives: set[int]) -> None:
@@ -215,7 +215,7 @@ class _Weights:
         self._sums = {}
 
     def torques(self) -> Iterator[tuple[int, int]]:
-        """Yield each joint that gives, from the farthest on, with the register of its torque at the present angles."""
+        """Yield each compliant joint, from the farthest on, with the register of its torque at the present angles."""
         for k in self._moving:
             self._turn_gravity(k)
         loads, torque = dict(self._loads), self._program.room(0.0)
@@ -228,7 +228,7 @@ class _Weights:
                 yield k, torque
 
     def _turn_gravity(self, k: int) -> None:
-        """Add the step that turns gravity from the frame of a body's carrier to its own."""
+        """Add the step that rotates gravity from the frame of a body's carrier to its own."""
         if k not in self._down:
             self._down[k] = self._program.room(0.0, 0.0, 0.0, 0.0)
         self._program.step(

@@ -1,4 +1,4 @@
-"""Convert the visual shapes of a URDF to MuJoCo's form. Meshes stay where they are."""
+"""Convert the visual shapes of a URDF to MuJoCo's form. Meshes stay in place."""
 
 from __future__ import annotations
 

@@ -59,7 +59,7 @@ def write_mjcf(simulation: Simulation, file: Path, heading: str) -> list[str]:
     """Write the simulation as MJCF to `file`.
 
     Returns:
-        Sentences on what the file does not hold, or holds in another form.
+        Sentences on effects that the file does not hold, or holds in another form.
 
     Raises:
         RobotError: two joints would have the same name.
@@ -221,7 +221,7 @@ class _Document:
         limits = {} if joint.kind == "continuous" else {"range": texts(np.array([joint.lower, joint.upper]))}
         zero = {"ref": repr(-errors.offset)} if errors.offset else {}
         inertia = self._inertia(joint) + _Settings.armature
-        # MuJoCo's friction and limits are softer the lighter the joints in the row are; a backlash needs them hard.
+        # MuJoCo's friction and limits soften with lighter joints in the chain; a backlash needs hard ones.
         heavy = {"armature": f"{inertia:.4g}"} if errors.play else {}
         self._joint(body, joint.name, **kind, **limits, **zero, **heavy)
         gain = f"{_Settings.servo_rate**2 * inertia:.4g}"
@@ -271,7 +271,7 @@ class _Document:
         self._add(self._equality, "joint", joint1=name, joint2=source, polycoef=polynomial)
 
     def _tie_error(self, name: str, joint: UrdfJoint, errors: JointErrors) -> None:
-        """Tie the joint `name` to the readings: its value less a share of each is the sum of the periodic errors."""
+        """Tie the joint `name` to the readings: its value minus a share of each is the sum of the periodic errors."""
         rest = self._add(self._tendon, "fixed", name=name)
         self._add(rest, "joint", joint=name, coef="1")
         constant, factor, ends = 0.0, 0.0, {"tendon1": name}
@@ -293,7 +293,7 @@ class _Document:
         The distance from (a, 0) to r · (cos, sin) of an angle is a - r · cos to first order in r/a.
 
         Returns:
-            Its length less the distances to the hands' axes [m], at the joint's initial value in the file.
+            Its length minus the distances to the hands' axes [m], at the joint's initial value in the file.
         """
         still, length, longer = self._wave_base(), self._add(self._tendon, "spatial", name=name), 0.0
         for count, wave in enumerate(waves):

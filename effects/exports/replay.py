@@ -31,7 +31,7 @@ def replayed(file: Path, joints: Sequence[str], motion: Motion) -> FloatArray:
     """Return positions (n, 3) [m] of the marker in the measurement frame, from an MJCF file alone.
 
     At each row the arm is at rest: constraints are met, springs balance gravity, and a joint with backlash is dragged
-        along by the rest of its joint.
+    along by the rest of its joint.
 
     Raises:
         ConfigError: MuJoCo is not installed, or cannot load the file.

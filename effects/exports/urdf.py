@@ -17,7 +17,7 @@ def write_urdf(simulation: Simulation, file: Path, heading: str) -> list[str]:
     """Write the URDF of the simulation's robot, with the corrections that a URDF can hold, to `file`.
 
     Returns:
-        Sentences on what the file does not hold.
+        Sentences on effects that the file does not hold.
 
     Raises:
         OSError: the file cannot be written.

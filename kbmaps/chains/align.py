@@ -112,19 +112,19 @@ def align(
 ) -> Alignment:
     """Fit the unknown camera pose and marker offset to measured pairs.
 
-    Needs no first guess and withstands gross outliers. The final fit is plain least squares over the inliers. Where
-    pose and marker offset can compensate for each other (a chain whose last frame hardly turns), the combination that
+    Needs no initial guess and withstands gross outliers. The final fit is plain least squares over the inliers. If pose
+    and marker offset can compensate for each other (a chain whose last frame hardly rotates), the combination that
     changes the nominal chain least is returned.
 
     Args:
         chain: the nominal chain.
         q: joint angles (n, d) [rad, m].
         x: measured marker positions (n, 3) [m].
-        pose_known: the instrument stands where the chain says.
-        marker_known: the marker sits where the chain says.
-        sigma: noise of one coordinate [m], if known: nothing within 15 sigma is ever called an outlier.
-        turns: how the marker was measured to be turned, rotations (n, 3, 3), if it was. They tell where to begin where
-            neither pose nor marker is known, and nothing else.
+        pose_known: True if the camera pose is that of the chain.
+        marker_known: True if the marker position is that of the chain.
+        sigma: noise of one coordinate [m], if known: errors within 15 sigma are never called outliers.
+        turns: measured orientations of the marker, rotations (n, 3, 3), if any. They only determine the start of the
+            fit when neither pose nor marker is known.
 
     Raises:
         SettingError: sigma is not positive.
@@ -210,8 +210,8 @@ def _start_shift(fit: _Fit, sigma: float, turns: FloatArray | None) -> FloatArra
 def _shift_by_turns(fit: _Fit, turns: FloatArray) -> FloatArray:
     """Return the marker shift (3,) that follows from the marker's orientations (n, 3, 3) and positions.
 
-    With the instrument turned by A and the marker on the last frame N by B, Aᵀ M = N B is linear in A and B; then so is
-    x = A (p + N δ) + t in the shift δ and the place t. Robot-world/hand-eye calibration is solved so (Shah 2013).
+    With the camera rotated by A and the marker by B on the last frame N, Aᵀ M = N B is linear in A and B. Then x = A (p
+    + N δ) + t is linear in the shift δ and the translation t. This solves robot-world/hand-eye calibration (Shah 2013).
     """
     if turns.shape != fit.nominal_rotations.shape:
         raise ShapeError("turns", f"{fit.nominal_rotations.shape} to go with q", turns.shape)
@@ -235,8 +235,8 @@ def _fit_robustly(fit: _Fit, sigma: float, tolerance: float = _Settings.step_tol
     """Fit robustly by graduated non-convexity, then by least squares on the inliers; return the inliers (n,).
 
     Geman-McClure weights whose scale shrinks from the largest residual to that of the bulk (Yang et al. 2020,
-    "Graduated Non-Convexity for Robust Spatial Perception"). The first fits are nearly least squares and need no good
-    guess. `fit` is changed in place.
+    "Graduated Non-Convexity for Robust Spatial Perception"). The first fits are nearly least squares and do not need a
+    good initial guess. `fit` is changed in place.
     """
     weights = np.ones(len(fit.x))
     if fit.fit_pose:
@@ -285,7 +285,7 @@ class PlacedStart:
         self._placed_at = 0
 
     def change(self, q: FloatArray, x: FloatArray) -> FloatArray:
-        """Return the change (size,) to start a fit from; 0 while the pairs do not determine a pose.
+        """Return the change (size,) from which to start a fit; 0 while the pairs do not determine a pose.
 
         Args:
             q: joint values of at least one pair (n, d) [rad, m].
@@ -314,11 +314,11 @@ def with_refitted_tool(
 ) -> KBMap:
     """Return the map after its marker was moved to another place on the last link, or the tool was changed.
 
-    The offset δ is fitted, robustly, to pairs seen since: x ≈ f(q) + R(q) δ with the orientation R of the nominal
+    The offset δ is fitted robustly to the pairs since then: x ≈ f(q) + R(q) δ with the orientation R of the nominal
     chain. With E the nets of R it is built in exactly, G ← G + E δ. Errors of R itself are left to a learner.
 
     Args:
-        kbmap: the map as learnt before the change; of its outputs only the position moves.
+        kbmap: the map learnt before the change; of its outputs only the position changes.
         chain: the nominal chain, which supplies the orientations.
         q, x: pairs since the change, (n, d) [rad, m] and (n, 3) [m].
         sigma: noise of one coordinate [m], if known.
@@ -341,13 +341,13 @@ def with_refitted_tool(
 def _robust_mean(offsets: FloatArray, sigma: float) -> FloatArray:
     """Return the mean (3,) of offsets (n, 3) without outliers.
 
-    It starts from their median, so that up to half of them may be arbitrary. Fewer than five have no majority, and all
-    count.
+    It starts from their median, so that up to half of them may be arbitrary. Fewer than five have no majority; all of
+    them count.
     """
     centre = np.median(offsets, axis=0)
     for _ in range(len(offsets)):
         distances = np.linalg.norm(offsets - centre, axis=1)
-        # One pair is always explained by an offset.
+        # An offset always explains a single pair.
         spread = max(middle_sigma(distances, len(distances) // 2 + 1), sigma)
         mean = offsets[distances <= RobustSettings.rounding_m + RobustSettings.uncalibrated_sigmas * spread].mean(
             axis=0

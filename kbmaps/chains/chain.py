@@ -22,13 +22,13 @@ _RIGID_TOLERANCE = 1e-6
 class RigidChain:
     """Serial chain from the measurement frame to the marker frame.
 
-    T(q) = F_0 · J_1(q_1) · F_1 · J_2(q_2) · … · J_d(q_d) · F_d, where J_k turns about (or, prismatic, slides along)
-    its axis. The marker is the origin of the last frame.
+    T(q) = F_0 · J_1(q_1) · F_1 · J_2(q_2) · … · J_d(q_d) · F_d, where J_k rotates about (or, prismatic, translates
+    along) its axis. The marker is the origin of the last frame.
 
     Attributes:
         fixed: the constant transforms F_0 ... F_d (d+1, 4, 4), lengths [m].
         axes: unit axes (d, 3) in each joint's own frame, the frame after F_{k-1}.
-        prismatic: True for each joint (d,) that slides.
+        prismatic: True for each prismatic joint (d,).
 
     Raises:
         ChainError: a transform is not rigid or an axis is not of unit length.
@@ -207,7 +207,7 @@ class RigidChain:
 
     @cached_property
     def _moved_links(self) -> FloatArray:
-        """Matrices (3, d, 4, 4): J_k(q) F_k of every joint, in the terms of `_joint_terms`."""
+        """Matrices (3, d, 4, 4) of J_k(q) F_k for every joint, in the terms of `_joint_terms`."""
         terms = np.stack([self._joint_terms(k) for k in range(self.joints)], axis=1)
         return frozen(terms @ self.fixed[1:])
 

@@ -45,7 +45,7 @@ class OrientedChain:
         parameters: the parametrisation, with the reference chain.
         mean: their values (size,) [rad, m].
         turn: rotation (3, 3) of the marker in the chain's last frame; constant, and unknown before the fit.
-        root: matrix W (size + 3, k), the covariance W Wᵀ of the parameters and of a small turn τ of the marker,
+        root: matrix W (size + 3, k), the covariance W Wᵀ of the parameters and of a small rotation τ of the marker,
             exp([τ]×) · turn [rad].
         noise: 1-sigma of a measured orientation about one axis [rad].
 
@@ -74,7 +74,7 @@ class OrientedChain:
 
     @property
     def chain(self) -> RigidChain:
-        """Most probable chain, its last frame turned as the marker is."""
+        """Most probable chain, its last frame rotated like the marker."""
         chain = self.parameters.chain(self.mean)
         fixed = chain.fixed.copy()
         fixed[-1, :3, :3] = nearest_rotation(fixed[-1, :3, :3] @ self.turn)
@@ -87,7 +87,7 @@ class OrientedChain:
     def orientation_with_variance(self, q: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Return rotations (n, 3, 3) at q (n, d) and their first-order variance (n, 3) [rad²].
 
-        The variance is that of a small turn about each axis of the measurement frame.
+        The variance is that of a small rotation about each axis of the measurement frame.
         """
         angles = rows("q", q, self.parameters.reference.joints)
         rotations, variance = np.empty((len(angles), 3, 3)), np.empty((len(angles), 3))
@@ -123,7 +123,7 @@ def fitted_orientation(belief: ChainBelief, q: ArrayLike, rotation: ArrayLike) -
 
     Args:
         belief: posterior of the chain from positions. Parameters that it holds stay held.
-        q: joint values (n, d) [rad, m], in the order in which they were measured.
+        q: joint values (n, d) [rad, m], in the order of measurement.
         rotation: orientations, (n, 3, 3) or quaternions x, y, z, w (n, 4).
 
     Raises:
@@ -155,7 +155,7 @@ def fitted_orientation(belief: ChainBelief, q: ArrayLike, rotation: ArrayLike) -
 
 
 class _Fit:
-    """Gauss-Newton over the columns of the belief's root and the turn of the marker."""
+    """Gauss-Newton over the columns of the belief's root and the rotation of the marker."""
 
     def __init__(self, belief: ChainBelief, q: FloatArray, measured: FloatArray) -> None:
         self._belief, self._q, self._measured = belief, q, measured

@@ -78,19 +78,19 @@ class _Geometry:
 
 
 class ChainParameters:
-    """Small changes of a reference chain, as vectors (size,), and the marker positions that result.
+    """Small changes of a reference chain, as vectors (size,), and the resulting marker positions.
 
     The product of exponentials of screws given with all joints at zero (Brockett 1984): a change of one axis leaves the
-    others where they are. In this order, with d joints:
+    others unchanged. In this order, with d joints:
 
         base turn (3) [rad]  rotation vector of the arm about the origin of the measurement frame
-        base shift (3) [m]   move of the arm in the measurement frame, after the turn
+        base shift (3) [m]   translation of the arm in the measurement frame, after the rotation
         tilts (2 d) [rad]    of each axis, about two directions across it
         shifts (2 d) [m]     of each axis, along the same two directions; without effect for a prismatic joint
         zeros (d) [rad, m]   joint offsets, added to the joints' readings
-        tool (3) [m]         move of the marker in the marker frame
+        tool (3) [m]         displacement of the marker in the marker frame
 
-    Turns of an axis about itself and shifts along itself would change nothing and are left out. The rest is
+    Rotations of an axis about itself and shifts along itself would change nothing and are left out. The rest is
     over-complete on purpose: axes and tool can compensate for base and joint offsets, and only a prior separates them.
 
     Example:
@@ -130,7 +130,7 @@ class ChainParameters:
         return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Restore the state, with the kernel that the present process chooses."""
+        """Restore the state, with the kernel that the present process selects."""
         self.__dict__.update(state)
         self._kernel = self._whole_kernel()
 
@@ -145,7 +145,7 @@ class ChainParameters:
 
     @property
     def turning(self) -> BoolArray:
-        """True for each parameter (size,) that is an angle, and so curves the marker's path.
+        """True for each parameter (size,) that is an angle, and therefore curves the marker's path.
 
         The others are lengths.
         """
@@ -281,8 +281,8 @@ class ChainParameters:
     def turned(self, change: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return rotations R (n, 3, 3) of the marker frame at q (n, d), and Ω (n, 3, size); inputs are not checked.
 
-        A small change δ turns them by dR = [Ω δ]× R. The parameters that turn them are those that act through a lever
-        in `linearised`; shifts, tool and prismatic joints do not turn them.
+        A small change δ rotates them by dR = [Ω δ]× R. Only the parameters that act through a lever in `linearised`
+        rotate them; shifts, tool and prismatic joints do not.
         """
         geometry = self._geometry(change)
         rotations = self._placed(geometry, q + geometry.zeros)[..., :3, :3]
@@ -360,7 +360,7 @@ class ChainParameters:
 
 
 def _plain(values: FloatArray) -> FloatArray:
-    """Return the values as the compiled kernel takes them."""
+    """Return the values in the form of the compiled kernel."""
     return np.ascontiguousarray(values, dtype=np.float64)
 
 
@@ -395,7 +395,7 @@ def chain_from_arrays(arrays: Mapping[str, FloatArray]) -> RigidChain:
 
 
 def describe_tolerances(tolerances: ChainTolerances) -> dict[str, float | None]:
-    """Return tolerances as JSON holds them: None for an infinite one."""
+    """Return tolerances for JSON: None for an infinite one."""
     return {name: unless_infinite(value) for name, value in asdict(tolerances).items()}
 
 

@@ -160,7 +160,7 @@ class _Fitter:
         markers, jacobian = np.empty((count, n, 3)), np.empty((count, n, 3, len(self._columns)))
         for k, row in enumerate(rows):
             self._linearise(changes[k], self._q[row], markers[k], jacobian[k])
-        # A step turns the frame as it is, and does not add to its rotation vector.
+        # A step rotates the present frame, and is not added to its rotation vector.
         jacobian[..., :3] = cross_matrix(shifts[:, None] - markers)
         residuals = (self._x[rows] - markers).reshape(count, 3 * n)
         return _State(rotations, shifts, zeros, tools, residuals, jacobian.reshape(count, 3 * n, -1))

@@ -37,15 +37,15 @@ class Scatter:
     """Scatter of pairs about a chain."""
 
     noise: float  # 1-sigma of a measured coordinate [m], estimated or given (their RMS)
-    misfit: float  # residual over what the noise explains; about 1 for a rigid chain, 1 where the noise was not given
-    # degrees of freedom: residual coordinates minus those that the parameters have used up. If they are few, `noise` is
+    misfit: float  # ratio of the residual to the given noise; about 1 for a rigid chain, 1 if no noise was given
+    # degrees of freedom: residual coordinates minus the effective number of parameters. If they are few, `noise` is
     # uncertain.
     freedom: float
 
 
 @dataclass(frozen=True, eq=False)
 class ChainReport:
-    """Learnt chain relative to the nominal one, in quantities that have names.
+    """Learnt chain relative to the nominal one, in named quantities.
 
     Attributes:
         T_measured_nominal: pose (4, 4) of the nominal measurement frame in the real one (hand-eye, camera pose).
@@ -56,15 +56,15 @@ class ChainReport:
         widening: factor by which the intervals are wider because the noise was estimated from few pairs (Student's t);
             1 if it was given.
         noise: 1-sigma of a measured coordinate [m], estimated or given (their RMS).
-        misfit: residual over what the noise explains; about 1 for a rigid chain, 1 where the noise was not given.
-        freedom: degrees of freedom: residual coordinates minus those that the parameters have used up. If they are few,
+        misfit: ratio of the residual to the given noise; about 1 for a rigid chain, 1 if no noise was given.
+        freedom: degrees of freedom: residual coordinates minus the effective number of parameters. If they are few,
             `noise` is uncertain.
         outliers: number of pairs left out.
         determined: number of independent directions of the free parameters that the pairs determine.
         undetermined: names of the free parameters that these pairs did not determine, though they matter: more than
             half of the prior's 1-sigma remains, and it exceeded the noise at the arm's reach. They compensate for each
             other or were never moved; their values rest on the tolerances.
-        prismatic: True for each joint (d,) that slides.
+        prismatic: True for each prismatic joint (d,).
     """
 
     T_measured_nominal: FloatArray

@@ -87,7 +87,7 @@ class RigidFilter:
         return covariance
 
     def learn(self, q: FloatArray, x: FloatArray, sigma: FloatArray) -> None:
-        """Learn checked pairs q (n, d), x (n, 3) and sigma (n,), NaN where it is to be estimated."""
+        """Learn checked pairs q (n, d), x (n, 3) and sigma (n,), NaN to estimate it."""
         if self._kernel is not None:
             self._learn_compiled(self._kernel, q, x, sigma)
             return
@@ -95,7 +95,7 @@ class RigidFilter:
             self._learn_one(q[k : k + 1], x[k], float(sigma[k]))
 
     def learn_plain(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None, row: FloatArray) -> bool:
-        """Learn one pair and write q, x and sigma to `row` (d + 4), if the kernel can take them as they are.
+        """Learn one pair and write q, x and sigma to `row` (d + 4), if the kernel can use them unconverted.
 
         Returns False, and changes nothing, if there is no kernel or the input needs conversion or is invalid.
         """
@@ -114,7 +114,7 @@ class RigidFilter:
 
         Args:
             belief: the posterior that replaces the information of all pairs so far.
-            fitted: True if its mean is the linearisation point of those pairs, and near enough for those to come.
+            fitted: True if its mean is the linearisation point of those pairs, and near enough for later ones.
         """
         active = self._active
         self.change = np.array(belief.mean)
@@ -190,7 +190,7 @@ class RigidFilter:
         return x, jacobian[:, :, self._active] * self._scales
 
     def _learn_one(self, q: FloatArray, x: FloatArray, sigma: float) -> None:
-        """Update with one pair, iterated (Bell and Cathey 1993): the gain is that of the point it leads to."""
+        """Update with one pair, iterated (Bell and Cathey 1993): the gain is evaluated at the resulting point."""
         told = not math.isnan(sigma)
         noise_square = sigma**2 if told else self.noise_square
         update = self._update(self.change, np.zeros(len(self._scales)), q, x, noise_square, 1.0)

@@ -54,8 +54,8 @@ class RigidFit:
     """Change of the chain with its uncertainty."""
 
     belief: ChainBelief  # the posterior of the parameters
-    noise: float  # estimated noise over unit; at least 1 where the units are the noise (more: the chain does not fit)
-    freedom: float  # residual coordinates minus those that the parameters have used up
+    noise: float  # estimated noise over unit; at least 1 if the units are the noise (more: the chain does not fit)
+    freedom: float  # residual coordinates minus the effective number of parameters
     inliers: BoolArray  # True for each pair (n,) that is not an outlier
     rank: int  # number of independent directions of the parameters that the data determine
     log_evidence: float  # log marginal likelihood of the inliers (Laplace's approximation)
@@ -64,7 +64,7 @@ class RigidFit:
 
 @dataclass(frozen=True, eq=False)
 class _Point:
-    """Residuals (n, 3) and Jacobian (n, 3, f), as sure in all directions, and norms in units (n,) at a change (size,).
+    """Residuals (n, 3) and Jacobian (n, 3, f), scaled to be isotropic, and norms in units (n,) at a change (size,).
 
     The f unknowns are the free parameters, counted from the prior's mean in columns of its root, then the errors common
     to all pairs in their sigmas; `offset` (f,) is their current value.
@@ -85,7 +85,7 @@ class _Point:
         """Return the distance (n,) of each pair from its prediction by the other inliers, in standard deviations.
 
         Mahalanobis lengths: an inlier's residual has the covariance σ² − J P Jᵀ, an outlier's σ² + J P Jᵀ (Cook and
-        Weisberg 1982, section 2.2). A pair's distance does not depend on whether it takes part in the fit.
+        Weisberg 1982, section 2.2). A pair's distance does not depend on its being part of the fit.
         """
         factor = self.reduced(inliers / sigma)
         _, singular, vt = np.linalg.svd(factor[:, :-1])
@@ -113,11 +113,11 @@ class _Fitter:
         self.point = self._at(np.concatenate([first, np.zeros(common.shape[2])]))
         self.least_noise = 1.0 if pairs.known else RobustSettings.rounding_m / float(pairs.unit.min())
         self._damping = _Settings.first_damping
-        # Residual coordinates that the parameters use up.
+        # Residual coordinates absorbed by the parameters.
         self.used = float(min(len(self.point.offset), 3 * len(pairs)))
 
     def typical(self) -> float:
-        """Return noise over unit from the middle residual."""
+        """Return the noise from the middle residual, divided by the unit."""
         norms = self.point.norms
         return max(middle_sigma(norms, 0.5 * (len(norms) + self.used / 3.0)), self.least_noise)
 
@@ -167,7 +167,7 @@ def fit_chain(
         prior: Gaussian over the parameters before these pairs.
         pairs: the pairs, at least one.
         start: change (size,) to start from.
-        near: the start is a fit to most of these pairs, so that least squares will do.
+        near: True if the start is a fit to most of these pairs, so that least squares suffice.
         noise: prior of a noise that is not given.
     """
     fitter = _Fitter(prior, pairs, start)
@@ -190,7 +190,7 @@ def folded(prior: ChainBelief, pairs: Pairs, change: FloatArray, noise: float) -
         prior: Gaussian over the parameters before these pairs.
         pairs: the pairs, without outliers.
         change: linearisation point (size,).
-        noise: over the pairs' unit.
+        noise: noise relative to the pairs' unit.
     """
     point = _Fitter(prior, pairs, change).point
     factor = point.reduced(1.0 / (pairs.unit * noise))

@@ -44,18 +44,19 @@ class _Settings:
 def deviations(belief: ChainBelief, pairs: Pairs, sigma: FloatArray) -> FloatArray:
     """Return the RMS deviation (size,) [rad, m] of each parameter's true value from the mean, to second order.
 
-    Changes that the pairs cannot separate lie along a curve, not along its tangent. An example is another offset of the
-    last joint, compensated for by the marker: it takes the marker round the joint's axis. With y standard normal along
-    the open directions W_o, the closed ones W_c follow, so that the pairs stay as well explained (our derivation):
+    Changes that the pairs cannot separate lie along a curve, not along its tangent. An example is a different offset of
+    the last joint that the marker compensates: the marker then moves round the joint's axis. With y standard normal
+    along the open directions W_o, the closed ones W_c follow, so that the pairs remain equally well explained (our
+    derivation):
 
         θ = m + W_o y + W_c (z + ½ Σ B_kl y_k y_l)    B_kl = −(J W_c)⁺ ∂²x(W_o e_k, W_o e_l)
 
-    Half the square form has the mean tr B / 2 and the variance tr B² / 2.
+    Half the quadratic form has the mean tr B / 2 and the variance tr B² / 2.
 
     Args:
-        belief: after the pairs.
-        pairs: the n pairs, or some that stand for them.
-        sigma: 1-sigma (n,) of a coordinate there [m].
+        belief: posterior after the pairs.
+        pairs: the n pairs, or representatives of them.
+        sigma: 1-sigma (n,) of a coordinate of each [m].
     """
     q = pairs.q
     opened, closed, follow = _sides(belief, pairs, sigma)
@@ -91,7 +92,7 @@ _KIND = "rigid chain, batch, 2"
 
 
 class RigidLearner(Model):
-    """Fits a rigid chain to all pairs, around a nominal one whose tolerances are the prior.
+    """Batch learner of a rigid chain around a nominal one, whose tolerances are the prior.
 
     The result depends on the pairs only, not on their order or grouping. The fit runs on first use after `learn`
     (7 joints: 10 ms at 30 pairs, 0.1 s at 2,200). Outliers are left out.
@@ -99,11 +100,11 @@ class RigidLearner(Model):
     Args:
         nominal: the nominal chain, or one found by `find_chain`.
         tolerances: standard deviations of the real chain about it.
-        prior: Gaussian prior, where more is known than the tolerances; it changes the same nominal chain. Use it to
+        prior: Gaussian prior, if more than the tolerances is known; it refers to the same nominal chain. Use it to
             continue with another tool: `learner.belief.with_other_tool(0.2)`.
 
     Raises:
-        ShapeError: the prior is one of another chain.
+        ShapeError: the prior belongs to another chain.
         DegenerateDataError: `scatter` and `report` before the first pair.
 
     Example:
@@ -223,11 +224,11 @@ class RigidLearner(Model):
         """Learn pairs, as every `Model` does.
 
         Args:
-            q, x, sigma: once one pair came without its sigma, the noise is estimated for all, and those told count
-                relative to their median.
-            cov: in the place of sigma: covariances [m²], (3, 3) or (n, 3, 3), where some directions are surer:
-                one camera tells depth far worse than what is across.
-            common: (n, 3, k) [m], the errors that k unknowns shared by all pairs bring at 1 sigma of each, such as
+            q, x, sigma: as soon as one pair comes without its sigma, the noise is estimated for all, and given sigmas
+                count relative to their median.
+            cov: instead of sigma: covariances [m²], (3, 3) or (n, 3, 3), if directions differ in accuracy: the depth of
+                one camera is far less certain than the position across the view.
+            common: (n, 3, k) [m], the errors caused by k unknowns shared by all pairs, at 1 sigma of each, such as
                 those of a camera's calibration. They are estimated with the chain and are not part of sigma or cov.
                 Compute them at predicted positions: measured ones would share their noise with the pairs.
 
@@ -256,15 +257,15 @@ class RigidLearner(Model):
         self._fit = None
 
     def weigh(self, stated: ArrayLike) -> None:
-        """Weigh each direction of the learnt pairs by what is stated of it, as far as the residuals confirm it.
+        """Weight each direction of the learnt pairs by its stated covariance, as far as the residuals confirm it.
 
-        The noise is estimated as if none had been given. Where every stated covariance is isotropic, nothing changes.
+        The noise is estimated as if none had been given. If every stated covariance is isotropic, nothing changes.
 
         Args:
-            stated: covariances (n, 3, 3) [m²] of the learnt positions; NaN where a pair has none.
+            stated: covariances (n, 3, 3) [m²] of the learnt positions; NaN for a pair without one.
 
         Raises:
-            ShapeError: they are of other pairs.
+            ShapeError: they belong to other pairs.
         """
         told = numbers("stated", stated)
         if told.shape != (self.pairs, 3, 3):
@@ -288,7 +289,7 @@ class RigidLearner(Model):
         return self._parameters.jacobian(self.belief.mean, q)
 
     def estimate(self, q: ArrayLike) -> Estimate:
-        """Return positions with their uncertainty; what the given noise does not explain is added to sigma."""
+        """Return positions with their uncertainty; residuals beyond the given noise are added to sigma."""
         angles = rows_or_vector("q", q, self.joints)
         fit = self._fitted()
         x, variance = self.belief.predict_with_variance(np.atleast_2d(angles))

@@ -48,7 +48,7 @@ class _Settings:
 
 
 class RigidWindow:
-    """Keeps at most `size` pairs. Older ones are folded: linearised at a fit that also used the pairs after them.
+    """Window of at most `size` pairs. Older ones are folded: linearised at a fit that also used the pairs after them.
 
     Raises:
         SettingError: size below 16.
@@ -182,11 +182,11 @@ _COUNTS = ("pairs", "window", "due")
 
 
 class RecursiveRigidLearner(Model):
-    """Corrects a rigid chain with each pair at once, and keeps a bounded number of pairs for refits.
+    """Learner that corrects a rigid chain with each pair, and keeps a bounded number of pairs for refits.
 
-    The parameters and the prior are those of `RigidLearner`. A filter takes each pair as it comes. At growing intervals
-    the kept pairs are refitted as in `RigidLearner`. A refit judges outliers and noise in hindsight, and linearises all
-    pairs at the chain found. When the window is full, its older half is folded into a Gaussian.
+    The parameters and the prior are those of `RigidLearner`. A filter processes each pair as it comes. At growing
+    intervals the kept pairs are refitted as in `RigidLearner`. A refit re-evaluates outliers and noise, and linearises
+    all pairs at the chain found. When the window is full, its older half is folded into a Gaussian.
 
     Cost with 7 joints: a pair takes 5 µs compiled, 0.27 ms in NumPy, and its share of the refits 0.1 ms once the window
     has filled. A refit takes 5 to 50 ms. Lists, other types than float64 and rows of one pair take 10 µs more.
@@ -194,9 +194,9 @@ class RecursiveRigidLearner(Model):
     Args:
         nominal: the nominal chain.
         tolerances: standard deviations of the real chain about it.
-        noise: initial 1-sigma of a coordinate where pairs come without their sigma [m]. From the eighth pair on it is
-            estimated from the pairs alone.
-        window: maximum number of kept pairs. Where the arm stays poorly determined for long, as on a guided path that
+        noise: initial 1-sigma of a coordinate of pairs without their sigma [m]. From the eighth pair on it is estimated
+            from the pairs alone.
+        window: maximum number of kept pairs. If the arm stays poorly determined for long, as on a guided path that
             moves one joint after the other, a long window is worth its memory (8 (d + 4) bytes a pair).
 
     Raises:
@@ -246,12 +246,12 @@ class RecursiveRigidLearner(Model):
 
     @property
     def chain(self) -> RigidChain:
-        """Chain as learnt."""
+        """Learnt chain."""
         return self._parameters.chain(self._filter.change)
 
     @property
     def noise(self) -> float:
-        """Estimated 1-sigma of a coordinate [m] of the pairs that came without theirs."""
+        """Estimated 1-sigma of a coordinate [m] of the pairs without their own."""
         return math.sqrt(self._filter.noise_square)
 
     @property
@@ -317,9 +317,9 @@ class RecursiveRigidLearner(Model):
     def estimate(self, q: ArrayLike) -> Estimate:
         """Return positions with their uncertainty.
 
-        Where the given noise does not explain the residuals of a refit, the excess is added to sigma everywhere.
-        Support is judged by the kept pairs, and by the most uncertain one of those before them. They are evaluated once
-        after each `learn` (5 ms at 1,000 kept pairs of 7 joints).
+        If the residuals of a refit exceed the given noise, the excess is added to sigma everywhere. Support is
+        determined by the kept pairs, and by the most uncertain one of those before them. They are evaluated once after
+        each `learn` (5 ms at 1,000 kept pairs of 7 joints).
         """
         angles = rows_or_vector("q", q, self.joints)
         x, variance = self._filter.with_variance(np.atleast_2d(angles))

@@ -85,7 +85,7 @@ class Descents:
     Args:
         q: joint angles (n, d) [rad, m].
         x: marker positions (n, 3) [m].
-        slides: True for each joint (d,) that slides.
+        slides: True for each prismatic joint (d,).
         size: spread of the positions [m].
     """
 
@@ -207,13 +207,13 @@ def find_chain(
 
     The pairs must be free of gross outliers. The search ends early when a start explains the pairs, exactly or, with
     `sigma`, up to the noise. Without sigma, noisy pairs use all the starts: local minima recur, so reaching one twice
-    proves nothing. What positions cannot determine (base and joint offsets apart from axes, the orientation of the
-    marker) is arbitrary in the result. Use it as the nominal chain of a learner.
+    proves nothing. Quantities that positions do not determine (base and joint offsets apart from axes, the orientation
+    of the marker) are arbitrary in the result. Use it as the nominal chain of a learner.
 
     Args:
         q: joint angles (n, d) [rad, m].
         x: marker positions (n, 3) [m].
-        prismatic: True for each joint (d) that slides; None: all turn.
+        prismatic: True for each prismatic joint (d); None if all are revolute.
         rng: random generator of the starts.
         starts: maximum number of random chains.
         sigma: noise of a coordinate [m], if known.

@@ -1,4 +1,4 @@
-"""Bends of an arm that no rigid chain has, and their evidence in pairs without a change."""
+"""Deflections (bends) of an arm that a rigid chain lacks, and their evidence in pairs without a change."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class Runs:
         """Return runs of pairs with these starts.
 
         Args:
-            angles: of all pairs (n, d).
+            angles: angles of all pairs (n, d).
             known: derivatives by the known parameters (n, 3, k).
             turning: derivatives by each joint, for a joint's own error of 1 (n, 3, d).
             errors: (n, 3).
@@ -120,7 +120,7 @@ class Bends:
     logs: FloatArray  # log probability of each (h,)
 
     def sums(self, rows: FloatArray) -> FloatArray:
-        """Return weighted products (h, p, p) of rows (m, 3, p) of runs, less the part of the known parameters."""
+        """Return weighted products (h, p, p) of rows (m, 3, p) of runs, minus the part of the known parameters."""
         turned = np.tensordot(self.axes.T, rows, axes=1)
         products = np.tensordot(self.weights, turned.transpose(0, 2, 1) @ turned, axes=1)
         common = self.known @ turned.reshape(-1, rows.shape[2])
@@ -128,7 +128,7 @@ class Bends:
 
 
 def log_evidence(runs: Runs) -> list[FloatArray]:
-    """Return the log evidence of bends in pairs between which nothing changed, for each length (h,).
+    """Return the log evidence of bends in pairs without a change between them, for each length (h,).
 
     Hypotheses are in the same order for all runs: each joints' own error with each noise with each size.
     """
@@ -249,10 +249,10 @@ def log_ratios_if_it_bends(
         angles: configurations (n, d) [rad, or for a prismatic joint the equivalent], at most `BendSettings.most_pairs`.
         errors: of a model that knows none of the pairs, in units of their noise (n, 3).
         known: their derivatives by the known parameters, whose prior is of variance 1 (n, 3, k).
-        turning: by each joint, such that 1 moves the marker by about the noise (n, 3, d).
-        changed: by the parameters that may change (n, 3, c).
+        turning: their derivatives by each joint, scaled so that 1 moves the marker by about the noise (n, 3, d).
+        changed: their derivatives by the parameters that may change (n, 3, c).
         places: the columns of `changed` of each kind of change.
-        sizes: of a change, 1-sigma of each number.
+        sizes: sizes of a change, 1-sigma of each number.
         suspected: the most probable onset if the arm is rigid.
         before: evidence of other pairs about bends, from `log_evidence_of_bends`.
 
@@ -291,9 +291,9 @@ def _compared(sums: FloatArray, places: Sequence[slice], sizes: FloatArray) -> F
     """Return the log ratios (h, kinds) of each kind of change to none.
 
     Args:
-        sums: of products of the derivatives by changes, and of the errors (h, p, p).
+        sums: sums of products of the derivatives by changes, and of the errors (h, p, p).
         places: the columns of each kind of change.
-        sizes: of a change, 1-sigma of each number.
+        sizes: sizes of a change, 1-sigma of each number.
     """
     information, score = sums[:, :-1, :-1], sums[:, :-1, -1]
     return np.stack([log_ratios(information[:, at, at], score[:, at], sizes) for at in places], axis=1)
@@ -312,7 +312,7 @@ def _without_outliers(errors: FloatArray) -> FloatArray:
 
 
 def _ages(pairs: int, share: float, longest: int) -> list[int]:
-    """Return ever larger ages, 1 to `pairs`, the last one included."""
+    """Return increasing ages, 1 to `pairs`, the last one included."""
     ages = [min(1, pairs)]
     while ages[-1] < pairs:
         ages.append(min(ages[-1] + max(1, min(int(share * ages[-1]), longest)), pairs))

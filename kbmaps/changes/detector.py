@@ -1,4 +1,4 @@
-"""Detection of a change from the errors of a model that was learnt before it."""
+"""Detection of a change from the errors of a model learnt before it."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Onsets:
 
     @property
     def weights(self) -> FloatArray:
-        """Number of pairs that each onset stands for (m,): itself and those after it that are no longer kept."""
+        """Number of pairs that each onset stands for (m,): itself and dropped ones after it."""
         onsets = self._onset[self._slots]
         return np.diff(np.append(onsets, self.pairs)).astype(np.float64)
 
@@ -124,16 +124,16 @@ class ChangeScore:
         """Return the first and last pair between which the change began, with this probability."""
         tail = 0.5 * (1.0 - probability)
         low, high = np.searchsorted(np.cumsum(self.shares), [tail, 1.0 - tail]).clip(max=len(self.onsets) - 1)
-        # Onsets that are no longer kept lie before the next one that is.
+        # Dropped onsets lie before the next one that is kept.
         return int(self.onsets[low]), int(
             self.onsets[min(high + 1, len(self.onsets) - 1)] - (high + 1 < len(self.onsets))
         )
 
 
 class ChangeDetector:
-    """Detects a change of the tool, the camera or a joint offset at an unknown pair, of an unknown size.
+    """Detector of a change of the tool, the camera or a joint offset at an unknown pair, of an unknown size.
 
-    The errors r of a model that knows none of the pairs are, with the derivatives J of its chain,
+    The errors r of a model not fitted to any of the pairs are, with the derivatives J of its chain,
 
         r_i = J_i (c + θ [i ≥ t]) + e_i
 
@@ -141,15 +141,15 @@ class ChangeDetector:
     change from pair t on. For each t that is kept and each kind, θ has a likelihood ratio (Willsky and Jones 1976,
     there maximised), averaged over sizes. Their sum over t is the statistic of Shiryaev and Roberts: without a change
     its expectation after n pairs is n. So it first exceeds A after at least A pairs on average (Pollak 1987, "Average
-    run lengths of an optimal method of detecting a change in distribution"), and after more because it then exceeds A
+    run lengths of an optimal method of detecting a change in distribution"), and later still because it then exceeds A
     by far.
 
     Args:
         belief: posterior of the chain from pairs before the first of these.
-        noise: of the whitened errors.
+        noise: noise of the whitened errors.
         noise_m: 1-sigma of a coordinate of one measurement [m]: the scale of small and large changes.
         distance_m: usual distance of the marker from the camera [m].
-        pairs_between_false_alarms: on average, at least.
+        pairs_between_false_alarms: lower bound of the mean number of pairs between false alarms.
     """
 
     def __init__(
@@ -201,25 +201,26 @@ class ChangeDetector:
     def surprises(self) -> FloatArray:
         """Whitened errors (n, 3) of the newest pairs, n at most `DetectorSettings.most_surprises`.
 
-        Each is against the prediction from the pairs before it. They are in units of the noise: the model's own
-        uncertainty is taken out.
+        Each is against the prediction from the pairs before it. They are in units of the noise, without the model's own
+        uncertainty.
         """
         return np.array(self._surprises).reshape(-1, 3)
 
     def add(self, q: FloatArray, errors: FloatArray, covariances: FloatArray) -> None:
-        """Add pairs that came after those that the model was fitted to, in their order.
+        """Add pairs later than those that the model was fitted to, in order.
 
         Args:
             q: configurations (n, d) [rad, m].
             errors: measured minus predicted (n, 3) [m].
-            covariances: of these errors: the measurement's, and the model's error beyond its belief (n, 3, 3) [m²].
+            covariances: covariances of these errors (n, 3, 3) [m²]: of the measurement, and of the model's error beyond
+                its belief.
         """
         for row in zip(*self._whitened(q, errors, covariances), strict=True):
             self._rows.append(row)
             self._add(*row[1:])
 
     def recall(self, q: FloatArray, errors: FloatArray, covariances: FloatArray) -> None:
-        """Set the pairs to which the belief was fitted, in their order: they show only how the arm bends.
+        """Set the pairs to which the belief was fitted, in order: they only show the arm's bends.
 
         Args:
             q: configurations (n, d) [rad, m].
@@ -296,7 +297,7 @@ class ChangeDetector:
         """Return the probability of a change if the arm may bend, before and after; at least one pair.
 
         The bends are those that the pairs make probable. It costs some hundred times as much as `suspicion`: use it
-        when that is an alarm.
+        only after its alarm.
         """
         angles, known, changed, errors = (np.array(each) for each in zip(*self._rows, strict=True))
         scale = 1.0 / math.sqrt(self._noise.single)

@@ -1,4 +1,4 @@
-"""Kinds of change of a running arm, the marker motion that each causes, and which one the pairs since then show."""
+"""Kinds of change of a running arm, the marker motion that each causes, and their identification from later pairs."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class KindSettings:
 def log_ratios(information: FloatArray, score: FloatArray, sizes: FloatArray) -> FloatArray:
     """Return the log likelihood ratio of a change θ ~ N(0, s² 1) to none, averaged over the sizes s, (m,).
 
-    With the information G and the score u = G θ̂ that a linear model has of θ, and in G's eigenvectors:
+    With a linear model's information G and score u = G θ̂ about θ, and in G's eigenvectors:
 
         log Λ_s = ½ Σ_j u_j² s² / (1 + s² g_j) − ½ Σ_j log(1 + s² g_j)
 
@@ -61,7 +61,7 @@ class ChangeKind:
 
     Attributes:
         name: `tool`, `camera`, `joint` or `other`.
-        joint: index of the joint (from 0) whose offset changed; else None.
+        joint: index of the joint (from 0) whose offset changed, otherwise None.
         columns: the parameters (k,) that change, as in `ChainParameters`.
         units: change of each that moves the marker by about a metre (k,) [rad/m, m/m].
         share: prior probability of this kind.
@@ -105,9 +105,9 @@ class Explanation:
 
     Attributes:
         kind: the part of the chain.
-        probability: of this kind.
-        change: of the kind's parameters, most probable (k,) [rad, m].
-        moved_m: motion of the marker that this causes at these pairs, root mean square [m].
+        probability: probability of this kind.
+        change: most probable change of the kind's parameters (k,) [rad, m].
+        moved_m: motion of the marker caused by it at these pairs, root mean square [m].
     """
 
     kind: ChangeKind
@@ -122,13 +122,13 @@ def explanations(
     """Return the probability of each kind of change, the most probable first.
 
     For each kind, the most probable change is fitted together with the chain's prior uncertainty. Its evidence is that
-    of a Gaussian around it (Laplace), averaged over the possible sizes of a change. So one parameter that fits as well
-    as three is more probable, and kinds that these pairs cannot separate stay undecided.
+    of a Gaussian around it (Laplace), averaged over the possible sizes of a change. So of two equally good fits, the
+    one with fewer parameters is more probable, and kinds that these pairs cannot separate stay undecided.
 
     Args:
         before: posterior of the chain from the pairs before the change.
         q: pairs since then, joint values (n, d) [rad, m].
-        x: the part of the measured positions (n, 3) [m] that the chain shall explain.
+        x: the part of the measured positions (n, 3) [m] that the chain must explain.
         noise_m: 1-sigma of a coordinate [m].
         shared: number of neighbours that carry as much information as one independent pair.
     """

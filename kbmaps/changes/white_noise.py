@@ -15,18 +15,18 @@ from kbmaps.variance_components import in_typical_units, most_probable_shares
 
 @dataclass(frozen=True, eq=False)
 class WhiteNoise:
-    """Variances of the error that each pair has by itself, not shared with its neighbours.
+    """Variances of each pair's independent error, which it does not share with its neighbours.
 
     A pair's error has the covariance
 
         a C + b 1 + Σ_j s_j² J_j J_jᵀ
 
     with the claimed covariance C of the measured position, and the derivatives J_j of the position by joint j: an
-    encoder's ticks move the predicted position along them, so the axes of the position err together.
+    encoder's ticks move the predicted position along them, so the errors of the axes are correlated.
 
     Attributes:
-        claimed: a, the factor by which the claimed covariance is too small; never below 1, as a camera's claimed error
-            may be shared by neighbours where the marker is partly hidden for a while.
+        claimed: a, the factor by which the claimed covariance is too small; never below 1, as neighbours may share a
+            camera's claimed error where the marker is partly hidden for a while.
         beside: b, the same on all axes [m²].
         joints: s_j², of the joints' readings (d,) [rad², m²].
     """
@@ -40,7 +40,7 @@ class WhiteNoise:
 
     @classmethod
     def as_claimed(cls, joints: int) -> Self:
-        """Return the noise that the camera claims, for this number of joints."""
+        """Return the noise claimed by the camera, for this number of joints."""
         return cls(1.0, 0.0, np.zeros(joints))
 
     @classmethod
@@ -49,12 +49,12 @@ class WhiteNoise:
 
         Maximum likelihood variances of Gaussian differences, by the MM algorithm of Zhou, Hu, Zhou and Lange (2019, "MM
         algorithms for variance components models"). It keeps variances positive and each step increases the likelihood.
-        With too few pairs, the noise is as claimed.
+        With too few pairs, the claimed noise is returned.
 
         Args:
-            errors: of a model's predictions (n, 3) [m], in the order of the pairs.
-            covariances: claimed of the measured positions (n, 3, 3) [m²].
-            derivatives: of the positions by the joints (n, 3, d) [m/rad, or 1 for a prismatic joint].
+            errors: errors of a model's predictions (n, 3) [m], in the order of the pairs.
+            covariances: claimed covariances of the measured positions (n, 3, 3) [m²].
+            derivatives: derivatives of the positions by the joints (n, 3, d) [m/rad, or 1 for a prismatic joint].
         """
         joints = derivatives.shape[2]
         if len(errors) - 1 < _Settings.fewest_a_variance * (joints + 2):
@@ -67,7 +67,7 @@ class WhiteNoise:
         spread, units = in_typical_units(spread, off)
         shares, likelihood = most_probable_shares(spread, off)
         of_camera, without_joints = most_probable_shares(spread[:, joints:], off)
-        # The errors of joints that turn in all directions resemble isotropic noise: they need evidence (Schwarz 1978).
+        # Errors of joints that rotate in all directions resemble isotropic noise: they need evidence (Schwarz 1978).
         if likelihood - without_joints < 0.5 * joints * np.log(3.0 * len(off)):
             shares = np.concatenate([np.zeros(joints), of_camera])
         variances = shares * units
@@ -104,9 +104,9 @@ class SharedNoise:
 
     Attributes:
         variances: n times the variance of the mean of n neighbours, for n = 1, 2, ... (m,); constant from there on. A
-            model's error may be the same all along a walk: a change has to be larger than that, however many pairs
-            show it.
-        whole: the same for all pairs of a long walk, where such errors have both signs.
+            model's error may be the same all along a walk: a change has to be larger than that, for any number of
+            pairs.
+        whole: the same for all pairs of a long walk, in which such errors have both signs.
     """
 
     variances: FloatArray
@@ -129,7 +129,7 @@ class SharedNoise:
         """Return the noise of unit-variance residuals that share a model's error with their neighbours.
 
         Args:
-            share: of the variance, due to the model's error.
+            share: share of the variance due to the model's error.
         """
         alike = 1.0 + share * np.arange(_Settings.longest_run if share > 0.0 else 1, dtype=np.float64)
         return cls(alike, 1.0 + share * (_Settings.usually_shared - 1))
@@ -138,10 +138,10 @@ class SharedNoise:
     def repeated(cls, share: float) -> SharedNoise:
         """Return the noise of unit-variance residuals of which a share may repeat for some neighbours.
 
-        A joint that turns by whole ticks from pair to pair, or hardly at all, is rounded in the same way each time.
+        A joint that moves by whole ticks from pair to pair, or hardly at all, is rounded the same way each time.
 
         Args:
-            share: of the variance, due to that rounding.
+            share: share of the variance due to that rounding.
         """
         alike = 1.0 + share * np.arange(_Settings.usually_shared, dtype=np.float64)
         return cls(alike, float(alike[-1]))

@@ -65,7 +65,7 @@ class Descent:
     q: FloatArray  # the configuration (d,)
     error: FloatArray  # the remaining error there [m]
     steps: int  # derivatives evaluated
-    ended: bool  # True if no step from there can lessen the error, or none is needed; False if the steps ran out
+    ended: bool  # True if no step from there can reduce the error, or none is needed; False if the steps ran out
 
 
 def descend(goal: Goal, start: FloatArray, joints: JointRange, max_steps: int) -> Descent:
@@ -101,7 +101,7 @@ def descend(goal: Goal, start: FloatArray, joints: JointRange, max_steps: int) -
 
 
 def _is_stuck(scaled_jacobian: FloatArray, error: FloatArray, q: FloatArray, joints: JointRange) -> bool:
-    """Return True if all motions that could lessen the error violate the limits, or are perpendicular to it."""
+    """Return True if all motions that could reduce the error violate the limits, or are perpendicular to it."""
     pull = scaled_jacobian.T @ error
     forbidden = ((q <= joints.lower) & (pull < 0.0)) | ((q >= joints.upper) & (pull > 0.0))
     reach = np.linalg.norm(scaled_jacobian, axis=0) * float(np.linalg.norm(error))
@@ -111,8 +111,8 @@ def _is_stuck(scaled_jacobian: FloatArray, error: FloatArray, q: FloatArray, joi
 def settle(goal: Goal, reached: Descent, posture: FloatArray, joints: JointRange, max_steps: int) -> Descent:
     """Move along the configurations that reach the goal, to the one locally nearest to `posture` in half ranges.
 
-    Each step projects the way to the posture into the null space (Liégeois 1977), then corrects the error from
-    curvature. Where that fails, or leads no nearer, half the step is tried.
+    Each step projects the way to the posture into the null space (Liégeois 1977), then corrects the error due to
+    curvature. If that fails, or leads no nearer, half the step is tried.
     """
     q, steps, portion = reached.q, reached.steps, 1.0
     error = reached.error
@@ -150,7 +150,7 @@ def bounded_step(
     """Return the step u (d,) that minimises ‖J u − e‖² + damping² ‖(u − preferred) / scale‖² within the bounds.
 
     Whitney 1969 with the damping of Wampler 1986 and Nakamura and Hanafusa 1986. An active-set method for least squares
-    with bounds (Stark and Parker 1995): joints are held at bounds, and released where that lessens the cost. The cost
+    with bounds (Stark and Parker 1995): joints are held at bounds, and released if that reduces the cost. The cost
     is strictly convex, so the method ends at the global optimum.
 
     Args:
@@ -174,7 +174,7 @@ def bounded_step(
         inside = np.clip(trial, low, high)
         passed = free & (inside != trial)
         if passed.any():
-            # As far towards the trial as the first bound.
+            # Go towards the trial as far as the first bound.
             portions = np.where(passed, (inside - step) / np.where(passed, trial - step, 1.0), 1.0)
             first = int(portions.argmin())
             step = np.clip(step + portions[first] * (trial - step), low, high)

@@ -77,15 +77,15 @@ class InverseSolution:
     """Joint values for one target, with the remaining error.
 
     Attributes:
-        q: joint values (d,) [rad, m] within the limits: of all that was found, the nearest to the target.
+        q: joint values (d,) [rad, m] within the limits: the nearest to the target of all that were found.
         x: the model's marker position there (3,) [m].
-        distance: from x to the target [m].
-        angle: between the orientation there and the target's [rad]; None without a target orientation.
+        distance: distance from x to the target [m].
+        angle: angle between the orientation there and the target's [rad]; None without a target orientation.
         converged: True if distance and angle are within the tolerance.
         reason: "reached"; "out_of_reach": no start leads to the target, and from q no small move leads nearer;
             "steps_ran_out": it may be in reach.
         steps: number of derivatives evaluated.
-        starts: number of configurations started from.
+        starts: number of initial configurations.
     """
 
     q: FloatArray
@@ -99,7 +99,7 @@ class InverseSolution:
 
 
 class InverseKinematics:
-    """Finds joint values for positions, or poses, of a model.
+    """Solver for joint values that reach positions, or poses, of a model.
 
     Resolved motion rate control (Whitney 1969), damped (Levenberg–Marquardt), within joint limits, from several starts:
     the given configuration, then samples of the whole range that come near the target, as far apart from each other as
@@ -111,14 +111,14 @@ class InverseKinematics:
             it.
         lower, upper: joint limits (d,) [rad, m]. A joint without a limit (infinite) may go anywhere; its samples are
             taken from one turn.
-        seed: of the samples.
+        seed: seed of the samples.
         samples: number of samples.
         starts: maximum number of starting configurations; None: 16 for a position, 48 for a pose.
-        max_steps: of all starts together; each takes about one evaluation of `model.jacobian`.
+        max_steps: maximum number of steps of all starts together; each takes about one evaluation of `model.jacobian`.
         tolerance, angle_tolerance: distance [m] and angle [rad] that count as reached.
 
     Raises:
-        SettingError: not such a model, lower limits above upper ones, or a setting that is not positive.
+        SettingError: unsuitable model, lower limits above upper ones, or a setting that is not positive.
         DegenerateDataError: the model has learnt too few pairs to predict.
 
     Example:
@@ -157,7 +157,7 @@ class InverseKinematics:
         )
         if not (low <= high).all():
             raise SettingError(f"joint {int((low > high).argmax()) + 1}'s lower limit is above its upper one")
-        # One turn where there are no limits, from the one there is or about 0.
+        # Without limits use one turn, from the existing limit or about 0.
         begin = np.where(np.isfinite(low), low, np.where(np.isfinite(high), high - 2.0 * np.pi, -np.pi))
         end = np.where(np.isfinite(high), high, begin + 2.0 * np.pi)
         half = 0.5 * (end - begin)
@@ -255,9 +255,9 @@ class InverseKinematics:
         return _Settings.pose_starts if isinstance(goal, PoseGoal) else _Settings.starts
 
     def _nearest(self, goal: PositionGoal | PoseGoal) -> IntArray:
-        """Return indices of the samples nearest to the goal, the nearest first."""
+        """Return indices of the samples nearest to the goal, in order."""
         count = min(_Settings.candidates * self._most_starts(goal), len(self._samples))
-        # Among some thousand points a search tree would not be faster.
+        # For some thousand points a search tree would not be faster.
         if isinstance(goal, PoseGoal):
             far = self._pose_features(goal.model) - _pose_features(goal.x, goal.rotation, goal.lever)
         else:

@@ -91,12 +91,12 @@ class KernelFit:
     Args:
         kernel: the product kernel.
         observations: the pairs.
-        precision: λ; "evidence" takes the most probable one; None explains the pairs exactly by the smallest
-            coefficients, where no pair contradicts another.
+        precision: λ; "evidence" selects the most probable one; None explains the pairs exactly by the smallest
+            coefficients, provided that no pair contradicts another.
 
     Attributes:
         precision: λ; 0 for the exact one.
-        noise_variance: s² of the scaled errors [m², or 1 where known].
+        noise_variance: s² of the scaled errors [m²; 1 if known].
         prior_variance: τ² of the map's coefficients [m²].
         log_evidence: log marginal likelihood at λ; None for the exact one.
 

@@ -84,11 +84,11 @@ def unpacked(fields: Any, arrays: Mapping[str, FloatArray], given: object | None
 
 
 class KeptPairs:
-    """Last pairs, with the predictions of the learner's prior model for them.
+    """The last pairs, with the predictions of the learner's prior model for them.
 
     Attributes:
-        q, x, sigma, behind: configurations (n, d), positions (n, 3), their 1-sigma (n,), NaN where unknown, and the
-            prior model's positions (n, 3).
+        q, x, sigma, behind: configurations (n, d), positions (n, 3), their 1-sigma (n,), NaN if unknown, and the prior
+            model's positions (n, 3).
         total: number of pairs so far.
     """
 
@@ -224,18 +224,18 @@ def slopes(model: Predictor, q: ArrayLike, bases: Sequence[JointBasis]) -> Float
 
 
 class KernelLearner(Model):
-    """Learns a KB-Map around a prior from n pairs with n² numbers instead of 3^d control points.
+    """Learner of a KB-Map around a prior from n pairs, with n² numbers instead of 3^d control points.
 
-    Gives the same solution as `ExactLearner` where both can be computed. Use this one for fewer pairs than control
+    Gives the same solution as `ExactLearner` if both can be computed. Use this one for fewer pairs than control
     points, and for more joints than a net has room for. The fit runs on first use after `learn`, at n³ / 3
     multiplications for each λ that is tried (0.3 s at 1,000 pairs). It depends only on the pairs that the memory keeps.
 
     Args:
         bases: the metric of "nearest to the prior"; scaled orthonormal ones (`learning_bases`) are advised.
-        prior: prediction far from all pairs: a `RigidChain`, a `KBMap`, or anything with `predict`, which must not
+        prior: prediction far from all pairs: a `RigidChain`, a `KBMap`, or any object with `predict`, which must not
             change meanwhile (`rebase`); None for the origin of the measurement frame.
-        precision: λ = (noise / standard deviation of the control points)² as in `ExactLearner.solve`; "evidence" takes
-            the most probable one; None explains noise-free pairs exactly, up to as many as there are control points.
+        precision: λ = (noise / standard deviation of the control points)² as in `ExactLearner.solve`; "evidence"
+            selects the most probable one; None explains noise-free pairs exactly, up to the number of control points.
         memory: the old pairs that count.
 
     Raises:
@@ -272,7 +272,7 @@ class KernelLearner(Model):
 
     @property
     def pairs(self) -> int:
-        """Number of learnt pairs, those that no longer count included."""
+        """Number of learnt pairs, including those that no longer count."""
         return self._pairs.total
 
     @property
@@ -324,7 +324,7 @@ class KernelLearner(Model):
         return math.sqrt(self._fitted().prior_variance)
 
     def learn(self, q: ArrayLike, x: ArrayLike, sigma: ArrayLike | None = None) -> None:
-        """Learn pairs; DegenerateDataError: more than control points, and no precision to weigh them."""
+        """Learn pairs. DegenerateDataError: there are more than control points, and no precision to weigh them."""
         angles, positions, sigmas = self._pairs.checked(q, x, sigma)
         kept = self._memory.kept(self.kept + len(angles))
         points = math.prod(basis.size for basis in self.bases)
@@ -342,13 +342,13 @@ class KernelLearner(Model):
         self._prior, self._fit = prior, None
 
     def estimate(self, q: ArrayLike) -> Estimate:
-        """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and True where data is near.
+        """Return positions at q (n, d), or (d,), their 1-sigma per axis against the truth, and True near data.
 
         Support has its own rule here: a configuration is in support if the pairs leave at most `SUPPORT_LIMIT` of its
-        prior variance. With fewer pairs than control points, each pair determines directions of its own and is known to
-        its noise alone. By the rule of `Estimate`, almost nothing except the pairs themselves would then be in support.
-        Where λ is so large that more than the limit remains even at the pairs, they are not in support either. Before
-        the first pair, sigma is infinite: only pairs can show the quality of the prior.
+        prior variance. With fewer pairs than control points, each pair determines independent directions and is known
+        to within its noise. By the rule of `Estimate`, almost nothing except the pairs themselves would then be in
+        support. If λ is so large that more than the limit remains even at the pairs, they are not in support either.
+        Before the first pair, sigma is infinite: only pairs can show the quality of the prior.
         """
         angles = rows_or_vector("q", q, self.joints)
         batch = np.atleast_2d(angles)
@@ -364,8 +364,8 @@ class KernelLearner(Model):
     def to_bytes(self) -> bytes:
         """Return the learner with the pairs that count.
 
-        A prior that is neither a `KBMap` nor a `RigidChain` is not stored. The one given in its place has to predict
-        the same at the pairs, up to rounding; elsewhere predictions differ as the priors do.
+        A prior that is neither a `KBMap` nor a `RigidChain` is not stored. A replacement has to predict the same at the
+        pairs, up to rounding; elsewhere predictions differ as the priors do.
         """
         behind, arrays = packable(self._prior)
         fields: dict[str, Any] = {

@@ -317,7 +317,7 @@ def check_net_size(bases: Sequence[JointBasis], outputs: int) -> None:
 
 
 def describe_bases(bases: Sequence[JointBasis]) -> list[list[Any]]:
-    """Return bases as JSON holds them: [kind, parameters...] each."""
+    """Return bases for JSON: [kind, parameters...] each."""
     return [[basis.kind, *basis.parameters] for basis in bases]
 
 

@@ -1,7 +1,7 @@
 """Choice of the prior's weight by cross-validation over blocks of pairs.
 
-Neighbouring pairs of a guided arm share their errors (time stamps, shading of the marker, backlash). The evidence
-assumes independent noise, and so mistakes shared errors for shape. A block of pairs that was left out as a whole
+Neighbouring pairs of a guided arm share their errors (timestamps, shading of the marker, backlash). The evidence
+assumes independent noise, and so mistakes shared errors for shape. A block of pairs that was held out as a whole
 shares none of its errors with the others.
 """
 
@@ -33,7 +33,7 @@ class BlockSettings:
 
 
 def follow_a_path(prior: KBMap, q: ArrayLike) -> bool:
-    """Return True if the configurations q (n, d) [rad, m], in their order, are neighbours on a path."""
+    """Return True if consecutive configurations q (n, d) [rad, m] are neighbours on a path."""
     left, right = BasisStack(prior.bases).halves(rows("q", q, len(prior.bases)))
     square = (left * left).sum(axis=1) * (right * right).sum(axis=1)
     inner = (left[:-1] * left[1:]).sum(axis=1) * (right[:-1] * right[1:]).sum(axis=1)
@@ -43,14 +43,14 @@ def follow_a_path(prior: KBMap, q: ArrayLike) -> bool:
 
 
 def blockwise_precision(prior: KBMap, q: ArrayLike, x: ArrayLike) -> float:
-    """Return the precision λ of the prior for `ExactLearner.solve` with the best predictions of left-out blocks.
+    """Return the precision λ of the prior for `ExactLearner.solve` with the best predictions of held-out blocks.
 
     The pairs are cut into runs of neighbours, and those of each run, at most `block_pairs`, are predicted from all
     other runs. Of the precisions that do this equally well, to one standard error, the largest is taken: the data do
     not require a more flexible map (Breiman et al., Classification and Regression Trees, 1984, section 3.4.3).
 
     Args:
-        prior: in the bases that the learner works in.
+        prior: the prior, in the bases of the learner.
         q, x: pairs in the order of recording, (n, d) [rad, m] and (n, 3) [m].
 
     Returns:
@@ -83,7 +83,7 @@ def _kernel(prior: KBMap, q: FloatArray) -> FloatArray:
 
 
 def _left_out_errors(kernel: FloatArray, errors: FloatArray, blocks: int, precisions: FloatArray) -> FloatArray:
-    """Return the mean distance between left-out positions and their predictions from all other blocks [m]: (λ, block).
+    """Return the mean distance between held-out positions and their predictions from all other blocks [m]: (λ, block).
 
     With C = K + λI, the errors of block B predicted from the others are ([C⁻¹]_BB)⁻¹ (C⁻¹ e)_B: Rasmussen and Williams,
     Gaussian Processes for Machine Learning, 2006, eq. (5.12), for blocks. One eigendecomposition of K serves all λ.

@@ -37,9 +37,9 @@ class NetKernel(Protocol):
 class FilterKernel(Protocol):
     """Compiled update of a `RigidFilter` with pairs, and linearisation of its chain.
 
-    `learn` returns the number of learnt pairs, the noise² and the number of coordinates that this rests on. `learn_one`
-    checks its pair and writes it to a row (d + 4). It returns None, and changes nothing, if the pair is not float64 of
-    the right shape, or invalid.
+    `learn` returns the number of learnt pairs, the noise² and the number of coordinates that this estimate rests on.
+    `learn_one` checks its pair and writes it to a row (d + 4). It returns None, and changes nothing, if the pair is not
+    float64 of the right shape, or invalid.
     """
 
     def learn(
@@ -116,7 +116,7 @@ def available() -> tuple[KernelPath, ...]:
 
 @contextmanager
 def using(path: KernelPath) -> Generator[None]:
-    """Create maps and learners on this path within the context, for good; for comparing the two.
+    """Create maps and learners on this path within the context; they keep it afterwards. For comparing the two paths.
 
     Raises:
         SettingError: there are no compiled kernels.
@@ -142,7 +142,7 @@ def net_kernel(stack: BasisStack, planes: FloatArray, check_q: Check, check_x: C
 
 
 def filter_kernel(*arrays: FloatArray) -> FilterKernel | None:
-    """Return the compiled loops of `RigidFilter`, if that is the path."""
+    """Return the compiled loops of `RigidFilter`; None on the NumPy path."""
     compiled = _chosen.get()
     return None if compiled is None else compiled.RigidFilter(*(np.ascontiguousarray(array) for array in arrays))
 

@@ -18,10 +18,10 @@ _BLOCK = 64
 
 
 class NumpyNet:
-    """Evaluates a net half by half: the weights of 3^d control points are never formed.
+    """Evaluator of a net, half by half: the weights of 3^d control points are never formed.
 
     Args:
-        stack: of the bases.
+        stack: stack of the bases.
         planes: the net (outputs · left_size, right_size): one row for each output and left weight, one column for each
             right weight. Shared, not copied; `step` and `replay` write to it.
         check_q: check of joint angles, a vector (d,) or also rows (n, d).

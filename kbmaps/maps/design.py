@@ -48,7 +48,7 @@ class Moments:
         self._sums[:] = 0.0
 
     def gram(self) -> FloatArray:
-        """Return a new Gram matrix (m, m), Fortran-ordered, of which only the upper triangle counts."""
+        """Return a new Gram matrix (m, m), Fortran-ordered; only its upper triangle is valid."""
         stack, split = self._stack, self._stack.split
         left = self._unfolded(np.eye(len(self._sums)), 0, split)
         right = self._unfolded(self._sums, split, stack.joints)
@@ -103,7 +103,7 @@ def _kronecker(factors: Sequence[FloatArray]) -> FloatArray:
 
 
 class Design:
-    """Matrix A (n, m) with the rows √weight · w(q)ᵀ, and the targets (n, outputs) likewise scaled.
+    """Matrix A (n, m) with the rows √weight · w(q)ᵀ, and the targets (n, outputs) scaled in the same way.
 
     A pair takes (d + outputs + 1) numbers, and a product with A costs as much as predictions; w(q) is a Kronecker
     product and never formed. The sums for AᵀA are updated block by block once there are more pairs than unknowns.

@@ -38,8 +38,8 @@ class LinearEvidence:
 
         −2 log p(y) = N log(2π s²) + Σ log(1 + γ / s²) + y₀ᵀ y₀ / s² + Σ a² / (s² + γ).
 
-    All terms are positive. Computed as a difference of yᵀ y and the part that β explains, the noise of a wide prior
-    would be rounding.
+    All terms are positive. If the noise of a wide prior were computed as the difference of yᵀ y and the part that β
+    explains, it would be lost in rounding.
     """
 
     count: float  # N, the number of coordinates of y; not whole where pairs are partly forgotten
@@ -59,7 +59,7 @@ class LinearEvidence:
         return -0.5 * (self.count * np.log(2.0 * np.pi * variances) + spread + misfit)
 
     def best_variance(self) -> float:
-        """Return the variance of the greatest evidence, found on ever finer grids of its logarithm."""
+        """Return the variance of the greatest evidence, found on successively finer grids of its logarithm."""
         mean = (self.unreached + float(np.square(self.along).sum())) / self.count
         if not len(self.eigenvalues):
             return max(mean, RobustSettings.variance_floor)
@@ -84,7 +84,8 @@ def most_evident(log_evidence: Callable[[float], float], start: float, low: floa
     three, unless that is next to the middle one.
 
     Args:
-        log_evidence: of a scale. If the search ends where it started, the best scale is the last one evaluated.
+        log_evidence: log evidence of a scale. If the search ends where it started, the best scale is the last one
+            evaluated.
         start: first scale; clipped to the limits.
         low, high: limits of the scale.
     """

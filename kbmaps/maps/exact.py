@@ -41,7 +41,7 @@ class ExactSettings:
 def nearest_solution(design: Design, errors: FloatArray) -> FloatArray:
     """Return the smallest change (m, outputs) of the coefficients that explains errors (n, outputs) best.
 
-    Uses Cholesky factors of the Gram matrix where they suffice. Refinement through the pairs then matches a QR
+    Uses Cholesky factors of the Gram matrix if they suffice. Refinement through the pairs then matches a QR
     factorisation (corrected seminormal equations, Björck 1987), at a tenth of its cost.
     """
     gram = ShiftedGram(design.gram())
@@ -113,12 +113,12 @@ class ExactSolution:
     """Fitted map with the quality of the fit.
 
     Attributes:
-        map: in the bases of the learner's prior.
-        noise_std: estimated noise of one coordinate at weight 1 [m]; None where the data do not determine it.
+        map: the map, in the bases of the learner's prior.
+        noise_std: estimated noise of one coordinate at weight 1 [m]; None if the data do not determine it.
         orientation_noise_std: the same of one entry of the rotation matrices; None also without orientations.
         prior_precision: λ = (noise_std / spread of the prior's coefficients)²; 0 for the unregularised solution.
-        log_evidence: log marginal likelihood of all that was learnt at λ; None for the unregularised solution.
-        residual_rms: weighted RMS distance between the map's positions and those it was fitted to [m].
+        log_evidence: log marginal likelihood of all learnt pairs at λ; None for the unregularised solution.
+        residual_rms: weighted RMS distance between the map's positions and the fitted ones [m].
     """
 
     map: KBMap
@@ -132,7 +132,7 @@ class ExactSolution:
     def prior_std(self) -> float | None:
         """Standard deviation of the coefficients around the prior [m]; None for the unregularised solution.
 
-        Times `SupportSet.spread` (in the learner's bases) it is the 1-sigma of a predicted coordinate.
+        Multiplied by `SupportSet.spread` (in the learner's bases) it is the 1-sigma of a predicted coordinate.
         """
         if self.noise_std is None or self.prior_precision == 0.0:
             return None
@@ -144,7 +144,7 @@ class _Fit:
     """Fit at one λ before refinement, with its evidence and the noise variances of positions and of orientations.
 
     The solution is the change of the coefficients (m, outputs). With fewer pairs than unknowns, it is the multipliers
-    (n, outputs) that the change comes from. `remaining` (n, outputs) holds the residuals, in the first case only.
+    (n, outputs) from which the change follows. `remaining` (n, outputs) holds the residuals, in the first case only.
     """
 
     precision: float
@@ -155,17 +155,17 @@ class _Fit:
 
 
 class ExactLearner:
-    """Collects pairs, and solves for the map on demand.
+    """Learner that collects pairs, and solves for the map on demand.
 
-    The pairs are kept as they came. With more of them than control points, so are the sums for their Gram matrix. The
+    The pairs are kept unchanged. If there are more than control points, so are the sums for their Gram matrix. The
     prior is part of neither, so it may change (`rebase`). At d = 7 a pair takes 88 bytes, 6 µs to learn and 5 µs of
-    each solve. The rest of a solve is one Cholesky factorisation of at most (3^d)², within 8 · 9^d bytes (38 MB). Where
+    each solve. The rest of a solve is one Cholesky factorisation of at most (3^d)², within 8 · 9^d bytes (38 MB). If
     the data are too one-sided for it, the solution comes from a QR factorisation of all pairs: exact, and slow.
 
     Args:
         prior: the solution in the directions that the data do not determine. If it has an orientation, that is learnt
-            too: its nine planes have a noise of their own and share λ with the position's.
-        bases: the bases of the solution, and so the metric of "nearest to the prior". None takes the prior's. Scaled
+            too: its nine planes have a separate noise and share λ with the position's.
+        bases: the bases of the solution, and so the metric of "nearest to the prior". None for the prior's. Scaled
             orthonormal bases over the joints' ranges (`learning_bases`) are advised.
         memory: treatment of old pairs; all count by default.
 
@@ -252,9 +252,9 @@ class ExactLearner:
         """Return the map for all pairs so far.
 
         Args:
-            prior_precision: None: least squares without regularisation; where the pairs do not determine it, the
-                solution nearest to the prior in the learner's bases. λ > 0: minimises Σ weight ‖f(q) − x‖² + λ ‖g −
-                g0‖² over the coefficients g, the posterior mean for a Gaussian prior of variance noise² / λ around g0.
+            prior_precision: None: least squares without regularisation; if the pairs do not determine it, the solution
+                nearest to the prior in the learner's bases. λ > 0: minimises Σ weight ‖f(q) − x‖² + λ ‖g − g0‖² over
+                the coefficients g, the posterior mean for a Gaussian prior of variance noise² / λ around g0.
                 "evidence": λ of the greatest marginal likelihood.
 
         Raises:
@@ -301,7 +301,8 @@ class ExactLearner:
     def _fit(self, gram: ShiftedGram, errors: FloatArray, rhs: FloatArray, precision: float) -> _Fit:
         """Fit at λ, with its evidence. The errors of one coordinate are N(0, s² (A Aᵀ / λ + I)).
 
-        With fewer pairs than unknowns through A Aᵀ, else through AᵀA, of the same determinant except for powers of λ.
+        With fewer pairs than unknowns through A Aᵀ, otherwise through AᵀA, which has the same determinant except for
+        powers of λ.
         """
         if not gram.factorise(precision):
             raise SettingError(f"prior_precision = {precision:.3g} is below rounding here; use None or a larger one")

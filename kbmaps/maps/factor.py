@@ -11,7 +11,7 @@ from kbmaps.arrays import FloatArray
 class RowFactor:
     """Rows A (k, m) and targets (k, outputs) of a least-squares problem, never more of them than unknowns.
 
-    Up to m rows are kept as they come. From then on A is their triangular QR factor, into which later rows are folded:
+    Up to m rows are kept unchanged. After that A is their triangular QR factor, into which later rows are folded:
     for every g, the squares of A g − targets stay the sum over all rows ever added, up to a constant that no g changes.
     Memory and cost per row stay constant. No normal equations are formed, so no digits are lost to squaring the
     condition number. Inputs are not checked.
@@ -52,13 +52,13 @@ class RowFactor:
 
 
 class ShiftedGram:
-    """Factorises K + λ I for one λ after the other, within K's own buffer.
+    """Factorisation of K + λ I for one λ after the other, within K's own buffer.
 
-    The Cholesky factor lives in the lower triangle and the diagonal, K itself in the upper one and a copy of its
+    The Cholesky factor is in the lower triangle and the diagonal, K itself in the upper one and a copy of its
     diagonal.
 
     Args:
-        gram: K (k, k), Fortran-ordered, positive semidefinite; the upper triangle counts. Taken over, not copied.
+        gram: K (k, k), Fortran-ordered, positive semidefinite; only the upper triangle is read. Taken over, not copied.
     """
 
     _COPY_COLUMNS = 64

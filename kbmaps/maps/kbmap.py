@@ -26,14 +26,14 @@ POSE_OUTPUTS = 12
 
 @dataclass(frozen=True, eq=False)
 class KBMap:
-    """Position (and orientation, when learnt) of the marker in the measurement frame, of d joints.
+    """Position (and orientation, if learnt) of the marker in the measurement frame, of d joints.
 
     f(q) = Σ_i w_i(q) b_i with w = w_1(q_1) ⊗ … ⊗ w_d(q_d). Ulbrich et al. 2009, eqs. (10) and (15).
 
     Attributes:
         bases: one basis per joint, in the order of q.
         net: the coefficients as planes (outputs, m1, ..., md), m = 3 for a revolute joint and 2 for a prismatic one;
-            control points [m] where the bases are Bernstein. Read-only. Outputs 0..2 are the position x, y, z [m];
+            control points [m] if the bases are Bernstein. Read-only. Outputs 0..2 are the position x, y, z [m];
             a map of 12 outputs continues with the columns e1, e2, e3 of the marker's rotation matrix.
         metadata: short texts stored with the map; not part of `digest`.
 
@@ -171,7 +171,7 @@ class KBMap:
 
         Args:
             alpha: α [rad], one for all revolute joints or one per joint (d,); prismatic joints keep their Bézier basis.
-            centre: the angle that −α and α are counted from [rad], likewise.
+            centre: origin of −α and α [rad], likewise.
 
         Raises:
             BasisError: an α that is not within 0..180 degrees (SingularAlphaError: within 80..100).
@@ -269,7 +269,7 @@ def pose_targets(positions: FloatArray, rotation: ArrayLike | None, outputs: int
     Args:
         positions: checked positions (n, 3) [m].
         rotation: (n, 3, 3), or unit quaternions x, y, z, w (n, 4); for one pair also (3, 3) or (4,).
-        outputs: of the map.
+        outputs: number of outputs of the map.
 
     Raises:
         SettingError: a rotation for a map of positions, or none for a map of poses.

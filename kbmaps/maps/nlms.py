@@ -23,12 +23,12 @@ from kbmaps.packed import complete, count, named, number, or_infinite, pack, res
 class StepSize:
     """Step size μ(t) = max(floor, mu0 / (1 + t / decay)) after t pairs: constant unless a decay is given.
 
-    Any μ between 0 and 2 is stable. A constant one leaves noise of about 1.6 σ √(μ / (2 − μ)) in the map. One that
-    decays averages the noise down to the level of the floor, and the floor keeps the map able to follow changes.
+    Any μ between 0 and 2 is stable. A constant one leaves noise of about 1.6 σ √(μ / (2 − μ)) in the map. A decaying
+    one averages the noise down to the level of the floor, and the floor keeps the map able to follow changes.
 
     Attributes:
         mu0: share of the first error that is corrected.
-        decay: number of pairs after which it is half of that; infinity for never.
+        decay: number of pairs after which μ is half of mu0; infinity for never.
         floor: lower bound of μ.
 
     Raises:
@@ -62,10 +62,10 @@ _KIND = "nlms, 1"
 
 
 class NLMS:
-    """Moves the control points with each new pair by the smallest step that corrects the share mu0 of its error.
+    """Learner that moves the control points by the smallest step that corrects the share mu0 of each pair's error.
 
-    Learns the outputs of the map it starts from, position or position and orientation, in that map's bases; scaled
-    orthonormal ones (`learning_bases`) are advised.
+    Learns the outputs of its initial map, position or position and orientation, in that map's bases; scaled orthonormal
+    ones (`learning_bases`) are advised.
 
     Args:
         kbmap: the map to start from.
@@ -148,14 +148,14 @@ class NLMS:
     def replay(
         self, q: ArrayLike, x: ArrayLike, order: ArrayLike | None = None, rotation: ArrayLike | None = None
     ) -> None:
-        """Take steps for the pairs q (n, d) [rad], x (n, 3) [m] in the sequence `order` (indices), or as they stand.
+        """Take steps for the pairs q (n, d) [rad], x (n, 3) [m] in the sequence `order` (indices), or as they are.
 
         Equal to `learn` on each of them up to rounding, at a fraction of its cost.
 
         Args:
             q: joint angles (n, d) [rad].
             x: marker positions (n, 3) [m].
-            order: indices of the pairs; None: each once, in their order.
+            order: indices of the pairs; None: each once, in order.
             rotation: the orientations, (n, 3, 3) or quaternions (n, 4), as for `learn`.
 
         Raises:
@@ -169,7 +169,7 @@ class NLMS:
         self._pairs += len(sequence)
 
     def to_bytes(self) -> bytes:
-        """Return the learner's state; a learner restored by `from_bytes` continues to the last bit as this one."""
+        """Return the learner's state; a learner restored by `from_bytes` continues identically to the last bit."""
         settings = self._step_size
         fields: dict[str, Any] = {
             "bases": describe_bases(self._bases),

@@ -73,7 +73,7 @@ def _parse_header(header: bytes) -> tuple[tuple[JointBasis, ...], int, dict[str,
 
 
 def _listed(entry: Any) -> list[Any]:
-    """Return a basis of the header as `parse_bases` reads it."""
+    """Return a basis of the header in the form of `parse_bases`."""
     fields = named(entry, "a basis", ("kind", "parameters"))
     kind = fields["kind"]
     if not isinstance(kind, str) or kind not in PARAMETER_NAMES:

@@ -16,7 +16,7 @@ _FIRST, _SECOND = np.array([[0, 0, 1], [0, 1, 1]])
 
 
 class BasisStack:
-    """Evaluates all joints at once and keeps the weight vector factored into a left and a right half.
+    """Evaluator of all joints at once that keeps the weight vector factored into a left and a right half.
 
     The full weight vector is kron(left, right). With about as many joints on either side, both are of length 3^(d/2),
     so contracting a net of 3^d control points with them needs no vector of length 3^d. Inputs are not checked: callers

@@ -102,7 +102,7 @@ class SupportSet:
         return True
 
     def unexplained(self, q: ArrayLike) -> float | FloatArray:
-        """Return the share in [0, 1] of the prior variance at q (d,) that the data leave; (n,) for q (n, d)."""
+        """Return the share in [0, 1] of the prior variance at q (d,) that remains after the data; (n,) for q (n, d)."""
         angles = rows_or_vector("q", q, self._stack.joints)
         left, right = self._normalised(angles)
         if angles.ndim == 1:
@@ -115,8 +115,8 @@ class SupportSet:
     def spread(self, q: ArrayLike) -> float | FloatArray:
         """Return the standard deviation of a predicted coordinate at q (d,), or (n,) for q (n, d).
 
-        For coefficients of prior standard deviation 1. Times `ExactSolution.prior_std` it is the 1-sigma [m] that the
-        fit leaves.
+        For coefficients of prior standard deviation 1. Multiplied by `ExactSolution.prior_std` it is the 1-sigma [m]
+        after the fit.
         """
         angles = rows_or_vector("q", q, self._stack.joints)
         left, right = self._stack.halves(angles)

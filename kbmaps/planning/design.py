@@ -35,7 +35,7 @@ class Posterior(Protocol):
 
     @property
     def floor(self) -> float:
-        """Error of a coordinate that remains with any number of pairs, 1-sigma [m]; 0 where the model fits."""
+        """1-sigma of the error of a coordinate that remains with any number of pairs [m]; 0 if the model fits."""
         ...
 
     def roots(self, q: ArrayLike) -> FloatArray:
@@ -49,7 +49,7 @@ class ChainPosterior:
     Args:
         nominal: the chain that the parameters change.
         change: linearisation point (size,) as in `ChainParameters`.
-        covariance: of the change (size, size) [rad², m²].
+        covariance: covariance of the change (size, size) [rad², m²].
         noise: 1-sigma of a coordinate of a further pair [m].
         floor: 1-sigma of a coordinate that no rigid chain explains [m].
 
@@ -75,15 +75,15 @@ class ChainPosterior:
 
     @classmethod
     def of(cls, learner: RigidLearner | RecursiveRigidLearner, *, noise: float | None = None) -> ChainPosterior:
-        """Return the posterior of a learner. Its floor is 0 unless the pairs' given noise does not explain them.
+        """Return the posterior of a learner. Its floor is 0 unless the residuals exceed the pairs' given noise.
 
         Args:
-            learner: the learner, which may go on learning.
-            noise: 1-sigma of a coordinate of further pairs [m]; None takes that of the pairs so far. A recursive
-                learner knows only the noise of pairs that came without their sigma.
+            learner: the learner, which may continue to learn.
+            noise: 1-sigma of a coordinate of further pairs [m]; None for that of the pairs so far. A recursive learner
+                knows only the noise of pairs without their own sigma.
 
         Raises:
-            DegenerateDataError: no noise was given and the learner has none, being without pairs.
+            DegenerateDataError: no noise was given, and the learner has no pairs to estimate it.
             SettingError: noise is not positive.
         """
         floor = 0.0
@@ -136,7 +136,7 @@ class _Settings:
 
 
 class ExperimentDesign:
-    """Uncertainty over a region as pairs are added whose measurement is not known yet.
+    """Uncertainty over a region after adding pairs whose measurement is not known yet.
 
     The uncertainty of a model linear in its parameters depends only on the poses, not on the measurements (Fedorov
     1972), so it can be predicted. Poses are given by their `roots`, as in `Posterior.roots`.
@@ -213,7 +213,7 @@ class ExperimentDesign:
 
 
 class _Exchange:
-    """Improves a pose within limits, one joint at a time."""
+    """Improver of a pose within limits, one joint at a time."""
 
     def __init__(self, design: ExperimentDesign, posterior: Posterior, lower: ArrayLike, upper: ArrayLike) -> None:
         self._design, self._posterior = design, posterior
@@ -258,7 +258,7 @@ def next_poses(
 ) -> FloatArray:
     """Return poses (count, d) to measure together before the model is updated.
 
-    Each is the best after those before it, and no candidate is taken twice. With `limits`, as in `next_pose`, each is
+    Each is the best given those before it, and no candidate is taken twice. With `limits`, as in `next_pose`, each is
     then improved in the presence of all others: a joint plan for many pairs is better than repeating `next_pose`.
 
     Raises:

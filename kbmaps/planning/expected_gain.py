@@ -39,7 +39,7 @@ class Forecast:
         now: expected mean error [m].
         least: the part of it [m] that no pair reduces, since the model cannot follow the arm.
         pairs: requested numbers of further pairs.
-        motions: their expected errors, the motion that gains most first.
+        motions: expected errors of the motions, the one that gains most first.
     """
 
     now: float
@@ -117,7 +117,7 @@ def candidate_motions(
         seen: poses (n, d) of the pairs so far [rad, m].
         lower, upper: the joints' limits (d,).
         rng: random generator of the poses.
-        names: of the joints; None counts them from 1.
+        names: names of the joints; None counts them from 1.
         together: number of joints that the other motions move.
         count: number of poses per motion.
 

@@ -99,7 +99,7 @@ class GroupedModel:
     are 0 and their variances are estimated: groups that the evidence (MacKay 1992) does not support are left out.
 
     Args:
-        moments: over the columns of all groups.
+        moments: moments over the columns of all groups.
         columns: the columns of each group.
         centre: prior mean of the weights of the group "".
         least_noise: lower bound of the noise [rows' unit].
@@ -189,7 +189,7 @@ class GroupedModel:
             self.settle()
 
     def average(self, candidates: Sequence[str]) -> Average:
-        """Return the average over the active groups and all sets that differ by one group less, more, or exchanged.
+        """Return the average over the active groups and all sets that differ by one group removed, added, or exchanged.
 
         Weighted by evidence and prior odds of e^−price per group. Hoeting et al., "Bayesian model averaging",
         Statistical Science 14, 1999; improbable models are left out (Occam's window there).
@@ -253,7 +253,7 @@ class GroupedModel:
         return (square + rows * before**2) / max(self._moments.count - used + rows, 1.0)
 
     def _try(self, group: str, variance: float) -> None:
-        """Add a group unless left-out blocks contradict it."""
+        """Add a group unless held-out blocks contradict it."""
         before, errors = (dict(self.variances), self.noise), self._left_out_errors()
         self.variances[group] = variance
         self.settle()
@@ -287,9 +287,9 @@ class GroupedModel:
         return True
 
     def _gain(self, group: str, active: Mapping[str, float], posterior: Posterior) -> tuple[float, float]:
-        """Return the evidence that a group adds at its best variance, and that variance; all else stays.
+        """Return the evidence that a group adds at its best variance, with everything else fixed, and that variance.
 
-        With the rows' part of the group that the active columns do not explain, S = U Λ Uᵀ and z, the gain is
+        With the part of the group's rows that the active columns do not explain, S = U Λ Uᵀ and z, the gain is
         ½ Σ (v y² / (1 + v λ) − ln (1 + v λ)), y = Uᵀ z.
         """
         index = self.index(active)

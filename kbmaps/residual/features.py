@@ -48,7 +48,7 @@ class Linearised:
 
 @dataclass(frozen=True, eq=False)
 class ResidualScaling:
-    """Scaling that makes features of the order of 1 at the data, and the place of the last load on the hand.
+    """Scaling that makes features of the order of 1 at the data, and the position of the last load on the hand.
 
     Raises:
         SettingError: a range or the spread is not positive.
@@ -94,8 +94,8 @@ class ResidualFeatures:
     with the chain f at the change c, the angle groups' φ, and ψ of p (camera groups) or of q (smooth groups).
 
     Args:
-        parameters: of the chain.
-        scaling: of the features.
+        parameters: parameters of the chain.
+        scaling: scaling of the features.
     """
 
     def __init__(self, parameters: ChainParameters, scaling: ResidualScaling) -> None:
@@ -127,9 +127,9 @@ class ResidualFeatures:
         return tuple(group for group in groups if group in self._still)
 
     def follow_a_path(self, q: FloatArray) -> bool:
-        """Return True if configurations (n, d), in their order, are neighbours on a path.
+        """Return True if consecutive configurations (n, d) are neighbours on a path.
 
-        Judged by functions that are scaled to the configurations' reach.
+        The criterion uses functions that are scaled to the configurations' reach.
         """
         weights = self._stack.joint_weights(q)
         inner, square = np.einsum("nkm,nkm->nk", weights[:-1], weights[1:]), np.square(weights).sum(axis=2)
@@ -166,7 +166,7 @@ class ResidualFeatures:
     ) -> tuple[FloatArray, dict[str, FloatArray]]:
         """Return offsets of the readings (n, d) [rad, m], and φ (n, d, m) of the angle groups weighted or requested.
 
-        Torques are evaluated where the joints have yielded to the torques of the readings.
+        Torques are evaluated after the joints have deflected under the torques at the readings.
         """
         names = [g for g in (*READING_GROUPS, *self._still) if g in weights or g in groups]
         shapes = {group: self._reading_functions(group, q) for group in names if group in READING_GROUPS}
@@ -184,7 +184,7 @@ class ResidualFeatures:
         return error + self._weighted(torques, weights, q), {**shapes, **torques}
 
     def _weighted(self, shapes: Weights, weights: Weights, q: FloatArray) -> FloatArray:
-        """Return Σ_m φ_jm w_jm over those groups that have weights (n, d)."""
+        """Return Σ_m φ_jm w_jm over the groups that have weights (n, d)."""
         total = np.zeros_like(q)
         for group, functions in shapes.items():
             if group in weights:
@@ -204,7 +204,7 @@ class ResidualFeatures:
         return total
 
     def _mask(self, group: str) -> BoolArray:
-        """Return True for each of a group's functions (d, m) that exists."""
+        """Return the mask (d, m) of a group's functions that exist."""
         if group in self._still:
             return self._loads[group]
         if group == "gain":

@@ -43,7 +43,7 @@ class _Settings:
 
 
 def innovations(series: FloatArray, correlation: float) -> FloatArray:
-    """Return a series (n, ...) with first-order autoregressive errors, freed of the correlation with the entry before.
+    """Return a series (n, ...) with first-order autoregressive errors, without the correlation with the previous entry.
 
     e_k = ρ e_{k−1} + √(1 − ρ²) fresh_k. The result has independent errors of the same size: Prais and Winsten 1954.
     """
@@ -81,7 +81,7 @@ class ResidualFit:
 
     model: ResidualModel  # the fitted model
     noise: float  # estimated noise over unit; at least 1 where the units are the noise
-    freedom: float  # residual coordinates minus those that all weights have used up
+    freedom: float  # residual coordinates minus the effective number of all weights
     shared: float  # correlation of the errors of neighbours on a path; 0 where pairs are apart
     inliers: BoolArray  # True for each pair (n,) that is not an outlier
     groups: tuple[str, ...]  # supported by the pairs or part of the prior; the model averages over others too
@@ -158,7 +158,7 @@ class _Fitter:
         return tuple(dict.fromkeys((*self._known, *self.variances)))
 
     def _considered(self) -> tuple[str, ...]:
-        """Return groups with no more features than coordinates; the largest only if the one before is active."""
+        """Return groups with no more features than coordinates; the largest only if the previous one is active."""
         coordinates = 3 * int(self.inliers.sum())
         if self._on_path and coordinates < _Settings.fewest_on_path:
             return tuple(self.variances)
@@ -273,7 +273,7 @@ class _Fitter:
 
 
 def fit_residual(prior: ResidualModel, pairs: Pairs, change: FloatArray) -> ResidualFit | None:
-    """Fit around the most probable rigid chain, at `change`; return None if nothing supports more than that."""
+    """Fit around the most probable rigid chain, at `change`; return None if only a rigid chain is supported."""
     fitter = _Fitter(prior, pairs, change)
     for turn in range(_Settings.rounds):
         length = fitter.step(turn < _Settings.selections)
@@ -295,7 +295,7 @@ def fit_residual(prior: ResidualModel, pairs: Pairs, change: FloatArray) -> Resi
 
 
 def _moments(design: FloatArray, target: FloatArray, correlation: float) -> Moments:
-    """Return the moments of rows (n, 3, P) and targets (n, 3), freed of the correlation of neighbours."""
+    """Return the moments of rows (n, 3, P) and targets (n, 3), without the correlation of neighbours."""
     return Moments.of(
         innovations(design, correlation).reshape(-1, design.shape[2]), innovations(target, correlation).ravel()
     )

@@ -32,22 +32,22 @@ _LEAST_FREEDOM = 10.0
 
 
 class ResidualLearner(Model):
-    """Fits a rigid chain around a nominal one, and smooth deviations from it where the pairs support them.
+    """Learner of a rigid chain around a nominal one, and of smooth deviations from it as far as the pairs support them.
 
     Deviations come in groups: eccentric encoders, gear gains, compliant joints, a distorting camera, and smooth
     functions of one to three joints. The chain's tolerances and each group's variance are the prior; the variances are
     those that make the pairs most probable. The prediction averages over the sets of groups that are about as probable
-    as the best. Where the pairs support no group, it equals `RigidLearner` to a fraction of its sigma. Where no set
-    with a group comes near in probability, as without noise, it is equal to the last bit.
+    as the best. If the pairs support no group, it equals `RigidLearner` to a fraction of its sigma. If no set with a
+    group comes near in probability, as without noise, it is equal to the last bit.
 
     Args:
         nominal: the nominal chain, or one found by `find_chain`.
         tolerances: standard deviations of the real chain about it.
-        prior: Gaussian prior, where more is known than the tolerances: of the same chain, or of its deviations too. Use
-            it to continue with another tool: `learner.model.with_other_tool(0.2)`.
+        prior: Gaussian prior of the same chain, or of its deviations too, if more than the tolerances is known. Use it
+            to continue with another tool: `learner.model.with_other_tool(0.2)`.
 
     Raises:
-        ShapeError: the prior is one of another chain.
+        ShapeError: the prior belongs to another chain.
     """
 
     def __init__(
@@ -109,7 +109,7 @@ class ResidualLearner(Model):
         self._model = self._fit = None
 
     def weigh(self, stated: ArrayLike) -> None:
-        """Weigh each direction of the learnt pairs by what is stated of it, as `RigidLearner.weigh` does."""
+        """Weight each direction of the learnt pairs by its stated covariance, like `RigidLearner.weigh`."""
         self._rigid.weigh(stated)
         self._model = self._fit = None
 
@@ -121,7 +121,7 @@ class ResidualLearner(Model):
         return self._rigid.jacobian(q) if self._is_rigid else self.model.jacobian(q)
 
     def estimate(self, q: ArrayLike) -> Estimate:
-        """Return positions with their uncertainty; what the given noise does not explain is added to sigma."""
+        """Return positions with their uncertainty; residuals beyond the given noise are added to sigma."""
         if self._is_rigid:
             return self._rigid.estimate(q)
         angles, fit = rows_or_vector("q", q, self.joints), self._fitted()
@@ -154,7 +154,7 @@ class ResidualLearner(Model):
         return self._fitted() is None and not self.model.weights
 
     def _fitted(self) -> ResidualFit | None:
-        """Return the fit; None without pairs, or if they support nothing but the rigid chain."""
+        """Return the fit; None without pairs, or if they support only the rigid chain."""
         if self._model is None and self.pairs:
             pairs = self._rigid.data
             before = self._prior

@@ -45,8 +45,8 @@ class ResidualModel:
 
     Attributes:
         features: the chain's parameters and the groups' functions.
-        change: of the chain's parameters, most probable (size,) [rad, m].
-        weights: of each group, most probable (features,).
+        change: most probable change of the chain's parameters (size,) [rad, m].
+        weights: most probable weights of each group (features,).
         root: W (size + features of all groups, k) with the covariance W Wᵀ of the change, then the weights.
         noise: 1-sigma of a measured coordinate [m], estimated from pairs; 0 without pairs.
 
@@ -112,7 +112,7 @@ class ResidualModel:
 
     @property
     def digest(self) -> str:
-        """Sixteen hexadecimal digits that identify this map, its uncertainty left out."""
+        """Sixteen hexadecimal digits that identify this map, without its uncertainty."""
         arrays = self._arrays()
         del arrays["root"]
         return hashlib.blake2b(pack(_KIND, {"scale": self.features.scaling.scale}, arrays), digest_size=8).hexdigest()
@@ -160,7 +160,7 @@ class ResidualModel:
     def with_other_tool(self, tolerance: float) -> Self:
         """Return the same arm with a marker displaced by `tolerance` (1-sigma of each component [m]).
 
-        The joints' compliance and errors stay as they are; the hand's load stays in its place.
+        The joints' compliance and errors stay unchanged; the hand's load stays in its place.
 
         Raises:
             SettingError: the tolerance is not positive.

@@ -1,1 +1,1 @@
-"""Tensor trains: maps of many joints in few numbers per joint, and their learner."""
+"""Tensor trains: maps of many joints with few numbers per joint, and their learner."""

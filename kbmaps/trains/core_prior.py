@@ -60,16 +60,16 @@ class CorePrior:
 
         To first order, a small rigid motion before joint k changes its core along six directions, and a shift of the
         marker changes the last core along three. They carry the geometry's uncertainty. In addition, every number of
-        every core has `ellipse_std` of its own, for deviations that no rigid chain can have.
+        every core has an independent `ellipse_std`, for deviations that no rigid chain can have.
 
         Args:
             chain: the nominal model.
             bases: one per joint.
-            turn_std: of each component of a link's rotation [rad].
+            turn_std: standard deviation of each component of a link's rotation [rad].
             shift_std: of each component of a link's shift, at the joint [m].
             marker_std: of each component of the marker's position [m].
             ellipse_std: of each number of a core; of a translation, times `length`.
-            length: of a typical link [m].
+            length: length of a typical link [m].
 
         Raises:
             SettingError: a standard deviation or the length is not positive.
@@ -104,7 +104,7 @@ class CoreFamily:
     Attributes:
         mean: (d, 36), the cores of the nominal chain.
         motions: (d, 36, m), changes of a core by rigid motions of its link, each of one standard deviation.
-        length: of a typical link [m].
+        length: length of a typical link [m].
     """
 
     mean: FloatArray
@@ -155,7 +155,7 @@ class CoreFamily:
         return np.tile([1.0, 1.0, 1.0, self.length], 9)
 
     def prior(self, ellipse_std: float) -> CorePrior:
-        """Return the prior whose cores have `ellipse_std` of their own in each number, times `length` in translations.
+        """Return the prior with an independent `ellipse_std` for each number of a core, times `length` in translations.
 
         Raises:
             SettingError: ellipse_std is not positive.

@@ -45,7 +45,7 @@ def likely_ellipse_std(family: CoreFamily, jacobian: FloatArray, positions: Floa
 
         2 log p = - rᵀ (I + J S Sᵀ Jᵀ)⁻¹ r - log |I + J S Sᵀ Jᵀ| + terms without S,
 
-    or, where there are fewer cores' numbers than coordinates,
+    or, if the cores have fewer numbers than there are coordinates,
 
         2 log p = rᵀ J S (I + Sᵀ Jᵀ J S)⁻¹ Sᵀ Jᵀ r - log |I + Sᵀ Jᵀ J S| + terms without S.
 
@@ -95,7 +95,7 @@ def _by_cores(family: CoreFamily, jacobian: FloatArray, residuals: FloatArray) -
 
 
 def _inverse_square(matrix: FloatArray, vector: FloatArray) -> tuple[float, float]:
-    """Return vᵀ M⁻¹ v and log |M|, which is infinite where M is not positive definite up to rounding."""
+    """Return vᵀ M⁻¹ v and log |M|, which is infinite if M is not positive definite up to rounding."""
     factor, positive = lapack.cholesky_lower(np.asfortranarray(matrix))
     if not positive:
         return 0.0, math.inf
@@ -121,17 +121,17 @@ class _Settings:
 
 
 class TensorLearner(Model):
-    """Learns a TensorTrain.
+    """Learner of a TensorTrain.
 
     With a prior, every fit is the most likely train under it (`TensorLearner.around` makes one from a nominal chain).
     Without, the first fits search from random chains once there are `pairs_needed`; later ones continue from the one
-    before. Where no sigma is given, the noise is estimated from the residuals.
+    before. If no sigma is given, the noise is estimated from the residuals.
 
     Args:
         bases: one per joint; orthonormal over the joints' ranges (`learning_bases`) are advised.
-        prior: prior of the cores, in these bases; None without one. Of a family, every fit takes the member that its
+        prior: prior of the cores, in these bases; None without one. Of a family, every fit selects the member that its
             pairs support.
-        settings: of the learner; the defaults if None.
+        settings: settings of the learner; None for the defaults.
 
     Raises:
         ShapeError: the prior has another number of joints.
@@ -224,8 +224,8 @@ class TensorLearner(Model):
     def pairs_needed(self) -> int:
         """Minimum number of pairs for the first fit without a prior: 1.5 times one third of the free parameters.
 
-        The train has Σ 12 m_k numbers over all joints but the last and 3 m_d of that, less 12 for the frame between any
-        two cores: 24 d − 15 for revolute joints.
+        The train has Σ 12 m_k numbers over all joints but the last and 3 m_d of that, minus 12 for the frame between
+        any two cores: 24 d − 15 for revolute joints.
         """
         sizes = [basis.size for basis in self.bases]
         numbers = 12 * sum(sizes[:-1]) + 3 * sizes[-1] - 12 * (self.joints - 1)
@@ -264,7 +264,7 @@ class TensorLearner(Model):
         self._waiting += len(angles)
         if self.settings.window is not None:
             self._keep(self.settings.window)
-        # While pairs are few, a quarter more may change much.
+        # While pairs are few, a quarter more may change a lot.
         if self._waiting >= min(self.settings.refit_every, max(1, self.kept // _Settings.share_before_refit)):
             self.refit()
 
@@ -343,7 +343,7 @@ class TensorLearner(Model):
     def estimate(self, q: ArrayLike) -> Estimate:
         """Return positions with the standard deviation of the Gauss-Newton posterior.
 
-        Where residuals show joint or instrument errors that no train can follow, their uncertainty is added.
+        If residuals reveal joint or instrument errors that no train can follow, their uncertainty is added.
         """
         angles = rows_or_vector("q", q, self.joints)
         batch = np.atleast_2d(angles)

@@ -34,7 +34,7 @@ def misfit_directions(train: TensorTrain, q: FloatArray) -> FloatArray:
     In m/rad, or m/m; q is not checked. A joint's error is a second harmonic of its reading, or proportional to the
     moment of a force on the marker along each axis of the measurement frame. The first models eccentric encoders, gears
     and other periodic errors (a train has the constant and the first harmonic), the second elastic joints. The
-    instrument's error is any quadratic function of the position, as of lenses (a train follows linear ones).
+    instrument's error is any quadratic function of the position, such as that of lenses (a train follows linear ones).
     """
     slopes = train.jacobian(q)
     phases = _phases(train.bases, q)
@@ -66,7 +66,7 @@ def likely_misfit(
         directions: G (m, k).
         absorbed: Rᵀ G (p, k), with R Rᵀ = J (JᵀJ + I)⁻¹ Jᵀ.
         residuals: r (m,).
-        sizes: of the groups, k in all.
+        sizes: numbers of directions of the groups, k in all.
     """
     values, vectors = np.linalg.eigh(directions.T @ directions - absorbed.T @ absorbed)
     # Directions that the cores absorb up to rounding are not determined; without noise, rounding would look
@@ -106,8 +106,8 @@ class TensorPosterior:
     """Gauss-Newton posterior of a train's cores. A `kbmaps.planning.design.Posterior`.
 
     Args:
-        train: the most likely one.
-        prior: of its cores.
+        train: the most likely train.
+        prior: prior of its cores.
         information: JᵀJ (36 d, 36 d) of the pairs by whitened cores; None before any pair.
         noise: 1-sigma of each coordinate of a further pair [m].
     """
@@ -132,14 +132,14 @@ class TensorPosterior:
 
         Args:
             q: configurations (n, d) of the pairs that the fit used.
-            residuals: (n, 3) [m] there.
-            std: of a coordinate of each (n,) [m], as in `information`.
+            residuals: residuals (n, 3) [m] of these pairs.
+            std: standard deviation of a coordinate of each (n,) [m], as in `information`.
         """
         self._left, self._learnt = (q, residuals, std), q
 
     @property
     def misfit(self) -> FloatArray:
-        """Standard deviations (3,) [rad, m] of errors that no train follows; 0 where the pairs support none."""
+        """Standard deviations (3,) [rad, m] of errors that no train follows; 0 if the pairs support none."""
         self._judge_what_is_left()
         return self._misfit
 

@@ -52,7 +52,7 @@ class Pairs:
 
     @property
     def size(self) -> float:
-        """RMS distance of the positions from their mean [m]; 1 m where they are all the same."""
+        """RMS distance of the positions from their mean [m]; 1 m if they are all the same."""
         spread = math.sqrt(float(self.x.var(axis=0).sum()))
         return spread if spread > 0.0 else 1.0
 
@@ -65,7 +65,7 @@ class Pairs:
         return Pairs(self.weights[mask], self.x[mask], self.sigma[mask])
 
     def problem(self, prior: CorePrior, noise: float, trust: FloatArray | None = None) -> TensorProblem:
-        """Return the problem with `noise` [m] where no sigma is given, and variances divided by `trust` (n,)."""
+        """Return the problem with `noise` [m] for pairs without a sigma, and variances divided by `trust` (n,)."""
         std = np.where(self.unknown, noise, self.sigma)
         return TensorProblem(self.weights, self.x, std if trust is None else std / np.sqrt(trust), prior)
 
@@ -110,7 +110,7 @@ def search(
 ) -> Fit:
     """Return the best of several fits from random rigid chains.
 
-    Ends early when one explains the pairs, or two agree.
+    Ends early if one explains the pairs, or two agree.
     """
     some = pairs
     if len(pairs.x) > SearchSettings.search_pairs * len(bases):
@@ -159,8 +159,8 @@ def random_chain(bases: Sequence[JointBasis], length: float, rng: np.random.Gene
 def information(pairs: Pairs, prior: CorePrior, fit: Fit) -> tuple[FloatArray, FloatArray]:
     """Return JᵀJ (36 d, 36 d) of the pairs that a fit used, by z: the information beyond the prior's unit matrix.
 
-    Also returns the standard deviation of a coordinate of each (n,) [m] as weighted. Where every sigma was given but
-    the residuals are larger, all are scaled up accordingly.
+    Also returns the standard deviation of a coordinate of each (n,) [m] as weighted. If every sigma was given but the
+    residuals are larger, all are scaled up accordingly.
     """
     good = pairs.chosen(fit.used)
     problem = good.problem(prior, fit.noise)
@@ -186,7 +186,7 @@ def effective_parameters(problem: TensorProblem, z: FloatArray) -> float:
 
 
 def _settle(pairs: Pairs, prior: CorePrior, z: FloatArray, noise: float) -> Fit:
-    """Fit z and noise in turn until neither moves.
+    """Fit z and noise in turn until both have converged.
 
     The noise follows MacKay 1992: rss / (3 n − effective parameters).
     """
@@ -213,7 +213,7 @@ def _settle(pairs: Pairs, prior: CorePrior, z: FloatArray, noise: float) -> Fit:
 def _distances(pairs: Pairs, prior: CorePrior, fit: Fit) -> tuple[FloatArray, bool]:
     """Return residuals' lengths (n,) in robust standard deviations, and True if these are meaningful.
 
-    The unit comes from the median; where every sigma is given, it is at least that.
+    The unit comes from the median; if every sigma is given, it is at least that.
     """
     problem = pairs.problem(prior, fit.noise)
     freedom = 1.0 - effective_parameters(problem, fit.z) / (3.0 * len(pairs.x))

@@ -200,7 +200,7 @@ class TensorSettings:
     Attributes:
         window: number of the last pairs to keep; None keeps all.
         refit_every: number of new pairs after which `learn` refits; earlier if they are a quarter of all kept pairs.
-            Until then they wait, or for `refit`.
+            Until then, or until `refit`, they wait.
         robust: leave out pairs that lie more than five robust standard deviations off.
         starts: maximum number of random chains to start from without a prior.
         seed: of these random chains, so that the same pairs give the same train.

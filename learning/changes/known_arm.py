@@ -65,7 +65,7 @@ class ArmSettings:
 class Adapted:
     """State from which learning continues."""
 
-    prior: KBMap  # the map to learn on top of
+    prior: KBMap  # the map on top of which to learn
     arm: KnownArm  # prior of the arm before the first pair since the change
     belief: ChainBelief  # posterior of the chain after these pairs
 
@@ -102,11 +102,11 @@ class Origin:
     def adapt(
         self, found: Sequence[Explanation], q: FloatArray, x: FloatArray, cov: FloatArray | None = None
     ) -> Adapted:
-        """Widen what may have changed, and relearn it from the pairs since, q (n, d) [rad] and x (n, 3) [m].
+        """Widen the prior of suspected parts, and relearn them from the pairs since, q (n, d) [rad] and x (n, 3) [m].
 
         Args:
             found: probability of each kind of change, the most probable first.
-            cov: as `PairMemory.append` takes them.
+            cov: as in `PairMemory.append`.
         """
         arm = self._forgetful(found)
         belief = fitted_belief(arm.chain, q, self._of_chain(q, x), cov)
@@ -132,7 +132,7 @@ class Origin:
         return float(np.square(new).sum()) < float(np.square(old).sum())
 
     def _of_chain(self, q: FloatArray, x: FloatArray) -> FloatArray:
-        """Return the part of positions x (n, 3) [m] that the chain must explain: the model's other terms are kept."""
+        """Return the part of positions x (n, 3) [m] that the chain must explain, without the model's other terms."""
         return x - self._reference.beyond_chain(q)
 
     def _forgetful(self, found: Sequence[Explanation]) -> KnownArm:

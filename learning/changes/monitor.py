@@ -35,7 +35,7 @@ class MonitorSettings:
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """Model fitted to none of the monitored pairs, with its posterior."""
+    """Model that was not fitted to any monitored pair, with its posterior."""
 
     model: LearntModel  # the answering model
     map: KBMap  # the best KB-Map
@@ -43,7 +43,7 @@ class Reference:
     wide: ChainBelief  # the same without the selection of narrower tolerances
     residual: ResidualModel | None  # posterior of the arm beyond that; None without any
     claim: PredictiveUncertainty  # predictive uncertainty of the model
-    known: int  # number of pairs it knows
+    known: int  # number of pairs it was fitted to
     # q, x: some of the last of these, in their order (n, d) [rad] and (n, 3) [m]
     q: FloatArray
     x: FloatArray
@@ -65,8 +65,8 @@ class Reference:
 
         Args:
             q: joint values (n, d).
-            white: of the noise (n, 3, 3).
-            claimed: of the measurements (n, 3, 3).
+            white: covariances of the noise (n, 3, 3).
+            claimed: covariances of the measurements (n, 3, 3).
         """
         more = np.maximum((white - claimed).diagonal(axis1=1, axis2=2), 0.0)
         missed = np.maximum(self.claim.beyond_chain(q) - more, 0.0)
@@ -76,8 +76,8 @@ class Reference:
         """Return the noise of the reference's whitened errors at pairs that it was fitted to.
 
         Args:
-            covariances: of these errors (n, 3, 3) [m²].
-            white: of the noise (n, 3, 3) [m²].
+            covariances: covariances of these errors (n, 3, 3) [m²].
+            white: covariances of the noise (n, 3, 3) [m²].
         """
         errors = np.matvec(inverse_roots(covariances), self.x - self.model.predict(self.q))
         used = (4 * self.q.shape[1] + 3) * len(self.q) / self.known
@@ -96,7 +96,7 @@ class DetectedChange:
     earliest: int
     latest: int
     seqs: tuple[int, ...]  # sequence numbers of the monitored pairs (n,)
-    kept: tuple[bool, ...]  # True for each of them (n,) that was learnt, not an outlier
+    kept: tuple[bool, ...]  # True for each of them (n,) that was learnt, False for outliers
     # q, x: the monitored pairs, (n, d) [rad] and (n, 3) [m]
     q: FloatArray
     x: FloatArray
@@ -133,10 +133,10 @@ class _Shown:
 
 
 class ChangeMonitor:
-    """Compares the pairs since a reference with it, and renews the reference while nothing changes.
+    """Monitor that compares the pairs since a reference with it, and renews the reference while nothing changes.
 
-    The distance of unknown pairs from a model can only be measured on such pairs: on its own pairs, a wrong chain looks
-    right. So the first reference is tried out before it can raise an alarm.
+    The distance of new pairs from a model can only be measured on pairs that it was not fitted to: on its own pairs, a
+    wrong chain looks right. So the first reference is tried out before it can raise an alarm.
     """
 
     def __init__(self) -> None:
@@ -165,7 +165,7 @@ class ChangeMonitor:
 
     @property
     def alarmed(self) -> bool:
-        """True if there was a change that a bending arm would not explain."""
+        """True if there was a change that deflections of the arm would not explain."""
         return self._change is not None
 
     @property
@@ -228,10 +228,10 @@ class ChangeMonitor:
                 self.refute()
 
     def noticed(self, run: int = 0) -> DetectedChange | None:
-        """Return the change that the pairs show; None if they show none, or there is no reference.
+        """Return the change detected in the pairs; None without a change or a reference.
 
         Args:
-            run: number of the last pairs that have shown it in another way: it began there if not before.
+            run: number of the last pairs that have revealed it by other means: it began there at the latest.
         """
         reference, detector = self._reference, self.detector
         if reference is None or detector is None or not self.ready or not (self.alarmed or run):
@@ -256,7 +256,7 @@ class ChangeMonitor:
         )
 
     def _show(self) -> None:
-        """Record the distances of the pairs from a model that does not know them."""
+        """Record the distances of the pairs from a model that was not fitted to them."""
         if self.detector is None or self._reference is None:
             return
         surprises = self.detector.surprises
@@ -268,7 +268,7 @@ class ChangeMonitor:
         self._shown = shown if self._shown is None else self._shown.with_newer(shown)
 
     def _drop(self, count: int) -> None:
-        """Stop monitoring the first `count` pairs; they still show the noise."""
+        """Stop monitoring the first `count` pairs; they still contribute to the noise."""
         self._earlier.extend(self._pairs[:count])
         del self._pairs[:count]
 
@@ -321,7 +321,7 @@ class ChangeMonitor:
 
 
 def _stacked(pairs: Sequence[_Watched]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return joint values (n, d), positions (n, 3) and their covariances (n, 3, 3) as claimed."""
+    """Return joint values (n, d), positions (n, 3) and their claimed covariances (n, 3, 3)."""
     return (
         np.array([each.q for each in pairs]),
         np.array([each.x for each in pairs]),

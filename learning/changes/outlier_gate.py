@@ -24,7 +24,7 @@ MEDIAN_TO_SIGMA = 0.6501  # 1-sigma of errors per axis by their median length, t
 
 
 class OutlierGate:
-    """Counts consecutive outliers, and keeps the newest of them: they may be the first pairs of another regime.
+    """Counter of consecutive outliers that keeps the newest of them: they may be the first pairs of another regime.
 
     Isolated outliers are never learnt later, so they are not kept.
     """
@@ -54,17 +54,17 @@ class OutlierGate:
         return doubted
 
     def run(self) -> tuple[FloatArray, FloatArray]:
-        """Return the newest consecutive outliers, at most as many as prove a change: q (n, d), x (n, 3)."""
+        """Return the newest consecutive outliers, at most the number that proves a change: q (n, d), x (n, 3)."""
         return self._memory.all()
 
     def restore(self, q: FloatArray, x: FloatArray, in_a_row: int) -> None:
-        """Resume from the run q (n, d), x (n, 3), of which `in_a_row` were counted."""
+        """Resume from the run q (n, d), x (n, 3) of `in_a_row` consecutive outliers."""
         self._memory.restore(q, x, in_a_row)
         self.in_a_row = in_a_row
 
 
 def sound(distances_m: FloatArray, noise_m: float) -> NDArray[np.bool_]:
-    """Return True for each of a few pairs that fits the others, by distances (n,) [m] from a robust fit, shape (n,).
+    """Return the mask (n,) of those of a few pairs that fit the others, by distances [m] from a robust fit.
 
     Args:
         distances_m: distances (n,) [m] from the fit.
@@ -87,6 +87,6 @@ def limits_m(inside_m: FloatArray, open_m: FloatArray) -> FloatArray:
 
     Args:
         inside_m: RMS distance of recent pairs from their predictions (n,).
-        open_m: RMS uncertainty of the predictions at the pairs' poses, from what the data do not determine yet (n,).
+        open_m: RMS uncertainty of the predictions at the pairs' poses, due to undetermined parameters (n,).
     """
     return OutlierSettings.times_farther * np.maximum(np.hypot(inside_m, open_m), OutlierSettings.smallest_m)

@@ -1,1 +1,1 @@
-"""Models that need all pairs: solve them, and schedule that."""
+"""Solve the models that need all pairs, and schedule their solutions."""

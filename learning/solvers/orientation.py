@@ -49,7 +49,7 @@ class OrientationSolution:
 
 
 class OrientationSolver:
-    """Keeps the pairs that have an orientation, and solves for them.
+    """Solver that keeps the pairs with an orientation.
 
     Args:
         bases: bases of the learnt maps.
@@ -68,7 +68,7 @@ class OrientationSolver:
         return self._pairs > 0 and self._pairs >= BatchSettings.growth * self._solved_at
 
     def learn(self, q: FloatArray, x: FloatArray, turns: FloatArray) -> None:
-        """Add pairs q (n, d), x (n, 3) and quaternions (n, 4), NaN where a pair has none."""
+        """Add pairs q (n, d), x (n, 3) and quaternions (n, 4), NaN for a pair without one."""
         told = np.isfinite(turns).all(axis=1)
         self._pairs += int(told.sum())
         self._q, self._x = np.vstack([self._q, q[told]]), np.vstack([self._x, x[told]])
@@ -102,7 +102,7 @@ class OrientationSolver:
         return OrientationSolution(self._pairs, chain, solution.map, noise if math.isfinite(noise) else 0.0)
 
     def _precision(self, prior: KBMap) -> float:
-        """Return the precision chosen by left-out blocks, for the axis e1: neighbours on a path share their errors."""
+        """Return the precision chosen by left-out blocks for axis e1, since neighbours on a path share their errors."""
         axis = KBMap(prior.bases, prior.net[3:6])
         rotations = rotation_matrices("turns", self._turns)
         return blockwise_precision(axis, self._q, rotations[:, :, 0])

@@ -59,7 +59,7 @@ class Task:
     residual: ResidualModel | None = None  # prior of the arm beyond that; None without any
     # True if the exact map keeps to `prior`, not to the rigid chain: it stands for pairs that are no longer kept
     prior_stays: bool = False
-    # those of `belief`, if the pairs may select narrower ones; None: they may not
+    # tolerances of `belief`, if the pairs may select narrower ones; None if they may not
     tolerances: ChainTolerances | None = None
 
 
@@ -79,7 +79,7 @@ class Solved:
 
 
 class Solver(Protocol):
-    """Solves one task at a time, for the pairs that came since `start`."""
+    """Solver of one task at a time, for the pairs since `start`."""
 
     def start(self, task: Task) -> None:
         """Forget all pairs and begin a new task."""
@@ -87,17 +87,17 @@ class Solver(Protocol):
     def learn(
         self, q: FloatArray, x: FloatArray, cov: FloatArray | None = None, turns: FloatArray | None = None
     ) -> None:
-        """Add pairs, q (n, d) [rad] and x (n, 3) [m], cov and turns as `PairMemory.append` takes them."""
+        """Add pairs, q (n, d) [rad] and x (n, 3) [m], cov and turns as in `PairMemory.append`."""
 
     def solve(self) -> None:
-        """Request the solutions of all pairs so far; `poll` returns them one by one, perhaps later."""
+        """Request the solutions of all pairs so far; `poll` returns them one by one, possibly later."""
 
     def poll(self) -> Solved | None:
         """Return the next answer to a `solve`, without waiting."""
 
 
 class DirectSolver:
-    """Solves at once, in the caller's thread."""
+    """Solver that works in the caller's thread."""
 
     def __init__(self) -> None:
         self._task: Task | None = None
@@ -184,8 +184,8 @@ class DirectSolver:
     def _solve_exact(self, task: Task, learner: ExactLearner, *, last: bool) -> Solved:
         """Solve least squares around the rigid chain.
 
-        The evidence finds the prior's precision if pairs are apart. On a guided path, neighbours share their errors,
-        which the evidence would take for shape: there, left-out blocks choose it.
+        The evidence determines the prior's precision if pairs are independent. On a guided path, neighbours share their
+        errors, which the evidence would take for shape; there, left-out blocks determine it.
         """
         retune = self._precision is None or learner.pairs >= SolverSettings.retune * self._tuned_at
         try:
@@ -236,13 +236,13 @@ def _as_made(belief: ChainBelief, task: Task, made: Sequence[Tolerances]) -> Cha
 def fitted_belief(prior: ChainBelief, q: FloatArray, x: FloatArray, cov: FloatArray | None = None) -> ChainBelief:
     """Return the posterior of a chain after pairs along a path.
 
-    Neighbours share part of their errors; as many as share them count as one.
+    Neighbours share part of their errors; those that share them count as one.
 
     Args:
-        prior: before these pairs.
+        prior: the posterior before these pairs.
         q: joint values (n, d) [rad].
         x: positions (n, 3) [m].
-        cov: their covariances (n, 3, 3) [m²], NaN where a pair has none; None where no pair has any.
+        cov: their covariances (n, 3, 3) [m²], NaN for a pair without one; None if no pair has any.
     """
     chosen = evenly_spread(len(q), SolverSettings.fitted)
     q, x = q[chosen], x[chosen]
@@ -284,14 +284,14 @@ def fitted_residual(
 
 
 class SolverClient:
-    """Keeps one solver up to date. For the background thread alone.
+    """Client that keeps one solver up to date. For the background thread alone.
 
-    Nothing is sent while the solver works: in a process of its own it does not read meanwhile, and the thread would
+    Nothing is sent while the solver works: a solver in a separate process does not read meanwhile, and the thread would
     block on the send.
 
     Attributes:
         fed: number of pairs of the current task that the solver has.
-        busy: true if it was asked and has not answered.
+        busy: True if it has not answered the last request.
     """
 
     def __init__(self, solver: Solver, solve_every: int) -> None:
@@ -305,11 +305,11 @@ class SolverClient:
         return self.fed > 0 and (self._soon or self.fed - self._solved_at >= enough)
 
     def works_on(self, task: int) -> bool:
-        """Return True if it has pairs of this task, and of no other since."""
+        """Return True if it has pairs of this task, and of no later one."""
         return self._task == task and self.fed > 0
 
     def has_solved(self, task: int, pairs: int) -> bool:
-        """Return True if this many pairs of the task were given, asked for and answered."""
+        """Return True if a solution for this many pairs of the task was requested and answered."""
         return self._task == task and not self.busy and self.fed == self._solved_at == pairs
 
     def restart(self) -> None:
@@ -334,7 +334,7 @@ class SolverClient:
     def feed(
         self, q: FloatArray, x: FloatArray, fed: int, cov: FloatArray | None = None, turns: FloatArray | None = None
     ) -> None:
-        """Send pairs as `Solver.learn` takes them; with them the solver has `fed` of the task's."""
+        """Send pairs as in `Solver.learn`; with them the solver has `fed` pairs of the task."""
         self._solver.learn(q, x, cov, turns)
         self.fed = fed
 

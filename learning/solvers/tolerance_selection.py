@@ -35,14 +35,14 @@ class Tolerances:
 def workmanship(belief: ChainBelief, tolerances: ChainTolerances, q: FloatArray) -> list[Tolerances]:
     """Return the probable tolerances of the arm, from the evidence of its pairs.
 
-    MacKay 1992, "Bayesian interpolation". The initial tolerances allow for an arm made by hand. Where the nominal chain
-    is right to a millimetre, the pairs show it long before they determine each parameter. Narrow tolerances may apply
-    to the arm alone, with its joint offsets, or with the cameras' pose too; an infinite tolerance stays infinite.
+    MacKay 1992, "Bayesian interpolation". The initial tolerances allow for an arm made by hand. If the nominal chain is
+    right to a millimetre, the pairs show it long before they determine each parameter. Narrow tolerances may apply to
+    the arm alone, with its joint offsets, or with the cameras' pose too; an infinite tolerance stays infinite.
 
     Args:
         belief: posterior of the chain.
         tolerances: those of its prior.
-        q: configurations (n, d) [rad] of its pairs, or some of them.
+        q: configurations (n, d) [rad] of its pairs, or of a part of them.
 
     Returns:
         The probable candidates, the narrowest last.
@@ -60,11 +60,11 @@ def workmanship(belief: ChainBelief, tolerances: ChainTolerances, q: FloatArray)
 
 
 def _lost_in_the_curve(belief: ChainBelief, narrowed: Sequence[ChainBelief], q: FloatArray) -> FloatArray:
-    """Return the evidence [nats] that narrower posteriors (m,) lose as positions are not linear in the parameters.
+    """Return the evidence [nats] that narrower posteriors (m,) lose because positions are nonlinear in the parameters.
 
-    A narrower prior moves what the pairs leave open, along a tangent. Where the pairs are precise, the positions at
-    the end of the tangent do not fit them. The loss is that of the evidence's variational lower bound: half the growth
-    of the expected sum of squares. That is counted in units of the posterior's covariance at the pairs, of which the k
+    A narrower prior moves the undetermined parameters along a tangent. If the pairs are precise, the positions at the
+    end of the tangent do not fit them. The loss is that of the evidence's variational lower bound: half the growth of
+    the expected sum of squares. That is counted in units of the posterior's covariance at the pairs, of which the k
     parameters have k in all (our derivation, from the trace identity Σ tr(J C Jᵀ) / σ² = k).
     """
     x, jacobian = belief.parameters.linearised(belief.mean, q)
@@ -83,7 +83,7 @@ def _lost_in_the_curve(belief: ChainBelief, narrowed: Sequence[ChainBelief], q: 
 
 
 def probable(evidence: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
-    """Return the indices of the probable explanations, the most probable first, and their shares.
+    """Return the indices of the probable explanations, the most probable first, and their probabilities.
 
     Args:
         evidence: log marginal likelihood of each (m,) (MacKay 1992, "Bayesian interpolation").
@@ -97,12 +97,12 @@ def probable(evidence: FloatArray) -> tuple[NDArray[np.intp], FloatArray]:
 def best_tolerances(belief: ChainBelief, tolerances: ChainTolerances, made: Sequence[Tolerances]) -> ChainBelief:
     """Return the chain nearest to nominal that is not improbable, with the uncertainty of all candidates.
 
-    Its covariance covers all candidate tolerances. Where these explain the pairs equally well, they differ only away
-    from the pairs: there the nominal chain is more reliable than the noise.
+    Its covariance covers all candidate tolerances. If these explain the pairs equally well, they differ only away from
+    the pairs: there the nominal chain is more reliable than the noise.
 
     Args:
-        belief: in an arm of the widest tolerances.
-        tolerances: those.
+        belief: posterior for an arm of the widest tolerances.
+        tolerances: the widest tolerances.
         made: the candidates.
     """
     beliefs = [belief.tightened(tolerances, each.tolerances)[0] for each in made]

@@ -1,4 +1,4 @@
-"""Recover the pairs of a damaged file: sound rows, lost numbers, and a new file of the rest."""
+"""Recover the pairs of a damaged file: sound rows, lost numbers, and a new file with the remaining pairs."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def scan(connection: sqlite3.Connection, columns: str, make: Make[Made], first: 
 
 
 def scan_back(connection: sqlite3.Connection, columns: str, make: Make[Made]) -> Iterator[Made | None]:
-    """Yield the same from the newest row backwards, and None for a row that is not sound.
+    """Yield like `scan`, from the newest row backwards, and None for a row that is not sound.
 
     Raises:
         sqlite3.DatabaseError: SQLite cannot read further.

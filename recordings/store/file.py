@@ -43,7 +43,7 @@ def explanation(file: Path, error: sqlite3.Error) -> str:
 
 
 def is_damage(error: sqlite3.Error) -> bool:
-    """Return True if SQLite found that the file is corrupted."""
+    """Return True if SQLite found the file corrupted."""
     return _name(error).startswith(("SQLITE_CORRUPT", "SQLITE_TOOBIG")) or isinstance(error, sqlite3.DataError)
 
 
@@ -74,7 +74,7 @@ def gone(file: Path) -> str:
 
 
 def file_identities(file: Path) -> FileIdentities:
-    """Return device and inode of a store and of its write-ahead log; None for what is not there."""
+    """Return device and inode of a store and of its write-ahead log; None for a missing file."""
     found: list[tuple[int, int] | None] = []
     for part in (file, file.with_name(f"{file.name}-wal")):
         try:
@@ -93,7 +93,7 @@ LOW_DISK_BYTES = 200 * 2**20  # below this the sampler warns, and the doctor
 
 
 def disk_free(file: Path) -> int:
-    """Return the free bytes on the store's disk. StoreError if its directory is gone."""
+    """Return the free bytes on the store's disk; raise StoreError if its folder is gone."""
     try:
         return free_bytes(file)
     except OSError as error:
@@ -104,7 +104,7 @@ def lock(file: Path, writer: str = "sampler") -> int:
     """Lock a file next to `file`; the process's end releases the lock, and children do not inherit it.
 
     Raises:
-        StoreUnwritable: the disk accepts no file.
+        StoreUnwritable: the disk cannot hold the lock file.
         StoreError: another process has locked it.
     """
     lock_file = file.with_name(file.name + ".lock")

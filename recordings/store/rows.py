@@ -72,7 +72,7 @@ def decoded(row: tuple[Any, ...], joints: int) -> tuple[Any, ...]:
     """Return the values of a row of `pairs` without its checksum, texts as bytes: numbers and lists of numbers.
 
     Raises:
-        DamagedRow: it is not a row that a sampler with `joints` joints writes.
+        DamagedRow: no sampler with `joints` joints writes such a row.
     """
     seq, session, segment, t, utc, q, x, upper, centres, turn, cov_turn = row
     try:
@@ -93,7 +93,7 @@ def decoded(row: tuple[Any, ...], joints: int) -> tuple[Any, ...]:
 
 
 def pair_of(store: str, row: tuple[Any, ...], joints: int) -> Pair:
-    """Return the pair of a row as for `decoded`, which may raise DamagedRow."""
+    """Return the pair of a row as for `decoded`, whose errors it raises."""
     seq, _, segment, t, utc, q, x, upper, centres, turn, cov_turn = decoded(row, joints)
     return Pair(
         store=store,

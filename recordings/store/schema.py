@@ -190,7 +190,7 @@ def new_meta(joints: Sequence[str], utc: str) -> dict[str, str]:
 
 
 def joints_of(meta: dict[str, str]) -> tuple[str, ...]:
-    """Return the names in the order of q. ValueError if they are not names."""
+    """Return the names in the order of q; raise ValueError if they are not names."""
     try:
         joints = msgspec.json.decode(meta["joints"], type=tuple[str, ...])
     except msgspec.DecodeError as error:
@@ -201,7 +201,7 @@ def joints_of(meta: dict[str, str]) -> tuple[str, ...]:
 
 
 def given_up_to(meta: dict[str, str]) -> int:
-    """Return the largest possible number of a lost pair; 0 if none is lost. ValueError if it is not a number."""
+    """Return the largest possible number of a lost pair; 0 if none is lost; raise ValueError if it is not a number."""
     number = int(meta.get(GIVEN_UP_TO, "0"))
     if not 0 <= number < 2**62:
         raise ValueError

@@ -41,9 +41,9 @@ _HEADER, _FRAME = struct.Struct(">6I8x"), struct.Struct(">4I8x")
 
 
 def commits(store: Path) -> list[bool]:
-    """Return for each frame of a store's log whether it ended a transaction, up to the first frame of an older log.
+    """Return a flag for each frame of a store's log: True if it ended a transaction.
 
-    A missing log, or one with a damaged header, has no frames.
+    The list ends before the first frame of an older log. A log that is missing or has a damaged header has no frames.
     """
     found: list[bool] = []
     try:
@@ -105,7 +105,7 @@ class Audit:
 
 
 class PairReader:
-    """Reads a pair store, also while a sampler writes it. Use as a context manager; any thread may read.
+    """Reader of a pair store, also while a sampler writes it. Use as a context manager; any thread may read.
 
     Rows that the disk corrupted, or that SQLite cannot read, are skipped.
     """
@@ -222,7 +222,7 @@ class PairReader:
         return Audit(len(numbers), newest, session, self.damage, lost, ranges)
 
     def devices(self) -> list[Devices]:
-        """Return what the joints were read with, in the order of the pairs; empty in a store of an older version."""
+        """Return the devices that read the joints, in the order of the pairs; empty in a store of an older version."""
         with self._reading() as connection:
             rows = [row[1:] for row in records(connection, "devices") if row is not None]
         try:
@@ -259,7 +259,7 @@ class PairReader:
 
 
 class PairStore:
-    """Writes a pair store, and creates it if it does not exist.
+    """Writer of a pair store, which is created if it does not exist.
 
     Use as a context manager, and append from one thread at a time. A pair returned by `append` is on the disk
     (`synchronous=FULL`). Sequence numbers run from 1 without gaps. Only one process can have a store open for writing;
@@ -335,7 +335,7 @@ class PairStore:
         """
         connection = self._require_open()
         with explained(self.file), store_schema.transaction(connection):
-            # An entry to which no pair belongs carries no information.
+            # An entry without pairs carries no information.
             connection.execute("DELETE FROM devices WHERE from_seq > ?", (self._seq,))
             number = connection.execute("SELECT coalesce(max(id), 0) + 1 FROM devices").fetchone()[0]
             told = (number, self._session_id, self._seq + 1, utc, as_json(record))
@@ -399,7 +399,7 @@ class PairStore:
             log.error("%s", said)
 
     def _require_in_place(self) -> None:
-        """Raise StoreUnwritable if the file was deleted, moved or replaced: SQLite would go on writing where it was."""
+        """Raise StoreUnwritable if the file was deleted, moved or replaced: SQLite would keep writing to the old."""
         now = file_identities(self.file)
         if any(before not in (None, here) for before, here in zip(self._identities, now, strict=True)):
             raise StoreUnwritable(gone(self.file))
@@ -481,7 +481,7 @@ class PairStore:
 
 
 def require_store(file: Path) -> None:
-    """Raise StoreError if nothing is there. What is no file is refused when it is opened."""
+    """Raise StoreError if the path does not exist. Anything but a file is refused when it is opened."""
     if not file.exists():
         raise StoreError(f"there is no store {file}. The sampler makes it: start it with `bodyschema run sampler`")
 

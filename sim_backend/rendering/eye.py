@@ -54,10 +54,10 @@ def cast_ball(
 
     Args:
         directions: rays (n, m, 3) in the eye's optical frame with z = 1.
-        centre: of the ball in that frame (3,) [m].
+        centre: centre of the ball in that frame (3,) [m].
         depth: distance along z of everything else (n, m) [m].
         bgr: the ball's colour (3,), 0 to 1.
-        to_light: unit vector to the light (3,) in that frame; None: the ball glows by itself.
+        to_light: unit vector to the light (3,) in that frame; None if the ball glows by itself.
 
     Returns:
         The mask (n, m) and the colours (k, 3), 0 to 255, of the rays in the mask.
@@ -278,9 +278,9 @@ class StereoEyes:
         return image if light == 1.0 else (light * image).astype(np.uint8)
 
     def _window(self, x_eye: FloatArray) -> tuple[int, int, int, int] | None:
-        """Return the rectangle (left, top, width, height) [px] around the marker, clipped to the image, or None.
+        """Return the rectangle (left, top, width, height) [px] around the marker, clipped to the image.
 
-        None: the marker is outside the image or too near to the eye.
+        None if the marker is outside the image or too near to the eye.
         """
         radius = self._config.marker_radius_m
         if x_eye[2] < 2 * radius:
@@ -316,7 +316,7 @@ class StereoEyes:
 
 
 def portraits(calibration: StereoCalibration, config: CameraConfig) -> Iterator[tuple[ImageArray, ...]]:
-    """Yield the marker alone before a plain wall in each eye's image (height, width, 3), BGR, without noise.
+    """Yield the marker alone in front of a plain wall in each eye's image (height, width, 3), BGR, without noise.
 
     The marker is centred between the images and near enough to be measured well; a tag is turned a little away.
     """

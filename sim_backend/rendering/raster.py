@@ -1,7 +1,7 @@
 """Render the robot from one eye: TinyRenderer on a grid of samples at exact image positions.
 
 Integer image coordinates are pixel centres. TinyRenderer samples column i of a frustum at its left edge plus i, row j
-at its top edge plus j + 1 (measured), so the frustum is shifted to put the samples where they belong.
+at its top edge plus j + 1 (measured), so the frustum is shifted to align the samples with the pixel centres.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Raster:
         self._to_light = to_light.tolist()
 
     def render(self, T_world_eye: FloatArray, grid: Grid) -> tuple[ImageArray, FloatArray]:
-        """Return colours (rows, columns, 3), BGR, and depths along z (rows, columns) [m]; inf where nothing is hit."""
+        """Return colours (rows, columns, 3), BGR, and depths along z (rows, columns) [m]; inf without a hit."""
         view = _FLIP @ np.linalg.inv(T_world_eye)
         _, _, rgba, buffer, _ = self._bullet.getCameraImage(
             grid.columns,

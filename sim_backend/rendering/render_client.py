@@ -26,9 +26,9 @@ from .scene import Scene
 
 
 class RenderProcess:
-    """Starts the renderer, sends it scenes and fetches images, in order. At most SLOTS frames may be under way.
+    """Client that starts the renderer, sends scenes and fetches images, in order; at most SLOTS frames are in progress.
 
-    The images lie in anonymous memory that the kernel frees with its last user: nothing is left behind, however
+    The images are in anonymous memory that the kernel frees with its last user: nothing is left behind, however
     either process ends.
     """
 
@@ -73,7 +73,7 @@ class RenderProcess:
         self._exit.close()
 
     def request(self, number: int, scene: Scene) -> None:
-        """Request frame `number`, with a stick from the hand to where the tool ends."""
+        """Request frame `number`, with a stick from the hand to the end of the tool."""
         tip = (float(scene.tip[0]), float(scene.tip[1]), float(scene.tip[2]))
         if tip != self._tip:
             self._send(Tool(tip=tip))
@@ -89,7 +89,7 @@ class RenderProcess:
         )
 
     def fetch(self, number: int, timeout_s: float) -> tuple[ImageArray, ...] | None:
-        """Frame `number`, the earliest not yet fetched, as images of the caller's own; None after `timeout_s`.
+        """Return a copy of the images of frame `number`, the earliest not yet fetched; None after `timeout_s`.
 
         Raises:
             SourceLost: the renderer's process has died.
@@ -107,7 +107,7 @@ class RenderProcess:
             raise self._lost() from error
 
     def _lost(self) -> SourceLost:
-        self._end()  # its pipes close a moment before it has ended, and who opens again asks whether it has
+        self._end()  # its pipes close a moment before it ends, and the next opening asks if it has ended
         return SourceLost(
             f"the renderer's process {self.process.pid} has ended (exit code {self.process.poll()}); "
             "its message stands on standard error; open the simulation again"
@@ -128,5 +128,5 @@ def _start(memory: int, requests: int, answers: int) -> subprocess.Popen[bytes]:
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
-        process_group=0,  # a signal to the group is the parent's to handle
+        process_group=0,  # the parent handles a signal to the group
     )

@@ -46,7 +46,7 @@ class Tool(msgspec.Struct, frozen=True, tag=True):
 
 
 class Frame(msgspec.Struct, frozen=True, tag=True):
-    """Paint this frame into slot `number` modulo SLOTS, then answer with one byte."""
+    """Request to paint this frame into slot `number` modulo SLOTS, answered with one byte."""
 
     number: int
     angles: list[float]  # true joint angles [rad or m]

@@ -26,7 +26,7 @@ from .render_messages import SLOTS, Frame, Message, Setup, Tool, frame_bytes, re
 
 
 class Stick:
-    """The tool: a thin rod from the hand to the ball. It is seen, weighs nothing and touches nothing."""
+    """The tool: a thin, massless rod from the hand to the ball, visible but without collisions."""
 
     def __init__(self, body: Body, link: str) -> None:
         self._body, self._link = body, link
@@ -54,7 +54,7 @@ class Stick:
         self._T_link_stick = (tip / 2, turn_of_z(tip / length))
 
     def follow(self) -> None:
-        """Move the rod to where the link is now."""
+        """Move the rod to the link's present pose."""
         if self._id < 0:
             return
         T = self._body.link_pose(self._link)

@@ -53,8 +53,8 @@ def _through_lenses(
 ) -> tuple[FloatArray, FloatArray]:
     """Return a point's apparent position in each eye (eyes, 3) and its triangulated position (3,) [m].
 
-    What shifts the triangulated position beyond the lenses moves the images accordingly. A longer focal length makes
-    the image larger, so the point appears nearer.
+    A shift of the triangulated position beyond the lenses moves the images accordingly. A longer focal length makes the
+    image larger, so the point appears nearer.
     """
     optics = simulation.optics
     eyes = calibration.eyes_m

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ast
+import io
 import re
+import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -26,6 +28,12 @@ INSTEAD = {
 }
 WORDS = re.compile(rf"\b({'|'.join(INSTEAD)})\b", re.IGNORECASE)
 SENTENCE = re.compile(r"\.\s+Raises? [A-Z]\w+")
+# Docstrings and comments: what no native reader writes, and the openings that announce a question.
+RIDDLES = re.compile(
+    r"\b(?:after|at|by|from|in|of|to|with) so many\b(?! that)|\bso no more\b|\bas (?:it|they) ha(?:s|ve) it\b",
+    re.IGNORECASE,
+)
+QUESTIONS = re.compile(r"(?:Whether|What|How|Who|Whose|Why)\b")
 # The views of a diagnosis quote its sentences.
 OF_DIAGNOSIS = re.compile(r"diagnosis_(run|view)\.py$")
 
@@ -81,3 +89,33 @@ def test_public_docstrings_name_errors_under_raises(room: str) -> None:
 def test_an_error_in_a_sentence_is_found() -> None:
     assert list(in_sentences('def run():\n    """Run. Raise RunError if it falls."""')) == ["line 1: run"]
     assert list(in_sentences('def run():\n    """Raise RunError if it falls."""')) == []
+
+
+def riddles(source: str) -> Iterator[str]:
+    """Yield the phrases of `RIDDLES` in docstrings and in comments inside functions, and docstrings that ask."""
+    functions: list[range] = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            functions.append(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            text, line = " ".join((ast.get_docstring(node) or "").split()), getattr(node, "lineno", 1)
+            yield from (f"line {line}: {found[0]}" for found in RIDDLES.finditer(text))
+            yield from (f"line {line}: {found[0]}" for found in [QUESTIONS.match(text)] if found)
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT and any(token.start[0] in lines for lines in functions):
+            yield from (f"line {token.start[0]}: {found[0]}" for found in RIDDLES.finditer(token.string))
+
+
+@pytest.mark.parametrize("room", [*ROOMS, "benchmarks", "diagnosis", "effects", "vision"])
+def test_docstrings_and_comments_are_no_riddles(room: str) -> None:
+    files = (ROOT / room).rglob("*.py")
+    found = {str(file.relative_to(ROOT)): words for file in files if (words := list(riddles(file.read_text("utf-8"))))}
+    assert found == {}
+
+
+def test_a_riddle_is_found() -> None:
+    across_lines = 'def run():\n    """Return the answers after so\n    many pairs."""'
+    assert list(riddles(across_lines)) == ["line 1: after so many"]
+    assert list(riddles('"""What a run is."""')) == ["line 1: What"]
+    assert list(riddles("def run():\n    pass  # linear, as they have it")) == ["line 2: as they have it"]
+    assert list(riddles('def run():\n    """Return True for so many that they fill a page."""')) == []

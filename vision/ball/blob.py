@@ -96,7 +96,7 @@ def find_patches(image: ImageArray, region: Region, gate: Gate) -> list[Patch]:
 def patch_at(image: ImageArray, centre_px: FloatArray, radius_px: float, gate: Gate) -> Patch | None:
     """Return the part of a circle in a BGR image that has the marker's colour, as a patch of that circle.
 
-    None if it is too small a part for a ball.
+    Return None if the part is too small for a ball.
     """
     height, width = image.shape[:2]
     low, high = np.rint(centre_px - radius_px).astype(int), np.rint(centre_px + radius_px).astype(int) + 1
@@ -120,7 +120,7 @@ def measure(
     """Measure the ball's image at `patch`, or return the reason why it cannot be measured.
 
     Args:
-        blur_px: rough blur of its contour (1-sigma) [px], such as it had in the last frame; it saves time.
+        blur_px: rough blur of its contour (1-sigma) [px], for example from the last frame; it saves time.
     """
     height, width = image.shape[:2]
     if not _clear_of_border(patch.box, _Settings.border_px, (width, height)):
@@ -189,13 +189,13 @@ def _cut_circle(image: ImageArray, patch: Patch, gate: Gate) -> tuple[FloatArray
 
 
 def _is_sure(outline: Outline) -> bool:
-    """Return True if the centre is sure enough; the limit is that of a small ball and grows with the radius."""
+    """Return True if the centre is precise enough; the limit is that of a small ball and grows with the radius."""
     limit_px = _Settings.most_sigma_px * max(1.0, outline.radius_px / _Settings.small_px)
     return math.sqrt(float(outline.cov_px.diagonal().max())) <= limit_px
 
 
 def _not_whole(outline: Outline) -> Reason | None:
-    """Return the reason why an outline is not that of a whole ball, or None."""
+    """Return the reason why an outline does not belong to a whole ball, or None."""
     if outline.visible < _Settings.least_visible or outline.off > _Settings.most_off:
         return Reason.OCCLUDED
     return Reason.LOW_CONTRAST if outline.uneven > _Settings.most_uneven else None
@@ -264,13 +264,11 @@ def _patch(mask: ImageArray, points: NDArray[np.int32], region: Region) -> Patch
 
 
 def _brighter_parts(image: ImageArray, patch: Patch, gate: Gate) -> list[Patch]:
-    """Return the parts of a patch that keep much of its strongest colour: the ball in front of a brick wall, for
-    example.
-    """
+    """Return the parts of a patch that keep much of its strongest colour, such as the ball in front of a brick wall."""
     pixels = patch.box.crop(image)
     amount = gate.amount(pixels)
     own = gate.mask(pixels) > 0
-    # The ball may be a small part of the patch: use the level that half of the smallest ball reaches.
+    # The ball may be a small part of the patch: use the level that half of the smallest ball exceeds.
     place = -_Settings.least_pixels // 2
     strongest = float(np.partition(amount[own], place)[place])
     return [

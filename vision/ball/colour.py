@@ -21,7 +21,7 @@ class Gate(Protocol):
 
     @property
     def shading_sigma(self) -> float:
-        """Relative difference (1-sigma) of the marker's brightness between its limb and a little inside."""
+        """Relative difference (1-sigma) of the marker's brightness between its limb and slightly further inside."""
         ...
 
     def mask(self, image: ImageArray) -> ImageArray:
@@ -35,7 +35,7 @@ class Gate(Protocol):
         ...
 
     def follow(self, pixels: ImageArray) -> None:
-        """Learn from BGR pixels (height, width, 3) of the middle of a ball that was accepted."""
+        """Learn from BGR pixels (height, width, 3) of the middle of an accepted ball."""
 
     def reset(self) -> None:
         """Forget the learned colour."""
@@ -44,8 +44,8 @@ class Gate(Protocol):
 class ColourGate:
     """Gate for pixels of one band of hues.
 
-    The band follows the ball's colour through changing light: slowly, only by pixels of accepted fixes, and never
-    farther from where it began than `_Settings.farthest` says, so that it cannot walk off to another thing.
+    The band follows the ball's colour through changing light: slowly, only by pixels of accepted fixes, and at most
+    `_Settings.farthest` from its initial position, so that it cannot drift to another object.
     """
 
     shading_sigma = 0.3
@@ -55,7 +55,7 @@ class ColourGate:
         self._use(band)
 
     def follow(self, pixels: ImageArray) -> None:
-        """Learn from BGR pixels (height, width, 3) of the middle of a ball that was accepted."""
+        """Learn from BGR pixels (height, width, 3) of the middle of an accepted ball."""
         hsv = cv2.cvtColor(pixels, cv2.COLOR_BGR2HSV).reshape(-1, 3).astype(np.float64)
         off_deg = (2.0 * hsv[:, 0] - self._band.hue_deg + 180.0) % 360.0 - 180.0
         first, rate = self._first, _Settings.followed
@@ -105,7 +105,7 @@ class BrightGate:
     shading_sigma = 0.1
 
     def __init__(self, min_brightness: float) -> None:
-        """Pixels from `min_brightness` on count, where 1 is white."""
+        """Accept pixels from `min_brightness` on, where 1 is white."""
         self._first = self._lowest = 255.0 * min_brightness
 
     def mask(self, image: ImageArray) -> ImageArray:
@@ -114,7 +114,7 @@ class BrightGate:
         return cast(ImageArray, cv2.threshold(grey, self._lowest, 255, cv2.THRESH_BINARY)[1])
 
     def follow(self, pixels: ImageArray) -> None:
-        """Take half of the ball's brightness for the limit, between half of the configured one and that."""
+        """Set the limit to half of the ball's brightness, clipped to between half and all of the configured limit."""
         seen = float(np.median(cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)))
         self._lowest = _followed(self._lowest, _Settings.room * seen, self._first)
 

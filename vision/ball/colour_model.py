@@ -126,7 +126,7 @@ def _apart_deg(hue_deg: NDArray[np.floating], other_deg: float) -> FloatArray:
 
 
 def _band(pixels: ImageArray) -> HueBand:
-    """Return the band around the pixels' hues (n, 3 of HSV), with room for other light."""
+    """Return the band around the pixels' hues (n, 3 of HSV), with a margin for other light."""
     middle = _mean_hue_deg(pixels)
     reach = float(np.quantile(_apart_deg(pixels[:, 0] * 2.0, middle), 1.0 - 2 * _Settings.share)) + _Settings.margin_deg
     saturation, value = (float(np.quantile(pixels[:, channel], 2 * _Settings.share)) / 255.0 for channel in (1, 2))

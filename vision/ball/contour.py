@@ -1,12 +1,12 @@
 """Measure a ball's edge along rays to a hundredth of a pixel, by matched filters adapted to the background.
 
-The filters are those of `contour_filters`. The texture of a ray's background is the most likely one given its samples.
+The filters are those of `contour_filters`. Each ray uses the background texture that is most likely given its samples.
 Colours are rotated so that the first channel is the ball's own colour. Its shading is unknown there, while the other
 two channels show only the ball's gloss.
 
 Each channel gives its own estimate of the edge. A narrow object along the limb, such as a bar or the rest of a box that
 the ball hides, mixes its light into each channel differently, so the estimates differ. The residuals of the fit do not
-show this, because whole arcs are shifted alike. The disagreement of the channels does, and such rays get low weight.
+show this, because whole arcs are shifted together. Rays whose channels disagree therefore get low weight.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Limb:
 
     @property
     def evenness(self) -> float:
-        """Evenness of the weights: 1 if all rays count alike, k/n if k of n rays do and the others have no weight."""
+        """Evenness of the weights: 1 if all rays have equal weight, k/n if k of n rays do and the others have none."""
         return float(self.weight.sum()) ** 2 / (len(self.weight) * float(self.weight @ self.weight))
 
     @property
@@ -53,12 +53,12 @@ class Limb:
 def find_limb(
     image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray, blur_px: float
 ) -> Limb | None:
-    """Measure the edge near an outline that is right to a few tenths of a pixel; None if no ball shows there.
+    """Measure the edge near an outline that is accurate to a few tenths of a pixel; return None if no ball is visible.
 
     Args:
         image: BGR, shape (height, width, 3), grey levels.
         centre_px, radius_px, shape: the outline, see `sphere.Ellipse`.
-        blur_px: assumed blur of the edge, right to about a third of itself [px].
+        blur_px: assumed blur of the edge, accurate to about a third [px].
     """
     rays = rays_round(radius_px)
     at = places(radius_px, blur_px)

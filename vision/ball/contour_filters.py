@@ -1,14 +1,14 @@
 """Optimal linear filters for the position at which a ray of samples leaves a ball.
 
-Samples at t [px] along a ray, t = 0 where the outline is thought to be, are
+Samples at t [px] along a ray, t = 0 at the assumed outline, are
 
     ball(t) · S(t) + background(t) · (1 − S(t)) + shift · contrast · g(t) + noise,
 
-with S the blurred step from 1 on the ball to 0 beyond it and g its slope. What neither filter nor likelihood may take
-for known has a prior as a Gaussian process, in units of the noise: the background's level is free, its slope none or
-moderate, and its texture a random walk from the outline on. Towards its own colour the ball's level and its shading are
-free (a sphere's depends on the normal's part along the ray, √(1 − ρ²)); across that colour a ball shows nothing but
-gloss, which fades towards the limb. The rougher the background, the less a filter trusts samples far from the edge.
+with S the blurred step from 1 on the ball to 0 beyond it and g its slope. Unknown terms of both filter and likelihood
+have a Gaussian process as prior, in units of the noise. The background's level is free, its slope none or moderate, and
+its texture a random walk starting at the outline. In its own colour the ball's level and its shading are free (a
+sphere's depends on the normal's part along the ray, √(1 − ρ²)). Orthogonal to that colour a ball shows only gloss,
+which fades towards the limb. The rougher the background, the less a filter trusts samples far from the edge.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ from .settings import LimbSettings as _Settings
 class Filters:
     """One filter for each of k textures of the background, over m samples of a ray in units of their noise."""
 
-    # what samples (n, m) are multiplied by, shape (m, l + 3k). The squares of the first l columns' results make the
+    # matrix applied to samples (n, m), shape (m, l + 3k). The squares of the first l columns' results make the
     # likelihoods. Then there are k filters for the edge's shift times the contrast and its information, k for the
-    # blur's error times the same, and k for the contrast, ball less background at the edge.
+    # blur's error times the same, and k for the contrast, ball minus background at the edge.
     matrix: Float32Array
     groups: Float32Array  # 1 where a square belongs to a texture, else 0, shape (l, k)
     log_ratio: Float32Array  # logarithms of the covariances' determinants less that of the first texture, shape (k,)
     information: FloatArray  # inverse variances of shift and blur for a contrast of 1, shape (2, k) [1/px²]
 
     def apply(self, samples: Float32Array) -> tuple[Float32Array, Float32Array]:
-        """Return the textures' log-likelihoods (n, k) for samples (n, m), and what the filters find (n, 3, k)."""
+        """Return the textures' log-likelihoods (n, k) for samples (n, m), and the filters' results (n, 3, k)."""
         found = samples @ self.matrix
         squares, count = np.square(found[:, : len(self.groups)]), self.information.shape[1]
         return 0.5 * (squares @ self.groups - self.log_ratio), found[:, len(self.groups) :].reshape(-1, 3, count)
@@ -83,7 +83,7 @@ def _filters(at: tuple[float, ...], radius_px: float, blur_px: float, own_colour
     normal = _blurred_normal(t, radius_px, blur_px)
     gloss = (_Settings.gloss * np.clip(-t - _Settings.edge_blurs * blur_px, 0.0, None) ** 2) ** 2
     known = np.eye(len(t)) + np.diag(gloss) + level * np.outer(ball, ball) + fall * np.outer(normal, normal)
-    # Of a random walk from 0 to both sides.
+    # Covariance of a random walk from 0 to both sides.
     walk = 0.5 * (np.abs(t)[:, None] + np.abs(t) - np.abs(t[:, None] - t))
     rows: list[tuple[FloatArray | float, ...]] = []
     for roughness, slope_variance in _Settings.textures:
@@ -113,13 +113,14 @@ def _filters(at: tuple[float, ...], radius_px: float, blur_px: float, own_colour
 def _root(matrix: FloatArray) -> FloatArray:
     """Return a (m, l) whose product with its transpose is a positive semidefinite matrix (m, m)."""
     values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
-    kept = values > np.sqrt(np.finfo(np.float64).eps)  # less tells two textures apart by less than thousandths
+    kept = values > np.sqrt(np.finfo(np.float64).eps)  # less changes likelihoods by less than thousandths
     return np.asarray(vectors[:, kept] * np.sqrt(values[kept]), np.float64)
 
 
 def _best_filter(cov: FloatArray, signal: FloatArray) -> tuple[FloatArray, float]:
-    """Return the minimum-variance linear filter (m,) for the amplitude of `signal` (m,) times its information, and that
-    information.
+    """Return the minimum-variance linear filter (m,) for the amplitude of `signal` (m,), multiplied by its information.
+
+    Return the information too.
     """
     weighted: FloatArray = np.linalg.solve(cov, signal).astype(np.float64)
     return weighted, float(signal @ weighted)

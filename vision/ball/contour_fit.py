@@ -50,10 +50,10 @@ class _Fit:
 def fit_limb(
     image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray, blur_px: float
 ) -> Circle | None:
-    """Fit an ellipse to the limb near the given outline, which must be right to about half a pixel.
+    """Fit an ellipse to the limb near the given outline, which must be accurate to about half a pixel.
 
-    It starts from the blur `blur_px`, and ends with the one that the limb shows. Return None if there is no ball's limb
-    all around. If the iteration has not settled, its last step is added to the covariance.
+    It starts from the blur `blur_px`, and ends with the measured blur of the limb. Return None if there is no ball's
+    limb all around. If the iteration has not settled, its last step is added to the covariance.
     """
     looks = 0
     while True:
@@ -65,7 +65,7 @@ def fit_limb(
         centre_px, radius_px = centre_px + shape @ fit.solution[:2], radius_px + growth
         moved_px, widened_px = max(math.hypot(u, v), abs(growth)), limb.blur_px - blur_px
         blur_px, looks = limb.blur_px, looks + 1
-        # Where the image was not anti-aliased, the circle is not used.
+        # If the image was not anti-aliased, the circle is not used.
         aliased = blur_px < _Settings.aliased_px
         settled = (aliased or moved_px < _Settings.settled_px) and abs(widened_px) < _Settings.settled_px
         if settled or looks == _Settings.looks:
@@ -83,7 +83,7 @@ def fit_limb(
     cov = fewer**2 * density * fit.inverse
     if not settled:
         cov += np.outer(fit.solution, fit.solution)
-    # A blurred disc's edge, where it is steepest, is nearer to the centre than the disc's.
+    # A blurred disc's steepest edge is nearer to the centre than the disc's edge.
     radius_px += blur_px**2 / (2.0 * radius_px)
     is_round = off_px < _Settings.round_share * radius_px
     unrest = 0.0 if is_round else math.sqrt(around.slow * around.quick) / excess
@@ -118,5 +118,5 @@ def _pulls(full: FloatArray, used: FloatArray, residual: FloatArray) -> FloatArr
     share = np.divide(used, full, out=np.zeros_like(full), where=full > 0)
     told = np.count_nonzero(full)
     mean = float(share.sum()) / told
-    slope = float(np.sum(2.0 * share**2 - share)) / told  # above 0, since half of the residuals are not far off
+    slope = float(np.sum(2.0 * share**2 - share)) / told  # positive, since half of the residuals are small
     return np.sqrt(full) * residual * share * (math.sqrt(mean) / slope)

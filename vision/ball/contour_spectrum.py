@@ -1,8 +1,8 @@
 """Estimate the centre's error from the residuals round an outline, decomposed into waves.
 
 Neighbouring points of an outline share pixels and background, so their variance alone would underestimate the error. A
-shift of the centre is the wave that goes once round. The fit has removed it, so its size is estimated from the next
-slowest waves.
+shift of the centre is the wave with one period round the outline. The fit has removed it, so its size is estimated from
+the next slowest waves.
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ class Waves:
 
     @property
     def mean(self) -> float:
-        """Mean of the slow and the quick waves' power, for noise that is the same in both."""
+        """Mean of the slow and the quick waves' power, for noise that is equal in both."""
         return 0.5 * (self.slow + self.quick)
 
     def once_round(self) -> float:
-        """Variance in the wave that goes once round.
+        """Variance in the wave with one period round the outline.
 
-        Pixel noise gives all waves the same power; what is behind the ball disturbs whole arcs and makes the slow ones
-        larger. So their excess over the quick ones counts once more.
+        Pixel noise gives all waves the same power. The background of the ball disturbs whole arcs and makes the slow
+        waves larger, so their excess over the quick ones counts twice.
         """
-        # Student's t with two degrees of freedom per wave: 1-sigma of a spread that is itself estimated.
+        # Student's t with two degrees of freedom per wave: 1-sigma of an estimated spread.
         return (1.0 + 0.25 / self.count) ** 2 * (self.slow + max(0.0, self.slow - self.quick))
 
 
 def waves(residual: FloatArray, radius_px: float) -> Waves:
     """Return the waves in the residuals (n,) of an outline's points, evenly spread around it; 0 if there are none."""
-    first = 2  # the fit of a circle takes the slower ones out
+    first = 2  # the fit of a circle removes the slower ones
     quickest = len(residual) // 2
     last_slow = min(max(first + _Settings.least_waves - 1, round(radius_px / _Settings.wave_radius_px)), quickest - 1)
     last_quick = min(max(last_slow + 1, min(2 * last_slow, round(radius_px))), quickest)
@@ -58,9 +58,7 @@ def waves(residual: FloatArray, radius_px: float) -> Waves:
 
 @lru_cache
 def _band(first: int, last_slow: int, last_quick: int) -> tuple[FloatArray, FloatArray, float]:
-    """Return the squares of all wave numbers, the shares of the slow ones in their mean, and the effective number of
-    these.
-    """
+    """Return the squares of all wave numbers, the slow ones' weights in their mean, and their effective number."""
     squares = np.arange(first, last_quick + 1, dtype=np.float64) ** 2
     weight = 1.0 / squares[: last_slow - first + 1]
     share = weight / weight.sum()

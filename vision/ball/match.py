@@ -25,20 +25,20 @@ class StereoMatcher:
         self._calibration, self._config = calibration, config
 
     def match(self, left: Sequence[Disc], right: Sequence[Disc]) -> Location | Reason:
-        """Return the one pair that fits, or the reason for none; both sequences hold at least one disc."""
+        """Return the one pair that fits, or the reason for none; both sequences contain at least one disc."""
         outcomes = [self._check(one, other) for one, other in product(left, right)]
         found = _without_reflections([outcome for outcome in outcomes if isinstance(outcome, Location)])
         if len(found) == 1:
             return found[0] if found[0].unrest < _Settings.most_unrest else Reason.OCCLUDED
         if found:
             return Reason.AMBIGUOUS
-        # The check that the best pair failed at.
+        # The check that rejected the best pair.
         return Reason.SIZE_MISMATCH if Reason.SIZE_MISMATCH in outcomes else Reason.EPIPOLAR
 
     def doubt(self, found: Location, left: Sequence[Disc], right: Sequence[Disc]) -> Reason | None:
         """Return the reason why the pair `found` may not be the marker, or None.
 
-        Another pair, of discs measured or rough, may be it too, or `found` may be a mirrored copy of that one.
+        Another pair, of measured or rough discs, may be the marker too, or `found` may be a mirror image of that pair.
         """
         others = [
             [disc for disc in discs if np.linalg.norm(disc.centre_px - centre_px) > disc.radius_px]
@@ -57,8 +57,8 @@ class StereoMatcher:
         """Return True if a disc of one eye may be a second marker that the other eye sees too, but not as a disc.
 
         Args:
-            disc: measured or rough, and not the marker that was found.
-            others: the discs of the other eye; a pair with one of them has already been checked.
+            disc: a measured or rough disc, not that of the marker found.
+            others: the discs of the other eye; pairs with these were checked before.
             mask: pixels of the marker's colour in the other eye, shape (height, width).
             found: the marker.
             in_left: True if `disc` is the left eye's.
@@ -93,14 +93,14 @@ class StereoMatcher:
         sigma = math.sqrt(location.variances_px[1] + location.variances_px[3])
         if abs(vl - vr) > _Settings.epipolar_px + _Settings.epipolar_sigmas * sigma:
             return Reason.EPIPOLAR
-        # How far apart noise may bring the sizes that the two eyes see.
+        # Noise of the difference between the sizes in the two eyes.
         size_sigma = math.hypot(*location.size_sigmas.tolist())
         sizes: list[float] = location.sizes.tolist()
         if not self._sizes_fit(sizes, size_sigma):
             return Reason.SIZE_MISMATCH
         apart = math.log(sizes[0] / sizes[1]) / math.hypot(size_sigma, _Settings.size_tolerance), (vl - vr) / sigma
-        # What pulls one eye's centre does not pull both alike: it shows in the sizes and in the rows.
-        # Birge's ratio, squared, less the 1 that chance makes of it.
+        # A disturbance shifts the two eyes' centres differently: it shows in the sizes and in the rows.
+        # Birge's ratio, squared, minus 1, its expectation by chance.
         doubt = max(1.0, (apart[0] ** 2 + apart[1] ** 2) / len(apart) - 1.0)
         return replace(location, cov=doubt * location.cov)
 
@@ -117,7 +117,7 @@ class StereoMatcher:
 
 
 def _without_reflections(found: list[Location]) -> list[Location]:
-    """Return the locations without the dimmer, farther copies that a mirror or window makes of the brightest one."""
+    """Return the locations without the dimmer, farther mirror images of the brightest one."""
     if len(found) < 2:
         return found
     first = max(found, key=lambda one: one.level)
@@ -125,5 +125,5 @@ def _without_reflections(found: list[Location]) -> list[Location]:
 
 
 def is_reflection_of(one: Location, level: float, distance_m: float) -> bool:
-    """Return True if `one` may be the mirrored copy of a marker of `level` [grey levels] at `distance_m` [m]."""
+    """Return True if `one` may be the mirror image of a marker of `level` [grey levels] at `distance_m` [m]."""
     return one.level < _Settings.mirrored_light * level and float(np.linalg.norm(one.x)) > distance_m

@@ -23,7 +23,7 @@ class OneEyeBallTracker:
     """
 
     def __init__(self, calibration: StereoCalibration, config: VisionConfig | None = None) -> None:
-        """Prepare for images of `calibration`; raise ConfigError if it describes no camera."""
+        """Prepare for images of `calibration`; raise ConfigError if it does not describe a camera."""
         check_calibration(calibration)
         self.calibration = calibration
         self.config = config or VisionConfig()
@@ -74,7 +74,7 @@ class OneEyeBallTracker:
             distance *= outline.radius_px / disc.radius_px
             sight = self._sight(disc, distance)
         x = distance * sight
-        # A pixel error only turns the line of sight; the error along it comes from the size.
+        # A pixel error only rotates the line of sight; the error along it comes from the size.
         across = (np.eye(3) - np.outer(sight, sight))[:, :2] * x[2] / self._eye.focal_px
         pixels = disc.cov_px + self.calibration.pixel_sigma**2 * np.eye(2)
         depth = (disc.radius_sigma_px / disc.radius_px) ** 2 + _Settings.radius_sigma**2

@@ -1,11 +1,11 @@
 """Fit the sub-pixel outline of a ball's image.
 
-The image is sampled along rays from a rough centre. Along each ray the pixels go from the ball's colour to the
+The image is sampled along rays from a rough centre. Along each ray the pixels change from the ball's colour to the
 background's, and the share of the ray that the ball covers gives its edge. Coverage is measured along the direction in
-colour space that best separates ball and background, with little weight on the ball's brightness, which varies with
-shading: a shaded limb before a grey wall is found by its hue, a limb before black by its light. Both ends of the
-mixture are taken next to the edge, per ray. So neither shading nor highlights bias the centre, and an anti-aliased
-edge counts by its coverage.
+colour space that best separates ball and background. The ball's brightness, which varies with shading, has little
+weight: a shaded limb in front of a grey wall is found by its hue, a limb in front of black by its light. Both ends of
+the mixture are sampled next to the edge, per ray. So neither shading nor highlights bias the centre, and an
+anti-aliased edge counts by its coverage.
 """
 
 from __future__ import annotations
@@ -75,12 +75,12 @@ class _Fit:
 def fit_outline(
     image: Float32Array, gate: Gate, centre_px: FloatArray, radius_px: float, shape: FloatArray
 ) -> Outline | None:
-    """Refine a rough circle to the outline of the ball, by coverage; None when there is no outline near it.
+    """Refine a rough circle to the outline of the ball, by coverage; return None if there is no outline near it.
 
     Args:
         image: BGR, shape (height, width, 3), grey levels.
         centre_px: rough centre (2,), in the pixel coordinates of `image` [px].
-        radius_px: rough radius [px], right to about a fifth.
+        radius_px: rough radius [px], accurate to about a fifth.
         shape: the ellipse's shape (2, 2), see `sphere.Ellipse`.
     """
     fit, moved_px = _step(image, gate, centre_px, radius_px, shape, _Settings.narrow_px)
@@ -104,7 +104,7 @@ def fit_outline(
 def refine_outline(
     image: Float32Array, gate: Gate, rough: Outline, shape: FloatArray, blur_px: float
 ) -> Outline | None:
-    """Refine an outline's centre, radius and covariance by the limb; None if there is no ball's limb.
+    """Refine an outline's centre, radius and covariance by the limb; return None if there is no ball's limb.
 
     Args:
         blur_px: rough blur of the limb, from which the fit starts [px].
@@ -191,7 +191,7 @@ def _find_edges(
 def _discriminant(
     level: FloatArray, colour: FloatArray, background: FloatArray, shading_sigma: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Fisher's linear discriminant between ball and background, ray by ray.
+    """Compute Fisher's linear discriminant between ball and background, ray by ray.
 
     The ball is `level · colour`, with a covariance of (σ_s · level)² along `colour` and of σ_c² in all channels.
 
@@ -211,10 +211,10 @@ def _discriminant(
 
 
 def _fit(edges: _Edges, agreed: FloatArray | None) -> _Fit | None:
-    """Fit a circle by least squares; points too far off are left out in turn.
+    """Fit a circle by least squares, leaving out points that are too far off in turn.
 
     Args:
-        agreed: circle (3,) [px] on which most points agree; None if it is to be found.
+        agreed: circle (3,) [px] that most points agree on; None to search for it.
     """
     weight = _agreeing(edges) if agreed is None else _near(edges, edges.distance_px - edges.rays @ agreed)
     fit: _Fit | None = None
@@ -244,7 +244,7 @@ def _near(edges: _Edges, residual: FloatArray) -> FloatArray:
 def _outline(fit: _Fit, centre_px: FloatArray, shape: FloatArray) -> Outline:
     edges, residual, radius_px = fit.edges, fit.residual, float(fit.solution[2])
     inverse = waves(np.sqrt(fit.used) * residual, radius_px).once_round() * fit.inverse
-    # What hides a ball moves its edge inwards; outwards does what has its colour behind it.
+    # An object in front of a ball moves its edge inwards; one of its colour behind it moves it outwards.
     apart = fit.apart & ~edges.uneven
     hidden = edges.covered | (apart & (residual < 0))
     return Outline(

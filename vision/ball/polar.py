@@ -19,7 +19,7 @@ from .settings import OutlineSettings as _Settings
 def rays_round(radius_px: float) -> FloatArray:
     """Return rays about a pixel apart on the outline, as rows (cos, sin, 1) of their angles, shape (n, 3).
 
-    These are the derivatives of a circle's points along the rays by its centre and its radius, too.
+    These are also the derivatives of a circle's points along the rays by its centre and its radius.
     """
     return _rays(min(max(round(2 * math.pi * radius_px), 24), 400))[0]
 

@@ -1,4 +1,4 @@
-"""Settings of the tracker of balls, and how much they matter.
+"""Settings of the ball tracker and their sensitivity.
 
 Sensitivity: each at 0.3 and 3 times, over the 354 frames of the tests. An outcome is a fix or the reason for a miss.
 """

@@ -1,8 +1,8 @@
-"""Track the apparent size of the ball and use it to judge each fix.
+"""Track the apparent size of the ball and use it to check each fix.
 
 Fingertips over the outline, or a nearby edge of the ball's hue, shift a measured centre and make the ball seem
-smaller or larger by the same amount. Both eyes may be affected alike, so that neither the rows nor the two sizes
-contradict each other. The size then still contradicts that of the previous fixes.
+smaller or larger by the same amount. If both eyes are affected equally, neither the rows nor the two sizes contradict
+each other. But the size then contradicts that of the previous fixes.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from .settings import TrackSettings as _Settings
 
 
 class BallSize:
-    """The ball's radius as a share of the configured one."""
+    """The ball's radius as a fraction of the configured one."""
 
     def __init__(self, calibration: StereoCalibration) -> None:
         self._calibration = calibration
@@ -41,7 +41,7 @@ class BallSize:
         return Reason.SIZE_MISMATCH if is_other else None
 
     def doubted(self, found: Location) -> Location:
-        """Return `found` with each centre's covariance inflated by its size error, beyond what noise explains."""
+        """Return `found` with each centre's covariance increased by its size error beyond noise."""
         off, sigma = self._off(found)
         # [px²], in both directions: the direction of the shift is unknown.
         excess = np.maximum(0.0, off**2 - (_Settings.free_sigmas * sigma) ** 2) * found.radii_px**2

@@ -88,12 +88,12 @@ class _Sighting:
 class StereoTracker:
     """Tracker of one coloured ball in rectified stereo images.
 
-    It searches near the position predicted from the last frames, else in the whole images. `track` always returns a
-    fix or the reason for a miss.
+    It searches near the position predicted from the last frames, otherwise in the whole images. `track` always returns
+    a fix or the reason for a miss.
     """
 
     def __init__(self, calibration: StereoCalibration, config: VisionConfig | None = None) -> None:
-        """Prepare for images of `calibration`; raise ConfigError if it describes no stereo pair."""
+        """Prepare for images of `calibration`; raise ConfigError if it does not describe a stereo pair."""
         check_calibration(calibration)
         self.calibration = calibration
         self.config = config or VisionConfig()
@@ -109,7 +109,7 @@ class StereoTracker:
         self._ambiguous_t = -math.inf
         self._sighted: tuple[_Sighting, ...] = ()
         self._fixes = 0
-        self._blur_px = LimbSettings.usual_blur_px  # of the marker's contour, where it was last as predicted [px]
+        self._blur_px = LimbSettings.usual_blur_px  # blur of the marker's contour, from its last predicted image [px]
 
     def track(self, frame: StereoFrame) -> MarkerFix | MarkerMiss:
         """Return the marker in `frame`, in the left optical frame, or the reason for a miss.
@@ -140,7 +140,7 @@ class StereoTracker:
         return MarkerFix(frame.t, frozen_array(found.x), frozen_array(found.cov), (ul, vl, ur, vr))
 
     def forget(self) -> None:
-        """Look for the marker in the whole images next time."""
+        """Search the whole images next time."""
         self._track = self._last = self._refused = None
         self._ambiguous_t, self._sighted = -math.inf, ()
         self._blur_px = LimbSettings.usual_blur_px
@@ -148,7 +148,7 @@ class StereoTracker:
         self._size.forget()
 
     def _look(self, frame: StereoFrame, in_left: _Expected | None, in_right: _Expected | None) -> Location | Reason:
-        """Return the marker near its prediction, else anywhere in view."""
+        """Return the marker near its prediction, otherwise anywhere in view."""
         left_image, right_image = frame.images
         left, left_rough = self._discs(left_image, in_left)
         if left is Reason.NO_MARKER:
@@ -172,7 +172,7 @@ class StereoTracker:
         return answer
 
     def _rivalry(self, frame: StereoFrame, found: Location, left: list[Disc], right: list[Disc]) -> Reason | None:
-        """Return the reason why something else in view, measured or not, may be the marker instead."""
+        """Return the reason why another object in view, measured or not, may be the marker instead."""
         reason = self._matcher.doubt(found, left, right)
         if reason is not None:
             return reason
@@ -188,7 +188,7 @@ class StereoTracker:
         return None
 
     def _discs(self, image: ImageArray, expected: _Expected | None) -> tuple[list[Disc] | Reason, list[Disc]]:
-        """Return the discs in one eye, or the reason why there is none; and round objects that could not be measured.
+        """Return the discs in one eye, or the reason for none, and the round objects that could not be measured.
 
         Once a disc fits the prediction, patches that are not whole are skipped.
         """
@@ -198,7 +198,7 @@ class StereoTracker:
         rough: list[Disc] = []
         reason: Reason | None = None
         if expected is not None and not any(patch.is_whole and expected.fits(patch) for patch in patches):
-            # What is behind the ball has its colour, too.
+            # The background of the ball has its colour, too.
             found = self._where_expected(image, expected)
             discs += [] if found is None else [found]
         for patch in patches:
@@ -222,7 +222,7 @@ class StereoTracker:
         return outcome if isinstance(outcome, Disc) and expected.fits(outcome) else None
 
     def _measured(self, image: ImageArray, patch: Patch, expected: _Expected | None) -> Disc | Reason:
-        """Return the ball at a patch, or the reason for none; start from its last blur where it is expected."""
+        """Return the ball at a patch, or the reason for none; start from its last blur if it is expected there."""
         blur_px = LimbSettings.usual_blur_px if expected is None else self._blur_px
         outcome = measure(image, patch, self._eye, self._gate, self.config, blur_px)
         if isinstance(outcome, Disc) and expected is not None and expected.fits(outcome):
@@ -270,7 +270,7 @@ class StereoTracker:
         return reason
 
     def _refused_again(self, t: float, found: Location) -> Reason | None:
-        """Return the reason of a recent refusal if this is the same object, else None."""
+        """Return the reason of a recent refusal if this is the same object, otherwise None."""
         refused = self._refused
         if refused is None or not 0 <= t - refused.t <= LONGEST_PAUSE_S:
             return None
@@ -278,16 +278,16 @@ class StereoTracker:
         return refused.reason if alike and self._within_reach(found.x, refused.x, t - refused.t) else None
 
     def _within_reach(self, x: FloatArray, from_x: FloatArray, seconds: float) -> bool:
-        """Return True if an object can have moved from one place (3,) [m] to another in that time."""
+        """Return True if an object can have moved from `from_x` to `x` (3,) [m] in that time."""
         reach_m = _Settings.jump_radii * self.config.radius_m + _Settings.fastest_m_s * min(
             seconds, _Settings.fair_pause_s
         )
         return float(np.linalg.norm(x - from_x)) <= reach_m
 
     def _doubt_without_track(self, t: float, found: Location) -> Reason | None:
-        """Why what was found may not be the marker though nothing was, a moment ago."""
+        """Return the reason why a detection without a recent track may not be the marker, or None."""
         if 0 <= t - self._ambiguous_t <= _Settings.longest_memory_s:
-            # One of two that were alike has gone; nothing tells which.
+            # One of two similar objects has disappeared; the remaining one may be the wrong one.
             return Reason.AMBIGUOUS
         is_copy = any(
             0 <= t - seen.t <= _Settings.longest_memory_s
@@ -309,7 +309,7 @@ class StereoTracker:
         self._track = _Track(t, found.centres_px, velocity, radius_px)
 
     def _follow_colour(self, frame: StereoFrame, found: Location) -> None:
-        """Show the colours' gate the middle of the ball in the left image, now and then."""
+        """At intervals, let the colour gate learn from the middle of the ball in the left image."""
         self._fixes += 1
         if self._fixes % _Settings.colour_every:
             return

@@ -39,10 +39,10 @@ class Board:
         square_m: side of a square [m].
         marker_m: side of a marker's black frame [m]; None: 0.75 of a square.
         dictionary: OpenCV name of the markers' dictionary without DICT_; None: the smallest of 4×4 bits.
-        pattern: a `chessboard` has no markers, so all of it must be in view.
+        pattern: `charuco` or `chessboard`; a chessboard has no markers, so all of it must be in view.
 
     Raises:
-        ConfigError: the board is not possible.
+        ConfigError: such a board is impossible.
     """
 
     columns: int = 8
@@ -106,7 +106,7 @@ class Board:
 
     @property
     def name(self) -> str:
-        """Description of the board for people."""
+        """Description of the board, for messages."""
         squares = f"{self.columns}x{self.rows} squares of {1e3 * self.square_m:g} mm"
         return f"{squares}, {self.dictionary_name}" if self.pattern == "charuco" else f"{squares}, plain"
 
@@ -140,7 +140,7 @@ def marker_bits(board: Board, number: int) -> FloatArray:
 
 
 def squares_seen(numbers: Sequence[int], corners_px: Sequence[FloatArray], board: Board) -> str | None:
-    """Return None if the markers fit the board; else the squares, such as 10x7, of the smallest board they fit.
+    """Return None if the markers fit the board; otherwise the squares, such as 10x7, of the smallest board they fit.
 
     If they fit no board, return the squares of `board`.
 

@@ -38,8 +38,8 @@ class Corners:
     """A board's corners in one image.
 
     Attributes:
-        numbers: which of the board's corners, shape (n,), increasing.
-        px: where they are, shape (n, 2) [px].
+        numbers: numbers of the corners found, shape (n,), increasing.
+        px: image coordinates of the corners, shape (n, 2) [px].
         blur_px: 1-sigma of the edges' blur in the blurrier direction [px].
     """
 
@@ -125,7 +125,7 @@ class BoardDetector:
         return NotFound("not_found", "no board. Bring it into view, larger, and not in glare")
 
     def _mirrored(self, grey: ImageArray, markers: int) -> NotFound | None:
-        """Return the fault if a mirrored image has more markers; some of them mirrored look like others."""
+        """Return the fault if a mirrored image has more markers; some markers look like others when mirrored."""
         mirrored = _markers(np.ascontiguousarray(grey[:, ::-1]), self.board.dictionary_name)
         if len(mirrored) < max(_Settings.least_markers, markers + 1):
             return None
@@ -160,7 +160,7 @@ class BoardDetector:
     def _other_dictionary(self, grey: ImageArray, wanted: str | None) -> str | None:
         """Return the family of other markers in the image, if there are any.
 
-        The search among a thousand words of each family takes seconds, so that it comes last.
+        The search among a thousand words of each family takes seconds, so it comes last.
         """
         bits = "" if wanted is None else wanted.split("_")[0]
         families = [name for name in _FAMILIES if name.split("_")[0] != bits or "APRILTAG" in name]
@@ -174,7 +174,7 @@ class BoardDetector:
         return None
 
     def _tried(self, grey: ImageArray, families: Sequence[str]) -> Iterator[list[str]]:
-        """Yield families to search for: that of an earlier image, those of which the first words are seen, all."""
+        """Yield families to search for: an earlier image's, then those whose first words are visible, then all."""
         if self._other_family is not None:
             yield [self._other_family]
         largest, smallest = f"_{SIZES[-1]}", f"_{SIZES[0]}"
@@ -193,7 +193,7 @@ def _markers(grey: ImageArray, family: str) -> list[int]:
 
 
 def _plain_squares(grey: ImageArray) -> tuple[int, int] | None:
-    """Return the squares, the more first, of the chessboard in an image, or of as much of one as is in view."""
+    """Return the larger and the smaller number of squares of the chessboard in an image, or of its visible part."""
     grid = any_grid(grey)
     if grid is None:
         return None
@@ -212,7 +212,7 @@ def any_grid(grey: ImageArray) -> FloatArray | None:
 def measured_grid(grey: ImageArray, rough_px: ArrayLike, board: Board) -> Corners:
     """Return all corners of a plain chessboard in order, from rough ones (rows, columns, 2) [px].
 
-    They are refined if they then lie better on a plane: outer squares that are cut short disturb some.
+    They are refined if they then lie better on a plane: truncated outer squares disturb some.
     """
     ordered = _in_order(grey, np.asarray(rough_px, dtype=np.float64), board).reshape(-1, 2)
     numbers = np.arange(len(ordered))
@@ -228,14 +228,14 @@ def _scatter(board: Board, px: FloatArray) -> float:
 
 
 def on_plane(board: Board, px: FloatArray) -> FloatArray:
-    """Return the image of a plane (n, 2) [px] that is nearest to all corners of a board."""
+    """Return the image of a plane (n, 2) [px] that best fits all corners of a board."""
     places = board.corners_m[:, :2] / board.square_m
     H, _ = cv2.findHomography(places, px, 0)
     return np.asarray(cv2.perspectiveTransform(places[:, None], H)[:, 0], dtype=np.float64)
 
 
 def _in_order(grey: ImageArray, grid: FloatArray, board: Board) -> FloatArray:
-    """Return the corners (rows, columns, 2), turned so that the square up and left of the first one is black.
+    """Return the corners (rows, columns, 2), rotated so that the square up and left of the first one is black.
 
     If the pattern is ambiguous, the first corner is the one nearer to the image's upper left.
     """

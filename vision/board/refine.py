@@ -2,8 +2,8 @@
 
 At a corner two edges cross. Every gradient on them is perpendicular to the line to the corner, which gives the corner
 as a least-squares solution (Förstner & Gülch 1987; OpenCV's cornerSubPix). The edges of the markers disturb this. The
-pixels are therefore chosen along the board's own directions: a cross of two strips along the edges, which markers
-leave white. In oblique views a square window would have to be so small that half of the edges are lost.
+pixels are therefore chosen along the board's own directions: a cross of two strips along the edges, outside the
+markers. In oblique views a square window would have to be so small that half of the edges are lost.
 
 A lens bends the edges. Both arms of an edge then leave the corner to the same side, and a straight cross is biased:
 through a fisheye by some 0.03 px in the same direction for all corners off the axis. The bend of the edges is
@@ -40,7 +40,7 @@ class _Settings:
 
 
 def refined(grey: ImageArray, board: Board, numbers: IntArray, px: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Move the corners to where their edges cross, and drop those that cannot be determined.
+    """Move the corners to the intersections of their edges, and drop those that cannot be determined.
 
     Args:
         grey: the image, shape (height, width).
@@ -85,13 +85,13 @@ def _frames(board: Board, numbers: IntArray, px: FloatArray) -> FloatArray:
 
 
 def _bends(board: Board, numbers: IntArray, px: FloatArray) -> FloatArray:
-    """Return how far the edges across and down deviate from their tangents one square from each corner, as columns.
+    """Return the deviation of the edges across and down from their tangents one square from each corner, as columns.
 
     Shape (n, 2, 2) [px]; 0 where fewer than three corners of an edge are known.
     """
     steps = np.arange(-_Settings.bending_steps, _Settings.bending_steps + 1)
     powers = np.stack([np.ones(len(steps)), steps, steps**2], axis=-1)
-    # A margin makes neighbours beyond the board unknown corners.
+    # With a margin, neighbours beyond the board become unknown corners.
     places = np.rint(board.corners_m[numbers, :2] / board.square_m).astype(int) + _Settings.bending_steps
     grid = np.full((board.columns + 2 * _Settings.bending_steps, board.rows + 2 * _Settings.bending_steps, 2), np.nan)
     grid[places[:, 0], places[:, 1]] = px
@@ -113,7 +113,7 @@ def _bends(board: Board, numbers: IntArray, px: FloatArray) -> FloatArray:
 def _crossings(
     slopes: FloatArray, start: FloatArray, frames: FloatArray, bends: FloatArray, board: Board
 ) -> FloatArray:
-    """Return where the edges cross near `start`, shape (n, 2) [px]; NaN where it cannot be determined."""
+    """Return the intersections of the edges near `start`, shape (n, 2) [px]; NaN if undetermined."""
     into_squares = np.linalg.inv(frames)
     # Width of the white strip between a square's edge and its marker.
     strip = 0.5 * (1.0 - board.marker_side_m / board.square_m)
@@ -122,7 +122,7 @@ def _crossings(
     half_widths = (
         np.maximum(strip_px - _Settings.blurred_px, np.minimum(strip_px, _Settings.least_strip_px)) * squares_a_px
     )
-    half_widths = np.minimum(half_widths, _Settings.reach)  # a plain square may be cut not far beyond
+    half_widths = np.minimum(half_widths, _Settings.reach)  # a plain square may be truncated a little farther out
     reach = min(
         int(np.ceil(_Settings.reach * np.abs(frames).sum(axis=2).max(initial=0.0))) + 1, _Settings.most_reach_px
     )
@@ -139,7 +139,7 @@ def _crossings(
         weights = _cross(np.abs(squares), half_widths[:, None])
         weighed = g * weights[..., None]
         G = weighed.mT @ g
-        # Edges of a single direction determine no crossing.
+        # Edges of a single direction do not determine an intersection.
         told = np.linalg.cond(G) < 1.0 / np.finfo(np.float64).eps
         # The tangent of an edge that has deviated by b passes the corner at -b.
         tangents = p + squares**2 @ bends.mT
@@ -153,9 +153,7 @@ def _crossings(
 
 
 def _cross(squares: FloatArray, half_widths: FloatArray) -> FloatArray:
-    """Return weights for places (..., 2) [squares from the corner]: a strip along each edge, fading at its end and
-    sides.
-    """
+    """Return weights for offsets (..., 2) [squares] from the corner: a strip along each edge with fading borders."""
     fade = np.clip((_Settings.reach - squares) / 0.12, 0.0, 1.0)
     within = np.clip((half_widths - squares) / (0.4 * half_widths), 0.0, 1.0)
     return np.maximum(within[..., 1] * fade[..., 0], within[..., 0] * fade[..., 1])

@@ -52,8 +52,7 @@ def _across(grey: ImageArray, numbers: NDArray[np.int64], px: FloatArray, board:
 
 
 def sharpest_edge_px(grey: FloatArray) -> float:
-    """Return the 1-sigma of the blur [px] of the sharpest edges in an image (height, width), with or without a
-    board.
+    """Return the 1-sigma of the blur [px] of the sharpest edges in an image (height, width), with or without a board.
 
     The direction of the largest blur counts: motion blurs along its own direction only.
     """
@@ -85,7 +84,7 @@ def _levels(grey: ImageArray, px: FloatArray) -> tuple[float, float]:
 
 
 def image_fault(grey: ImageArray) -> tuple[Literal["dark", "over_exposed", "blurred"], str] | None:
-    """Return kind and message of what is wrong with the whole image (height, width); None if nothing is."""
+    """Return kind and message of a fault of the whole image (height, width); None if there is no fault."""
     if is_black(grey):
         return "dark", "the image is black. Take the lens cap off; longer exposure, more light"
     if (white := too_white(grey)) is not None:

@@ -68,9 +68,9 @@ def solve(
 
     Args:
         corners_m: the board's corners, shape (n, 3) [m].
-        vector, poses: the start, as `Bundle` has them.
-        weights: as `Bundle` has them; None: all corners count alike.
-        prior: as `Bundle` has it; None: none.
+        vector, poses: the start, as in `Bundle`.
+        weights: as in `Bundle`; None for equal weights.
+        prior: as in `Bundle`; None for no prior.
 
     Raises:
         CalibrationError: the views do not determine the parameters.
@@ -141,13 +141,13 @@ def seen_with_slopes(
 
 
 def lenses_and_rest(model: Model, vector: FloatArray) -> tuple[tuple[Lens, ...], FloatArray]:
-    """Return the lenses in the rig's vector, and what stands behind them."""
+    """Return the lenses in the rig's vector, and the values behind them."""
     lenses = lenses_of(model, vector)
     return lenses, vector[len(lenses) * len(lenses[0].vector) :]
 
 
 def _in_right_eye(pose: FloatArray, right_eye: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Return a pose in the right eye's frame, and its Jacobians by the right eye's pose and by that in the left eye."""
+    """Return a pose in the right eye's frame, and its Jacobians by the right eye's pose and by the given pose."""
     composed = cv2.composeRT(pose[:3], pose[3:], right_eye[:3], right_eye[3:])
     r, t, r_r1, r_t1, r_r2, r_t2, t_r1, t_t1, t_r2, t_t2 = (np.asarray(each, dtype=np.float64) for each in composed)
     by_rig, by_pose = np.empty((2, POSE, POSE))
@@ -188,7 +188,7 @@ class Linear:
         """Return the next step of rig and poses; None if the equations have no solution."""
         try:
             normal, gradient, poses = self.reduced(damping)
-            if (np.diag(normal) <= 0.0).any():  # by rounding, far from any solution
+            if (np.diag(normal) <= 0.0).any():  # no solution, by rounding far from any minimum
                 return None
             scale = 1.0 / np.sqrt(np.diag(normal))
             rig = scale * np.linalg.solve(normal * np.outer(scale, scale), scale * gradient)

@@ -79,7 +79,7 @@ class Calibrated:
     fitted: Fitted  # the selected model
     rivals_px: dict[Model, float]  # held-out error of each candidate model that fits the cameras [px]
     coverage: Coverage  # image coverage of the views
-    # relative 1-sigma of the focal lengths over the views; None if nothing shows that a lens refocused
+    # relative 1-sigma of the focal lengths over the views; None without evidence that a lens refocused
     focal_spread: float | None
 
 
@@ -131,7 +131,7 @@ def _fits(
     if fits:
         return fits
     first, *others = refusals.values()
-    # A model that does not suit the lenses may misplace the eyes: one cause is sure only if all models say the same.
+    # An unsuitable model may misplace the eyes: a cause is certain only if all models agree on it.
     if len({_NUMBERS.sub("", str(each)) for each in (first, *others)}) == 1:
         raise first
     raise CalibrationError(together([f"{model} lenses: {error}" for model, error in refusals.items()]))
@@ -144,7 +144,7 @@ def fit(
     model: Model,
     eyes: tuple[Eye, ...] = EYES,
 ) -> Fitted:
-    """Fit one lens model; views that do not fit the others are left out, the worst first.
+    """Fit one lens model, leaving out views that do not fit the others, the worst first.
 
     Raises:
         CalibrationError: the eyes are misplaced, the views do not determine the lenses, the model folds the image
@@ -199,7 +199,7 @@ def _is_one_to_one(bundle: Bundle, image_size_px: tuple[int, int]) -> bool:
 def _stiffened(views: Sequence[View], corners_m: FloatArray, bundle: Bundle, image_size_px: tuple[int, int]) -> Bundle:
     """Refit a lens that folds over, with a prior that keeps the steepest term of its polynomial small.
 
-    A narrow lens hardly shows that term, and it may fold the image over where the board never was.
+    A narrow lens hardly determines that term, so it may fold the image over where the board was never seen.
     """
     count = 4 + len(DISTORTION_NAMES[bundle.model])
     prior, vector = np.zeros(len(bundle.vector)), bundle.vector.copy()
@@ -261,7 +261,7 @@ def _rig(fitted: Fitted, board: Board, asked: Asked) -> Rig:
     if len(lenses) == 1:
         return OneEyeRig(lenses[0], asked.image_size_px, (asked.serials[0],), unsure_by, made)
     left, right, rotation, translation = split(bundle.model, bundle.vector)
-    # An error of the board's size scales all lengths, and nothing else.
+    # An error of the board's size only scales all lengths.
     unsure_by[-3:, -3:] += asked.scale_sigma**2 * np.outer(translation, translation)
     serials = asked.serials[0], asked.serials[1]
     return StereoRig(left, right, rotation, translation, asked.image_size_px, serials, unsure_by, made)

@@ -43,7 +43,7 @@ class Check:
     square_m: float
     square_sigma_m: float
     nominal_m: float  # true side of the board's squares [m]
-    wrong: tuple[str, ...]  # messages for what no longer holds; empty if the calibration holds
+    wrong: tuple[str, ...]  # messages for figures that no longer hold; empty if the calibration holds
 
     @property
     def holds(self) -> bool:

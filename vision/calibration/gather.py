@@ -93,7 +93,7 @@ def gathered(pairs: Iterable[ImagePair], board: Board, tell: Callable[[str], Non
 
 
 def summarised(unusable: Sequence[Unusable], eyes: Sequence[Eye] = EYES) -> list[str]:
-    """Return one line for each eye and reason with the unusable images; reasons that differ in numbers only are one."""
+    """Return one line for each eye and reason with the unusable images; differences in numbers are ignored."""
     alike: dict[tuple[Eye, str], list[Unusable]] = {}
     for each in unusable:
         alike.setdefault((each.eye, _kind(each)), []).append(each)

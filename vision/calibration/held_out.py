@@ -22,7 +22,7 @@ class HeldOut:
     """Errors of each view when it was held out, except for its own pose."""
 
     squares: FloatArray  # sum of squared residuals of each view [px²]
-    freedom: NDArray[np.int64]  # image coordinates of each view minus those its pose takes
+    freedom: NDArray[np.int64]  # image coordinates of each view minus the parameters of its pose
 
     @property
     def rms_px(self) -> float:
@@ -44,7 +44,7 @@ def held_out(views: Sequence[View], corners_m: FloatArray, whole: Bundle) -> Hel
     """Cross-validate by views: hold out a tenth of them in turn and predict them.
 
     Args:
-        whole: the fit of all views, from which each part's fit starts. Corners rejected there do not count here.
+        whole: the fit of all views, from which each part's fit starts. Its rejected corners do not count here.
     """
     groups = np.arange(len(views)) % min(_Settings.folds, len(views))
     squares = np.zeros(len(views))
@@ -63,11 +63,11 @@ def held_out(views: Sequence[View], corners_m: FloatArray, whole: Bundle) -> Hel
 
 
 def covariance(views: Sequence[View], corners_m: FloatArray, whole: Bundle) -> FloatArray:
-    """Return the covariance of the rig's parameters, shape (p, p), without assuming independent corners of one view.
+    """Return the covariance of the rig's parameters, shape (p, p), without assuming independent corners within a view.
 
-    A board that is not flat, that moves between the two images, and a lens that no model describes move the corners of
-    a view together. So each view as a whole stands for its own variance: the delete-one jackknife (Efron 1982). Where
-    views disagree, the weights of all depend on each, so that they are found again without it.
+    A board that is not flat or moves between the two images, and a lens that no model describes, move the corners of
+    a view together. So the variance is estimated over whole views: the delete-one jackknife (Efron 1982). If views
+    disagree, the weights of all depend on each, so they are recomputed without it.
     """
     count = len(views)
     moved = np.zeros((count, len(whole.vector)))

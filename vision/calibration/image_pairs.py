@@ -84,7 +84,7 @@ def pair_files(
 
 
 def read_pairs(pairs: list[PairFiles], *, side_by_side: bool) -> Iterator[ImagePair]:
-    """Yield the images, one pair after the other; raise CalibrationError if a file is no image, or the sizes differ."""
+    """Yield the images pair by pair; raise CalibrationError if a file is not an image, or the sizes differ."""
     first: tuple[str, tuple[int, int]] | None = None
     for files in pairs:
         left = _read(files.left)

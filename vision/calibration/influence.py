@@ -20,7 +20,7 @@ class Influence:
 
     residual: FloatArray  # measured minus predicted, shape (corners, 2) [px]
     by_pose: FloatArray  # Jacobian of the prediction by the board's pose, shape (2 corners, 6)
-    free: FloatArray  # share of its variance that the fit leaves each corner, shape (corners,)
+    free: FloatArray  # share of its variance that remains in each corner's residual, shape (corners,)
 
 
 def influences(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> Iterator[Influence]:

@@ -1,4 +1,4 @@
-"""Recognise lenses that refocused between the views: each view fits another focal length."""
+"""Detect lenses that refocused between the views: each view fits another focal length."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from .view import View
 
 
 def focal_spread(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -> float | None:
-    """Return the relative 1-sigma of the focal lengths over the views; None if nothing shows that they differ.
+    """Return the relative 1-sigma of the focal lengths over the views; None without evidence that they differ.
 
-    Other errors leave residuals that a free focal length absorbs in part, so it competes with freedoms that absorb them
+    Other errors leave residuals that a free focal length absorbs in part. So it competes with freedoms that absorb them
     too: the ratio of fx and fy, a board that is bent or not rectangular, and one that moved between the two images.
     The shape that the board has in all views alike is removed first.
     """
@@ -55,7 +55,7 @@ def focal_spread(views: Sequence[View], corners_m: FloatArray, bundle: Bundle) -
         pulls.append((eye.T @ focal.T @ focal @ eye, eye.T @ pull))
         by_focal.extend(pull**2 / normal)
         off, rest = _without(focal, off), _without(focal, np.column_stack([rest, board]))
-        # One that is no freedom of this view explains nothing.
+        # A freedom that this view lacks explains nothing.
         by_others.append((rest.T @ off)[:, 0] ** 2 / np.maximum(np.sum(rest**2, axis=0), np.finfo(np.float64).tiny))
         squares += float(np.sum(off**2))
         freedom += len(off) - 6 - len(normal)
@@ -73,8 +73,8 @@ def _spread(pulls: Sequence[tuple[FloatArray, FloatArray]], variance: float) -> 
     lengths over the views is the most probable one (expectation maximisation).
 
     Args:
-        pulls: of each view the information (eyes, eyes) on the focal lengths and their gradient (eyes,).
-        variance: of one residual.
+        pulls: the information (eyes, eyes) of each view on the focal lengths, and its gradient (eyes,).
+        variance: variance of one residual.
     """
     information = np.stack([each for each, _ in pulls]) / variance
     pull = np.stack([each for _, each in pulls])[:, :, None] / variance
@@ -97,7 +97,7 @@ def refocused(spread: float) -> str:
 
 def _by_lenses(slopes: FloatArray, focal_px: Sequence[tuple[float, float]]) -> tuple[FloatArray, FloatArray]:
     """Return the derivatives (2 corners, eyes) by each eye's relative focal length, and by fx against fy."""
-    # The right eye's pose and the board's stand behind the lenses.
+    # The poses of the right eye and of the board come after the lenses.
     each = (slopes.shape[1] - 6 * len(focal_px)) // len(focal_px)
     fx, fy = (
         np.column_stack([slopes[:, number * each + axis] * f[axis] for number, f in enumerate(focal_px)])

@@ -39,7 +39,7 @@ def lacking(coverage: Coverage) -> list[str]:
 
 
 def misplaced(R_right_left: FloatArray, translation_m: FloatArray) -> str | None:
-    """Return a message if the eyes are exchanged, upside down or one above the other, else None.
+    """Return a message if the eyes are exchanged, upside down or one above the other, otherwise None.
 
     Args:
         R_right_left, translation_m: a point x of the left eye's frame is at R x + t in the right one's.
@@ -65,7 +65,7 @@ def misplaced(R_right_left: FloatArray, translation_m: FloatArray) -> str | None
 
 
 def unsure(rig: Rig) -> list[str]:
-    """Return messages for the parameters that are not determined well enough."""
+    """Return messages for the parameters that are not determined precisely enough."""
     reasons = []
     width = rig.image_size_px[0]
     if rig.made.held_out_px > (most_px := _Settings.most_held_out * width):
@@ -102,7 +102,7 @@ def unsure(rig: Rig) -> list[str]:
 
 
 def contradicts(rig: StereoRig, baseline_m: float) -> str | None:
-    """Return a message if the baseline measured by hand contradicts the calibrated one, else None."""
+    """Return a message if the baseline measured by hand contradicts the calibrated one, otherwise None."""
     allowed = np.hypot(3.0 * rig.baseline_sigma_m, _Settings.most_hand_error_m)
     ratio = baseline_m / rig.baseline_m
     if abs(baseline_m - rig.baseline_m) <= allowed:

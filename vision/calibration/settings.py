@@ -1,4 +1,4 @@
-"""Settings of the calibration of cameras, and how much they matter."""
+"""Settings of the camera calibration and their sensitivity."""
 
 from __future__ import annotations
 

@@ -91,7 +91,7 @@ def _lens(seen: Sequence[Corners], corners_m: FloatArray, size_px: tuple[int, in
 def _fisheye(
     seen: Sequence[Corners], corners_m: FloatArray, size_px: tuple[int, int], share: float
 ) -> tuple[Lens, float]:
-    """Return an undistorted fisheye lens of a focal length, and the median residual of its corners [px]."""
+    """Return an undistorted fisheye lens with this focal length, and the median residual of its corners [px]."""
     focal = share * size_px[0]
     centre = (0.5 * (size_px[0] - 1), 0.5 * (size_px[1] - 1))
     lens = Lens("fisheye", (focal, focal), centre, (0.0,) * len(DISTORTION_NAMES["fisheye"]))

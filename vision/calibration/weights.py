@@ -2,8 +2,8 @@
 
 Corners are found to 0.01 px where squares are large, and to 0.1 px where they are small or seen obliquely: far away,
 and towards the border of a fisheye image, which determines its lens. With equal weights, the accurate corners would
-count too little. The variance of a corner is therefore estimated from the residuals of corners whose squares are as
-wide, multiplied by the relative level of its own image's residuals.
+have too little influence. The variance of a corner is therefore estimated from the residuals of corners whose squares
+are equally wide, multiplied by the relative level of its own image's residuals.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class _Spread:
     image: NDArray[np.int64]
 
     def usual(self, share: FloatArray, kept: NDArray[np.bool_], *, robust: bool) -> FloatArray:
-        """Return the variance of corners by the width of their squares, with the share of each image taken out."""
+        """Return the variance of corners by the width of their squares, relative to their image's level."""
         order = np.flatnonzero(kept)[np.argsort(self.width[kept], kind="stable")]
         groups = np.array_split(order, max(len(order) // _Settings.group, 1))
         left = self.own / share
@@ -52,7 +52,7 @@ class _Spread:
         return ((total + _Settings.shared) / (count + _Settings.shared))[self.image]
 
     def fitting(self, usual: FloatArray) -> NDArray[np.bool_]:
-        """Return which corners are not outliers."""
+        """Return the mask of the corners that are not outliers."""
         fits = np.ones(len(self.own), dtype=bool)
         for number in range(int(self.image.max()) + 1):
             mine = np.flatnonzero(self.image == number)

@@ -44,7 +44,7 @@ class Annotator:
         self._whole = Region(0, 0, width, height)
 
     def sights(self, image: ImageArray) -> list[Sight]:
-        """Return everything that looks like the ball in one eye's image, marker or not; empty for tags."""
+        """Return everything in one eye's image that looks like the ball, marker or not; empty for tags."""
         if not self._is_ball:
             return []
         found = []

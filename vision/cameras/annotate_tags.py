@@ -27,10 +27,10 @@ class TagSight:
 
 
 class TagDrawing:
-    """Drawing of the tags that [vision] names, and of others of their dictionary."""
+    """Annotator of the tags in [vision], and of others of their dictionary."""
 
     def __init__(self, calibration: StereoCalibration, config: VisionConfig) -> None:
-        # They import scipy, which takes half a second, and where a ball is sought they are not needed.
+        # They import scipy, which takes half a second and is not needed to track a ball.
         from bodyschema.vision.tags.body import TagBody
         from bodyschema.vision.tags.chessboard import ChessboardFinder
         from bodyschema.vision.tags.dictionary import tags_of

@@ -114,7 +114,7 @@ class CamerasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     # the file that `bodyschema calibrate cameras` wrote, relative to robot.toml. Without it the images are assumed to
     # be rectified, as [camera] describes.
     calibration: str | None = None
-    # time from mid-exposure to the time stamp [s]; `bodyschema calibrate latency` measures it
+    # time from mid-exposure to the timestamp [s]; `bodyschema calibrate latency` measures it
     latency_s: Annotated[float, Meta(ge=-1, le=1)] = 0.0
     latency_sigma_s: NonNegative | None = None  # its 1-sigma; without it 15 ms for devices, 0 for files
     # time from the exposure of a rolling shutter's first row to that of its last [s]; 0 for a global shutter. Without
@@ -129,7 +129,7 @@ class CamerasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
     @property
     def layout(self) -> OneConfig | TwoConfig | SideBySideConfig | RealsenseConfig | ImagesConfig | VideosConfig:
-        """The layout that is given; call `check` first."""
+        """The configured layout; call `check` first."""
         found = self.one or self.two or self.side_by_side or self.realsense or self.images or self.videos
         if found is None:
             raise ConfigError("[vision.cameras] names no cameras")
@@ -166,13 +166,13 @@ class CamerasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
     @property
     def readout(self) -> tuple[float, float]:
-        """The readout of the rows and the RMS of what it may be besides [s]: one that is not known is uniform."""
+        """Readout time of all rows and its 1-sigma [s]; an unknown readout is uniform within ± a frame interval."""
         if self.readout_s is not None:
             return self.readout_s, 0.0
         return 0.0, 1.0 / (self.layout.fps or 30.0) / math.sqrt(3.0)
 
     def check(self, file: Path, text: str, table: tuple[str, ...] = ("vision", "cameras")) -> None:
-        """Raise ConfigError if there is not exactly one layout, or if it is incomplete; `table` is where it stands."""
+        """Raise ConfigError unless there is exactly one complete layout; `table` is the name of the table."""
         given = [name for name in LAYOUTS if getattr(self, name) is not None]
 
         def refuse(what: str, remedy: str, *keys: str) -> None:
@@ -208,7 +208,7 @@ class CamerasConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
 
 class FurtherCameras(CamerasConfig, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A table [[vision.further_cameras]]: cameras that see the same marker from elsewhere."""
+    """A table [[vision.further_cameras]]: cameras that see the same marker from another position."""
 
     name: str  # in messages
     # xyz, rpy: pose of their left optical frame in the measurement frame, that of [vision.cameras] [m], [rad]

@@ -1,4 +1,4 @@
-"""Compare the marker's depth by the two eyes with the depth image of the camera."""
+"""Compare the marker's depth from the two eyes with the depth image of the camera."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ class DepthImage(Protocol):
 
 
 class DepthChecked:
-    """A `MarkerSource` whose depths are compared with the depth image; only the health tells of it."""
+    """A `MarkerSource` whose depths are compared with the depth image; only its health reports the result."""
 
     def __init__(self, marker: MarkerSource, depth: DepthImage, in_front_m: float) -> None:
         """Store the settings.
 
         Args:
-            in_front_m: the marker's surface is so much nearer than its centre: a ball's radius [m].
+            in_front_m: distance of the marker's surface in front of its centre: a ball's radius [m].
         """
         self._marker, self._depth, self._in_front_m = marker, depth, in_front_m
         self._apart: deque[tuple[float, float, float]] = deque(maxlen=_Settings.frames)
@@ -64,7 +64,7 @@ class DepthChecked:
         self._marker.__exit__(kind, error, trace)
 
     def read(self, timeout_s: float) -> MarkerFix | MarkerMiss | None:
-        """Return what the marker source sees; see `MarkerSource.read`."""
+        """Return the fix or miss of the marker source; see `MarkerSource.read`."""
         seen = self._marker.read(timeout_s)
         if isinstance(seen, MarkerFix) and seen.centres_px is not None:
             surface = self._depth.depth_m(*seen.centres_px[:2])

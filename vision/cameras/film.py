@@ -52,13 +52,13 @@ class Film:
     """`StereoEyes` that plays recorded images. Closing and reopening continues after the last image read.
 
     At a speed above 0 the times are the clock's, the first pair is due when the film is opened, and pairs not read in
-    time are skipped, as with a camera. At speed 0 the times are those of the recording, pairs follow each other as fast
-    as they are read, and none is skipped.
+    time are skipped, as with a camera. At speed 0 the times are those of the recording, pairs are returned as fast as
+    they are read, and none is skipped.
     """
 
     def __init__(
         self,
-        # creates the roll when it is first needed; ConfigError or SourceError where files are missing or wrong
+        # creates the roll on first use; ConfigError or SourceError if files are missing or wrong
         roll: Callable[[], Roll],
         clock: Clock,
         *,
@@ -173,7 +173,7 @@ def read_times(file: Path, count: int) -> FloatArray:
 
 
 def checked_times(times: FloatArray, file: Path) -> FloatArray:
-    """Return `times`; raise ConfigError with the first that is not later than the one before."""
+    """Return `times`; raise ConfigError with the first one that is not later than its predecessor."""
     wrong = np.flatnonzero(~(np.diff(times) > 0))
     if len(wrong) or not np.isfinite(times).all():
         place = int(wrong[0]) + 2 if len(wrong) else int(np.argmin(np.isfinite(times))) + 1

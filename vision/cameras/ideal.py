@@ -12,7 +12,7 @@ from bodyschema.interfaces.records import StereoFrame
 
 
 class IdealCamera:
-    """A `StereoCamera` of eyes that [camera] describes: ideal pinholes side by side, or a single one."""
+    """A `StereoCamera` of the eyes in [camera]: ideal pinholes side by side, or a single one."""
 
     def __init__(self, eyes: StereoEyes, calibration: StereoCalibration) -> None:
         self._eyes, self._calibration = eyes, calibration
@@ -46,7 +46,7 @@ class IdealCamera:
         self._eyes.__exit__(kind, error, trace)
 
     def read(self, timeout_s: float) -> StereoFrame | None:
-        """Return the next frame, or None if none came within `timeout_s`. Raises as the eyes do."""
+        """Return the next frame; None if none came within `timeout_s`. Raise the errors of the eyes."""
         return self._eyes.read(timeout_s)
 
 

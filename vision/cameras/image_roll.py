@@ -25,15 +25,16 @@ class ImageRoll:
         t: times [s] (n,).
         t_sigma: time between the two eyes' images [s] (n,).
         image_size_px: width and height of each eye's image.
-        serials: pattern of each eye's files, in place of a serial number.
+        serials: pattern of each eye's files, instead of a serial number.
     """
 
     def __init__(self, config: ImagesConfig, folder: Path) -> None:
         """Read the names and the first pair.
 
         Raises:
-            ConfigError: there are no files, not as many of each eye, or the requested times are missing.
-            SourceError: a file is no image, or the two eyes' images differ in size.
+            ConfigError: there are no files, the eyes have different numbers of files, or the requested times are
+                missing.
+            SourceError: a file is not an image, or the two eyes' images differ in size.
         """
         patterns = (config.left,) if config.right is None else (config.left, config.right)
         self._eyes = [_files(folder, pattern) for pattern in patterns]
@@ -74,7 +75,7 @@ class ImageRoll:
         """Do nothing: no file is held open."""
 
     def next(self) -> tuple[ImageArray, ...]:
-        """Return the next image of each eye; raise SourceError if a file is no image, or of another size."""
+        """Return the next image of each eye; raise SourceError if a file is not an image, or has another size."""
         files = [each[self._next] for each in self._eyes]
         images = tuple(_image(file) for file in files)
         for file, image in zip(files, images, strict=True):

@@ -1,4 +1,4 @@
-"""Cameras that send images now: one, two of them, or one with two eyes."""
+"""Live cameras: one, two, or one with two eyes."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class LiveEyes:
         clock: Clock,
         open_capture: OpenCapture = open_v4l2,
     ) -> None:
-        """Nothing is opened yet; `clock` has to be the machine's monotonic one, as the kernel's stamps are."""
+        """Store the settings without opening anything. `clock` must be monotonic, like the kernel's timestamps."""
         self._config, self._layout = config, layout
         self._changed = threading.Condition()
         self._captures = [
@@ -73,7 +73,7 @@ class LiveEyes:
 
     @property
     def serials(self) -> tuple[str, ...]:
-        """Serial number of each eye's device; its name where it has none."""
+        """Serial number of each eye's device, or its name if it has none."""
         found = tuple(serial_of(device) for device in self._config.devices.values())
         return (f"{found[0]}/left", f"{found[0]}/right") if isinstance(self._layout, SideBySideConfig) else found
 

@@ -55,7 +55,7 @@ class Look:
     def _rate(self) -> float | None:
         """Return the frame rate [1/s] from the median interval; None if there are too few frames.
 
-        Single lost frames do not change the median, but a camera that loses every second one is slow.
+        Single lost frames do not change the median; a camera that loses every second frame counts as slow.
         """
         if len(self._times) < LookSettings.fewest_frames:
             return None

@@ -1,4 +1,4 @@
-"""The cameras that [vision.cameras] asks for."""
+"""Create the cameras of [vision.cameras]."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ def eyes_of(
     """Create the configured cameras or files as `StereoEyes`, not opened yet.
 
     Args:
-        folder: of robot.toml; files are named relative to it.
-        clock: the machine's monotonic one.
+        folder: folder of robot.toml; files are named relative to it.
+        clock: the machine's monotonic clock.
     """
     match config.layout:
         case OneConfig() | TwoConfig() | SideBySideConfig() as layout:

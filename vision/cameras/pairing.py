@@ -1,4 +1,4 @@
-"""Images of two cameras that do not wait for each other, paired by time."""
+"""Pair the images of two unsynchronised cameras by time."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ KEPT = 4  # images of each camera; older ones are never paired
 
 @dataclass(frozen=True, slots=True)
 class Shot:
-    """An image of one camera and when it was taken."""
+    """An image of one camera and its time."""
 
-    t: float  # time stamp [s], the latency not yet taken off
+    t: float  # timestamp [s], latency not yet subtracted
     t_sigma: float  # 1-sigma of it [s]
     image: ImageArray  # (height, width, 3), uint8, BGR
 

@@ -1,6 +1,6 @@
-"""The two infra-red eyes of a RealSense camera, through the maker's SDK (the extra `realsense`).
+"""The two infra-red eyes of a RealSense camera, through the vendor's SDK (the extra `realsense`).
 
-The device rectifies its infra-red images itself, and tells how they see. Its depth image is kept as a check.
+The device rectifies its infra-red images itself, and provides their calibration. Its depth image is kept as a check.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def connected_device(serial: str | None) -> Any:
 
     Raises:
         SourceLost: it is not connected.
-        ConfigError: several are, and `serial` names none.
+        ConfigError: several are connected, and `serial` is not set.
     """
     rs = sdk()
     devices = {device.get_info(rs.camera_info.serial_number): device for device in rs.context().query_devices()}
@@ -67,7 +67,7 @@ class RealsenseCamera:
     """`StereoEyes` and `StereoCamera` of the infra-red eyes of one device.
 
     Attributes:
-        depth_image_m: the depth image that belongs to the newest frame [m], 0 where it is unknown; None without one.
+        depth_image_m: the depth image of the newest frame [m], 0 where unknown; None without one.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class RealsenseCamera:
         clock: Clock,  # the machine's monotonic one
         find: FindDevice = connected_device,  # returns the device with a serial number
     ) -> None:
-        """Prepare; the device is looked for when it is opened, or asked for its calibration."""
+        """Store the settings. The device is searched for when it is opened, or when its calibration is requested."""
         self._config, self._settings, self._clock, self._find = config, settings, clock, find
         self._calibration: StereoCalibration | None = None
         self._serial = settings.serial or ""
@@ -110,10 +110,10 @@ class RealsenseCamera:
 
     @property
     def calibration(self) -> StereoCalibration:
-        """How the eyes see, as the device says.
+        """Calibration of the eyes, as reported by the device.
 
         Raises:
-            SourceLost: the device is not there.
+            SourceLost: the device is not connected.
             SourceError: it does not rectify these images.
         """
         if self._calibration is None:
@@ -225,7 +225,7 @@ class RealsenseCamera:
         )
 
     def _seen_by(self, left: Any, right: Any) -> StereoCalibration:
-        """Return the calibration of a rectified pair. Raise SourceError if the device does not rectify it."""
+        """Return the calibration of a rectified pair; raise SourceError if the device does not rectify it."""
         eyes = [profile.as_video_stream_profile().get_intrinsics() for profile in (left, right)]
         pose = left.get_extrinsics_to(right)
         focal = eyes[0].fx
@@ -241,7 +241,7 @@ class RealsenseCamera:
         return StereoCalibration(focal, (eyes[0].ppx, eyes[0].ppy), baseline_m, self.image_size_px)
 
     def _apply(self, rs: Any, sensor: Any) -> None:
-        """Write the settings; the dots of the projector would be taken for texture of the marker."""
+        """Write the settings. The projector is off by default: its dots would be taken for texture of the marker."""
         wanted: dict[Any, float] = {rs.option.emitter_enabled: float(self._settings.emitter)}
         wanted[rs.option.global_time_enabled] = 1.0
         if self._settings.exposure_s is not None:
@@ -253,7 +253,7 @@ class RealsenseCamera:
                 sensor.set_option(option, value)
 
     def _whole(self, image: Any, now: float) -> StereoFrame | None:
-        """Return the frame that an image completes; its images have one number."""
+        """Return the frame that an image completes; its images have the same number."""
         rs = sdk()
         number, name = image.get_frame_number(), _stream_name(rs, image.get_profile())
         part = self._parts.setdefault(number, {})
@@ -272,7 +272,7 @@ class RealsenseCamera:
         return StereoFrame(t - self._config.latency_s, _coloured(part["left"]), _coloured(part["right"]), sigma)
 
     def _on_our_clock(self, rs: Any, image: Any, now: float) -> float:
-        """Return an image's stamp on the monotonic clock [s]; 0 if it is on a clock of the device's own."""
+        """Return an image's timestamp on the monotonic clock [s]; 0 if it is on a clock of the device's own."""
         if image.get_frame_timestamp_domain() == rs.timestamp_domain.hardware_clock:
             return 0.0
         return now - (time.time() - 1e-3 * image.get_timestamp())

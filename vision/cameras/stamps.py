@@ -1,4 +1,4 @@
-"""Choose between a camera's own time stamps, if they are believable, and the images' arrival times."""
+"""Choose between a camera's own timestamps, if they are plausible, and the images' arrival times."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ class _Settings:
 
 
 class Stamps:
-    """Choice at the start between the kernel's stamps and the arrival times, with strictly increasing times.
+    """Choice at the start between the kernel's timestamps and the arrival times, with strictly increasing times.
 
     The kernel stamps frames of USB cameras with CLOCK_MONOTONIC. Other drivers, and uvcvideo with clock=REALTIME, give
     zero or the wall clock's time.
 
     Attributes:
         source: "kernel" or "arrival"; None until decided.
-        sigma_s: 1-sigma of the stamps [s].
+        sigma_s: 1-sigma of the timestamps [s].
     """
 
     def __init__(self) -> None:
@@ -36,10 +36,10 @@ class Stamps:
         return _Settings.kernel_sigma_s if self.source == "kernel" else _Settings.arrival_sigma_s
 
     def stamp(self, kernel_s: float, arrival_s: float) -> float | None:
-        """Return the time of a frame [s]; None for the first ones, and for one with an implausible stamp.
+        """Return the time of a frame [s]; None for the first ones, and for one with an implausible timestamp.
 
         Args:
-            kernel_s: the driver's stamp [s], monotonic.
+            kernel_s: the driver's timestamp [s], monotonic.
             arrival_s: time at which the frame was handed over [s], monotonic.
         """
         if self.source is None:

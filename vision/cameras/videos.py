@@ -1,4 +1,4 @@
-"""Films in the place of cameras."""
+"""Play films in place of cameras."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _CONVERT = "`ffmpeg -i OLD.mp4 -c:v libx264 -crf 18 NEW.mp4`"
 
 
 class _Film(Protocol):
-    """What is used of cv2.VideoCapture."""
+    """The subset of cv2.VideoCapture in use."""
 
     def grab(self) -> bool: ...
 
@@ -33,7 +33,7 @@ class _Film(Protocol):
 
 
 class _Av1Film:
-    """An AV1 film decoded by PyAV, which OpenCV's wheels cannot."""
+    """An AV1 film decoded by PyAV, since OpenCV's wheels cannot decode it."""
 
     def __init__(self, file: Path) -> None:
         try:
@@ -74,18 +74,18 @@ def _film(file: Path) -> _Film:
 
 
 class VideoRoll:
-    """Two films, that of one camera alone, or one whose frames have both eyes' images.
+    """Two films, the film of a single camera, or a film whose frames contain both eyes' images.
 
     Attributes:
         t: times [s] (n,). t_sigma: zeros (n,).
-        image_size_px: of each eye's image. serials: the file of each eye.
+        image_size_px: size of each eye's image. serials: the file of each eye.
     """
 
     def __init__(self, config: VideosConfig, folder: Path) -> None:
-        """Look at the files, and count their frames.
+        """Read the sizes of the files, and count their frames.
 
         Raises:
-            ConfigError: a file is missing, no readable video, or the two are not of one size.
+            ConfigError: a file is missing or not a readable video, or the two differ in size.
         """
         both = config.side_by_side
         self._files = [folder / name for name in ((both,) if both else (config.left, config.right)) if name]
@@ -151,7 +151,7 @@ def _measured(file: Path) -> tuple[tuple[int, int], int, float]:
     capture = _film(file)
     try:
         count = 0
-        while capture.grab():  # what the file says of itself is often wrong
+        while capture.grab():  # the file's own metadata is often wrong
             count += 1
         size = round(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), round(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
         rate_hz = capture.get(cv2.CAP_PROP_FPS)

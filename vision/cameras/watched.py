@@ -42,9 +42,7 @@ class WatchedCamera:
         self._camera.__exit__(kind, error, trace)
 
     def read(self, timeout_s: float) -> ImageArray | None:
-        """Return the next annotated picture (height, eyes width, 3); None if none came in time. Raises as the camera
-        does.
-        """
+        """Return the next annotated picture (height, eyes width, 3), or None in time. Raise the camera's errors."""
         frame = self._camera.read(timeout_s)
         if frame is None:
             return None
@@ -70,7 +68,7 @@ class WatchedCamera:
 
 
 class PlainEyes:
-    """Frames of cameras without a calibration: nothing is searched for in them."""
+    """Frames of cameras without a calibration, in which nothing is detected."""
 
     def __init__(self, eyes: StereoEyes) -> None:
         self._eyes = eyes
@@ -86,7 +84,7 @@ class PlainEyes:
         self._eyes.__exit__(kind, error, trace)
 
     def read(self, timeout_s: float) -> ImageArray | None:
-        """Return the next picture (height, eyes width, 3); None if none came in time. Raises as the eyes do."""
+        """Return the next picture (height, eyes width, 3); None if none came in time. Raise the errors of the eyes."""
         frame = self._eyes.read(timeout_s)
         if frame is None:
             return None

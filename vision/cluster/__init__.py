@@ -1,1 +1,1 @@
-"""Clusters of tags: shapes to fold, their page to print, and measuring where the tags of a built one are."""
+"""Clusters of tags: shapes to fold, their page to print, and measurement of the tags' poses on a built one."""

@@ -52,7 +52,7 @@ class ClusterView:
 
 @dataclass(frozen=True)
 class MeasuredTag:
-    """A tag on the cluster, in the frame of the first one."""
+    """A tag's pose on the cluster, in the frame of the first tag."""
 
     placed: PlacedTag  # its pose
     # xyz_sigma_m, turn_sigma_rad: 1-sigma of its position along the axes and its rotation about them, each (3,)
@@ -180,7 +180,7 @@ class _Block:
 
 @dataclass(frozen=True)
 class _Linearised:
-    """Residuals in sigmas at poses of tags and bodies, their derivatives by all turns and places, and by the size."""
+    """Residuals in sigmas at poses of tags and bodies, with derivatives by all rotations, positions and the size."""
 
     tags: Mapping[int, Motion]
     bodies: Sequence[Motion]
@@ -194,7 +194,7 @@ class _Linearised:
 
     @property
     def misfit(self) -> float:
-        """RMS of what is left, in units of the corners' own sigmas."""
+        """RMS of the residuals, in units of the corners' own sigmas."""
         return float(np.sqrt(self.squares / max(len(self.residuals) - self.J.shape[1], 1)))
 
 
@@ -248,7 +248,7 @@ class _Problem:
         """Return initial tag poses in the first tag's frame, from tag to tag through views that show both."""
         known: dict[int, Motion] = {self.ids[0]: (np.eye(3), np.zeros(3))}
         while len(known) < len(self.ids):
-            # The tag that most views show together with one that is known.
+            # The tag that most views show together with one of known pose.
             counts = {
                 (a, b): sum(a in poses and b in poses for poses in alone)
                 for a in known
@@ -326,13 +326,13 @@ class _Problem:
 
     @property
     def misfit(self) -> float:
-        """RMS of what is left, in units of the corners' own sigmas."""
+        """RMS of the residuals, in units of the corners' own sigmas."""
         return self._found.misfit
 
     def worst(self) -> tuple[str, int] | None:
         """Return the view's name and the tag's number of the worst outlier, or None.
 
-        Squares that are all larger or smaller than stated are no outliers: that is free here.
+        Squares that are all larger or smaller than stated are not outliers: their common size is free here.
         """
         residuals, J, grown = self._found.residuals, self._found.J, self._found.grown
         full = np.column_stack([J, grown])

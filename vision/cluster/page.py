@@ -1,4 +1,4 @@
-"""The page of tags: with lines to cut along, and to fold along where they make one body."""
+"""The page of tags: with lines to cut along, and lines to fold along if they form one body."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def shape_page(shape: Shape, ids: Sequence[int], dictionary: Dictionary, side_mm
     """Lay out a shape to cut out and fold, with tags of these numbers row by row.
 
     Raises:
-        ConfigError: the number of ids differs from that of the faces, there is no such tag or paper, or the shape
-            does not fit.
+        ConfigError: the number of ids differs from that of the faces, a tag or the paper is unknown, or the shape does
+            not fit.
     """
     width = FACE_SIDES * side_mm
     placed = shape.placed(ids, 1e-3 * width)
@@ -52,7 +52,7 @@ def tags_page(ids: Sequence[int], dictionary: Dictionary, side_mm: float, paper:
     """Lay out single tags to cut apart, each with its number below.
 
     Raises:
-        ConfigError: there is no such tag or paper, or the tags do not fit.
+        ConfigError: a tag or the paper is unknown, or the tags do not fit.
     """
     width = FACE_SIDES * side_mm
     pitch = width + _Settings.gap_mm

@@ -1,4 +1,4 @@
-"""Bodies folded from a sheet with a tag on each face: where the faces are on the sheet, and on the body."""
+"""Bodies folded from a sheet with a tag on each face: positions of the faces on the sheet and on the body."""
 
 from __future__ import annotations
 
@@ -36,32 +36,32 @@ class Face:
 
 @dataclass(frozen=True)
 class Shape:
-    """Faces of one size that hang together on the sheet."""
+    """Faces of one size that are connected on the sheet."""
 
-    name: str  # what it is
+    name: str  # description
     faces: tuple[Face, ...]  # in the order of their tags: row by row
 
     @property
     def size(self) -> tuple[int, int]:
-        """Columns and rows that it takes on the sheet."""
+        """Columns and rows of the shape on the sheet."""
         return 1 + max(face.cell[0] for face in self.faces), 1 + max(face.cell[1] for face in self.faces)
 
     @property
     def folds(self) -> list[tuple[Cell, Cell]]:
-        """Cells of faces between which the sheet is folded."""
+        """Pairs of cells between which the sheet is folded."""
         turns = {face.cell: face.rotation for face in self.faces}
         pairs = [(cell, (cell[0] + c, cell[1] + r)) for cell in turns for c, r in ((1, 0), (0, 1))]
         return [(cell, other) for cell, other in pairs if other in turns and not np.allclose(turns[cell], turns[other])]
 
     @property
     def cuts(self) -> list[tuple[Cell, Cell]]:
-        """A face's cell and the free one beside it, wherever the sheet is cut."""
+        """Pairs of a face's cell and the free cell beside it, between which the sheet is cut."""
         cells = {face.cell for face in self.faces}
         beside = [(cell, (cell[0] + c, cell[1] + r)) for cell in sorted(cells) for c, r in _STEPS]
         return [(cell, other) for cell, other in beside if other not in cells]
 
     def placed(self, ids: Sequence[int], width_m: float) -> tuple[PlacedTag, ...]:
-        """Return the poses on the body of the tags of these numbers, for faces of this width [m].
+        """Return the poses on the body of the tags with these numbers, for faces of this width [m].
 
         Raises:
             ConfigError: the number of ids differs from that of the faces.
@@ -86,7 +86,7 @@ def plate(columns: int, rows: int, fold_deg: float) -> Shape:
     With folds of 0° it is flat; four columns folded by 90° each are the sides of a box.
 
     Raises:
-        ConfigError: there are no tags, or the columns run into each other.
+        ConfigError: there are no tags, or the columns would intersect.
     """
     if columns < 1 or rows < 1:
         raise ConfigError(f"a plate of {columns}x{rows} tags", remedy="Take one and more each way")
@@ -122,12 +122,12 @@ def _folded(name: str, first: Face, links: Sequence[tuple[Cell, Cell, float]]) -
 def rpy_of(rotation: FloatArray) -> tuple[float, float, float]:
     """Return roll, pitch and yaw [rad] of a rotation (3, 3), URDF convention."""
     with warnings.catch_warnings():
-        # At a pitch of 90° roll and yaw turn about one axis: any split is right.
+        # At a pitch of 90° roll and yaw rotate about one axis: any split is right.
         warnings.filterwarnings("ignore", "Gimbal lock", UserWarning)
         return _vector(Rotation.from_matrix(rotation).as_euler("xyz"))
 
 
 def _vector(values: FloatArray) -> tuple[float, float, float]:
-    # Rounded to a nanometre: no 6e-17 in files that people read.
+    # Rounded to a nanometre, to avoid 6e-17 in files that people read.
     x, y, z = (float(value) + 0.0 for value in np.round(values, 9))
     return x, y, z

@@ -12,7 +12,7 @@ def cluster_tables(dictionary: Dictionary, side_m: float, tags: Sequence[PlacedT
     """Return the tables [vision], [vision.tag] and [[vision.cluster.tags]].
 
     Args:
-        notes: what is said of each tag, behind its number.
+        notes: a comment for each tag, behind its number.
     """
     lines = ["[vision]", 'marker = "cluster"', "", *_tag_table(dictionary, side_m)]
     for k, tag in enumerate(tags):
@@ -25,7 +25,7 @@ def cluster_tables(dictionary: Dictionary, side_m: float, tags: Sequence[PlacedT
 
 
 def chessboard_tables(columns: int, rows: int, square_m: float) -> str:
-    """Return the tables [vision] and [vision.chessboard]. ConfigError if it is no marker."""
+    """Return the tables [vision] and [vision.chessboard]; raise ConfigError if it cannot be a marker."""
     try:
         ChessboardConfig(columns=columns, rows=rows, square_m=square_m)
     except ValueError as error:

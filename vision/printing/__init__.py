@@ -1,4 +1,4 @@
-"""Pages to print in true size: black rectangles, rulers to check the print against, a few words; as PDF and SVG."""
+"""Pages to print in true size: black rectangles, rulers to check the print, and some text; as PDF and SVG."""
 
 from .pdf import pdf
 from .sheet import Page

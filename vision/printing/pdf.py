@@ -1,4 +1,4 @@
-"""A page as PDF 1.4, in true size: filled rectangles and a few words in Helvetica, which every viewer has."""
+"""A page as PDF 1.4, in true size: filled rectangles and some text in Helvetica, which every viewer has."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def _text(text: Text, page: Page) -> str:
 
 
 def _file(*objects: bytes) -> bytes:
-    """Objects from number 1 on, the catalogue first, with their cross-reference table (PDF 32000-1:2008, 7.5)."""
+    """Return objects from number 1 on, catalogue first, with their cross-reference table (PDF 32000-1:2008, 7.5)."""
     out = bytearray(b"%PDF-1.4\n%\xe2\xe3\xcf\xd3\n")
     places = []
     for number, content in enumerate(objects, 1):

@@ -1,4 +1,4 @@
-"""A sheet of paper, in millimetres: black rectangles, and two rulers to check the print against."""
+"""A sheet of paper, in millimetres: black rectangles, and two rulers to check the print."""
 
 from __future__ import annotations
 
@@ -54,10 +54,10 @@ class Text:
 
 @dataclass(frozen=True)
 class Page:
-    """A sheet with what is black on it."""
+    """A sheet with its black rectangles and texts."""
 
     size_mm: tuple[float, float]  # width and height of the sheet
-    drawing_mm: tuple[float, float]  # where the drawing's upper left corner is
+    drawing_mm: tuple[float, float]  # position of the drawing's upper left corner
     rulers_mm: tuple[float, float]  # lengths of the rulers, across and upright
     rectangles: tuple[Rectangle, ...]
     texts: tuple[Text, ...]
@@ -83,7 +83,7 @@ def page(
         rectangles, texts: the drawing, from its upper left corner.
 
     Raises:
-        ConfigError: there is no such paper.
+        ConfigError: the paper is unknown.
     """
     width, height = size_mm
     fitting = [

@@ -1,4 +1,4 @@
-"""Position errors that all fixes of calibrated cameras share: those of the lenses, of the eyes' places, of sizes."""
+"""Position errors that all fixes of calibrated cameras share: from the lenses, the eyes' poses, and sizes."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ class CommonErrorSettings:
 class CommonError:
     """Errors of positions in the rectified left frame that no number of fixes averages out.
 
-    A turn of the whole frame about the left eye is none of them: what the calibration takes for straight ahead is what
-    the frame means.
+    They do not include a rotation of the whole frame about the left eye: the calibration itself defines the direction
+    of the frame.
     """
 
     rig: Rig  # the calibration
-    size_sigma: float = 0.0  # relative 1-sigma of the marker's size, from which one eye has all distances
+    size_sigma: float = 0.0  # relative 1-sigma of the marker's size, from which one eye derives all distances
 
     def require_usable(self) -> None:
         """Raise CalibrationError if the eyes share no view, or a lens folds over within its image."""
@@ -64,7 +64,7 @@ class CommonError:
 
     @cached_property
     def _root(self) -> FloatArray:
-        """Root (p, k) of the calibration's covariance, without what rounding leaves."""
+        """Root (p, k) of the calibration's covariance, without rounding errors."""
         sigma = self.rig.sigma
         values, vectors = np.linalg.eigh(self.rig.covariance / np.outer(sigma, sigma))
         kept = values > 1e-9 * values[-1]
@@ -72,7 +72,7 @@ class CommonError:
 
     @cached_property
     def _frame(self) -> FloatArray:
-        """Turn (3, k) [rad] of the frame for each unknown: the best fit over the view, after `turned`."""
+        """Rotation (3, k) [rad] of the frame for each unknown: the best fit over the view, after `turned`."""
         errors = self._raw(self._grid)
         turn = np.linalg.lstsq(turned(self._grid).reshape(-1, 3), errors.reshape(-1, errors.shape[2]))[0]
         return np.asarray(turn, np.float64)
@@ -111,10 +111,11 @@ def _by_two_eyes(rig: StereoRig, x: FloatArray) -> FloatArray:
 
 
 def _by_one_eye(lens: Lens, x: FloatArray) -> FloatArray:
-    """Return the derivative (n, 3, p) by the lens of places x (n, 3) of a small marker of known size.
+    """Return the derivative (n, 3, p) by the lens of positions x (n, 3) of a small marker of known size.
 
-    The marker's direction moves with the lens, and its distance shrinks as its image grows. Two sides of an image that
-    grow differently look like a tilt; which side counts depends on the marker's tilt, and the mean is taken.
+    The marker's direction moves with the lens, and its distance shrinks as its image grows. If two sides of an image
+    grow differently, this looks like a tilt. The side that determines the distance depends on the tilt; the mean is
+    taken.
     """
     seen = x[:, None, :2] / x[:, None, 2:]
     steps = CommonErrorSettings.step * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
@@ -129,7 +130,7 @@ def _by_one_eye(lens: Lens, x: FloatArray) -> FloatArray:
 
 
 def _moved(lens: Lens, seen: FloatArray) -> FloatArray:
-    """Return the derivative (n, 2, p) by the lens of the directions (n, 2) of what is seen at fixed pixels."""
+    """Return the derivative (n, 2, p) by the lens of the directions (n, 2) seen at fixed pixels."""
     ahead = np.column_stack([seen, np.ones(len(seen))])
     _, by_pose, by_lens = lens.project_posed(ahead, np.zeros(3), np.zeros(3))
     by_direction, by_lens = by_pose[:, 3:5].reshape(-1, 2, 2), by_lens.reshape(len(seen), 2, -1)

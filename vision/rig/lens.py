@@ -98,7 +98,7 @@ class Lens:
         return self._undistorted(flat, px)
 
     def is_one_to_one(self, image_size_px: tuple[int, int]) -> bool:
-        """Return False if the lens folds over within the image: two directions would be seen at one point of it.
+        """Return False if the lens folds over within the image, so that one image point shows two directions.
 
         Far from the axis a distortion polynomial folds over; a fit to corners does not keep this out of the image.
         Directions beyond `widest` do not count.
@@ -111,7 +111,7 @@ class Lens:
         px = px.reshape(*ahead.shape[:2], 2)
         outward = np.sum(np.diff(px, axis=0) * rays, axis=2) > 0.0
         inside = np.all((px[:-1] >= 0.0) & (px[:-1] <= np.array(image_size_px) - 1.0), axis=2)
-        # A ray counts until it first leaves the image.
+        # Only the part of a ray before it first leaves the image counts.
         return bool(np.all(outward | ~np.logical_and.accumulate(inside, axis=0)))
 
     def _angle(self, seen: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""Two cameras as the two ideal pinholes side by side that everything else works with, or one as one."""
+"""Calibrated cameras as the ideal pinholes used everywhere else: two side by side, or a single one."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from .stereo_rig import CalibrationError, OneEyeRig, Rig
 class Rectification:
     """Rectification of both eyes' images to those of two parallel pinhole cameras side by side.
 
-    The rectified left frame has the left eye's optical centre as its origin; it is the left camera's own frame turned
-    by `R_rectified_left`: its x axis points to the right eye, and its z axis is as near as that allows to the mean of
-    where both cameras look. Nothing is moved and no length changes. The frame of one camera alone is its own.
+    The origin of the rectified left frame is the left eye's optical centre. It is the left camera's own frame rotated
+    by `R_rectified_left`: its x axis points to the right eye, and its z axis is as near as possible to the mean viewing
+    direction of both cameras. Nothing is translated and no length changes. The frame of a single camera is its own.
     """
 
     rig: Rig  # the calibration
@@ -53,9 +53,9 @@ class Rectification:
 
     @cached_property
     def calibration(self) -> StereoCalibration:
-        """The pinholes: the largest view of which all eyes fill every pixel.
+        """The pinholes: the largest view in which all eyes fill every pixel.
 
-        Its `pixel_sigma` is the error of views that were not calibrated with, at the rectified focal length.
+        Its `pixel_sigma` is the error of held-out views, at the rectified focal length.
 
         Raises:
             CalibrationError: the eyes share no view, or a lens folds over within its image.
@@ -138,7 +138,7 @@ class RectifiedCamera:
     """The rectified images of calibrated cameras: a `StereoCamera`."""
 
     def __init__(self, eyes: StereoEyes, rig: Rig) -> None:
-        """Compute the maps. Whether these are the cameras that were calibrated is seen when they are opened.
+        """Compute the maps. Opening the cameras checks that they are the calibrated ones.
 
         Raises:
             CalibrationError: the calibrated eyes share no view, or a lens folds over within its image.
@@ -151,11 +151,11 @@ class RectifiedCamera:
 
     @property
     def calibration(self) -> StereoCalibration:
-        """The pinholes that the images are those of."""
+        """The pinholes of the rectified images."""
         return self._calibration
 
     def __enter__(self) -> Self:
-        """Open the cameras; OtherCameras, a SourceError, when they are not the calibrated ones."""
+        """Open the cameras; raise OtherCameras, a SourceError, if they are not the calibrated ones."""
         self._eyes.__enter__()
         try:
             self._rig.require(self._eyes.image_size_px, self._eyes.serials)

@@ -40,7 +40,7 @@ class Made:
 
 @dataclass(frozen=True, eq=False)
 class StereoRig:
-    """Two lenses, where the right eye is against the left one, and how sure all that is.
+    """Two lenses and the right eye's pose relative to the left one, with their uncertainty.
 
     A point x in the left eye's frame (x right, y down, z forward) is at R x + t in the right one's.
     """
@@ -51,9 +51,9 @@ class StereoRig:
     rotation_rad: FloatArray  # rotation vector of R, shape (3,) [rad]
     translation_m: FloatArray  # t, shape (3,) [m]
     image_size_px: tuple[int, int]  # width and height of both eyes' images
-    serials: tuple[str, str]  # what tells the left and the right device from all others; "" where it was not known
+    serials: tuple[str, str]  # serial numbers of the left and the right device; "" if unknown
     covariance: FloatArray  # of `vector`, shape (p, p)
-    made: Made  # how it was made
+    made: Made  # provenance
 
     def __post_init__(self) -> None:
         for name in ("rotation_rad", "translation_m", "covariance"):
@@ -125,13 +125,13 @@ class StereoRig:
 
 @dataclass(frozen=True, eq=False)
 class OneEyeRig:
-    """One camera alone: its lens, and how sure that is."""
+    """A single camera: its lens with its uncertainty."""
 
     left: Lens  # the lens, as that of a pair's left eye
     image_size_px: tuple[int, int]  # width and height of its images
-    serials: tuple[str]  # what tells the device from all others; "" where it was not known
+    serials: tuple[str]  # serial number of the device; "" if unknown
     covariance: FloatArray  # of `vector`, shape (p, p)
-    made: Made  # how it was made
+    made: Made  # provenance
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "covariance", frozen_array(self.covariance))
@@ -195,7 +195,7 @@ def parameter_names(model: Model) -> tuple[str, ...]:
 
 
 def lens_of_one(model: Model, vector: FloatArray) -> Lens | None:
-    """Return the lens if the vector has the parameters of a single camera, else None."""
+    """Return the lens if the vector has the parameters of a single camera, otherwise None."""
     return Lens.from_vector(model, vector) if len(vector) == len(_lens_names(model)) else None
 
 
@@ -215,7 +215,7 @@ def lenses_of(model: Model, vector: FloatArray) -> tuple[Lens, ...]:
 def triangulated(rig: StereoRig, left_px: FloatArray, right_px: FloatArray) -> FloatArray:
     """Return points (n, 3) [m] in the left camera's own frame, seen at (n, 2) [px] by each eye.
 
-    The middle of the shortest line between both rays.
+    A point is the middle of the shortest line between both rays.
     """
     a = np.column_stack([rig.left.directions(left_px), np.ones(len(left_px))])
     b = np.column_stack([rig.right.directions(right_px), np.ones(len(right_px))]) @ rig.R_right_left

@@ -1,5 +1,5 @@
 """Find and measure AprilTags.
 
 `finder` finds rough corners, and `image` refines them: `edge` measures the four edges, `bleed` corrects them for white
-that bleeds into black, and the corners are their intersections. `tracker` makes a pose of the corners.
+that bleeds into black, and the corners are their intersections. `tracker` computes a pose from the corners.
 """

@@ -1,9 +1,9 @@
 """Estimate how far white bleeds into black in the image of a tag.
 
 A tone curve, overexposure, a glowing screen, and ink that spreads all move every edge of black against white the same
-way, the tag's own four edges too. Those would then say that the tag is smaller or larger than it is, and farther or
-nearer. The modules inside the tag show it: their edges are on a grid that is known, and white cells come out wider than
-black ones.
+way, including the tag's own four edges. The tag would then seem smaller or larger, and farther or nearer, than it is.
+The modules inside the tag show the shift: their edges are on a known grid, and white cells appear wider than black
+ones.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from .settings import TagSettings
 
 
 def bleed(grey: ImageArray, corners_px: FloatArray, blur_px: float, modules: FloatArray) -> tuple[float, float]:
-    """Return how far white bleeds over the edges of black [px] and its variance [px²]; 0 where the pattern hides it.
+    """Return how far white bleeds over the edges of black [px] and its variance [px²]; 0 if the pattern hides it.
 
     The levels of the tag are fitted by those of black and white, with a gradient each, and by two derivatives of the
-    blurred pattern: by its edges' shift, and by its blur. The pattern is then drawn with its edges shifted, and fitted
-    again (Gauss and Newton).
+    blurred pattern: by its edges' shift, and by its blur. The pattern is then rendered with its edges shifted, and
+    fitted again (Gauss and Newton).
 
     Args:
         grey: the image.
-        corners_px: the square's corners (4, 2) [px] as its own edges show them: each edge has bled by as much.
+        corners_px: the square's corners (4, 2) [px] by its own edges, which have bled by the same amount.
         blur_px: 1-sigma.
         modules: the tag's modules with its black border (n, n), 1 white and 0 black.
     """
@@ -67,15 +67,15 @@ def bleed(grey: ImageArray, corners_px: FloatArray, blur_px: float, modules: Flo
     if fit is None or not abs(fit.moved) < _Settings.widest * min(width, height):
         return unseen
     moved, found, cov, design, kept = fit
-    # What a module pulls at the shift: its samples share pixels, and print and light.
+    # Influence of a module on the shift: its samples share pixels, print and light.
     pulls = (cov[7] @ design * kept * (levels - found @ design)).reshape(across.shape)
     rows, columns = (np.flatnonzero(np.diff(np.floor(at), prepend=-1.0)) for at in (y, x))
     pulls = np.add.reduceat(np.add.reduceat(pulls, rows, axis=0), columns, axis=1)
     by_chance = float(np.square(pulls).sum() / found[3] ** 2) * pulls.size / (pulls.size - len(design))
     if not by_chance > 0.0:
         return unseen
-    # Many cameras do not bleed at all. How likely that is follows from two densities of what was found: by chance
-    # alone, and by chance and the usual bleeding.
+    # Many cameras do not bleed at all. The probability of bleeding follows from two densities of the estimate: by
+    # chance alone, and by chance with the usual bleeding.
     usual = unseen[1] + by_chance
     odds = math.sqrt(by_chance / usual) * math.exp(min(0.5 * moved * moved * (1.0 / by_chance - 1.0 / usual), 500.0))
     bleeds = odds / (1.0 + odds)
@@ -86,7 +86,7 @@ def bleed(grey: ImageArray, corners_px: FloatArray, blur_px: float, modules: Flo
 
 
 class _Fit(NamedTuple):
-    """Shift [px], weights of the rows of a design (8, n) and their covariance, the design, and samples it explains."""
+    """Shift [px], weights of the rows of a design (8, n) with covariance, the design, and the samples explained."""
 
     moved: float
     found: FloatArray
@@ -98,7 +98,7 @@ class _Fit(NamedTuple):
 def _fitted(
     levels: FloatArray, lit: FloatArray, pattern_at: Callable[[float], tuple[FloatArray, FloatArray]], step_px: float
 ) -> _Fit | None:
-    """Fit levels (n,) by the pattern at the shift that explains them best; None if something hides it."""
+    """Fit levels (n,) by the pattern at the shift that explains them best; return None if something covers it."""
     moved, kept = 0.0, np.ones(levels.shape, np.bool_)
     fit = None
     for _ in range(_Settings.rounds):
@@ -112,7 +112,7 @@ def _fitted(
             if not found[3] >= 1.0 or kept.mean() < _Settings.explained:
                 return None
             cov = np.linalg.inv((design * kept) @ design.T)
-        except np.linalg.LinAlgError:  # too few modules, or too sharp, to tell shift and blur apart
+        except np.linalg.LinAlgError:  # too few modules, or too sharp, to separate shift and blur
             return None
         found = cov @ (design @ (levels * kept))
         change = float(found[7] / found[3])
@@ -126,7 +126,7 @@ def _fitted(
 
 
 def _bled(printed: FloatArray, bled_px: float) -> FloatArray:
-    """Return the colours (2 n − 1, 2 n − 1) of n by n modules and of the strips between, which white or black takes."""
+    """Return the colours (2 n − 1, 2 n − 1) of n by n modules and of the strips between them after bleeding."""
     taken = np.maximum if bled_px >= 0.0 else np.minimum
     rows = np.empty((2 * len(printed) - 1, len(printed)))
     rows[::2], rows[1::2] = printed, taken(printed[1:], printed[:-1])
@@ -138,7 +138,7 @@ def _bled(printed: FloatArray, bled_px: float) -> FloatArray:
 def _blurred(
     places: FloatArray, shift: float, module_px: float, blur_px: float, length: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the shares (n, m) of modules and strips in a row at `places` (n,), and their second derivatives [1/px²].
+    """Return the weights (n, m) of modules and strips in a row at `places` (n,), and their second derivatives [1/px²].
 
     Places and shift are in modules. A strip is as wide as two edges' shift.
     """

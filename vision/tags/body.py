@@ -25,7 +25,7 @@ class TagBody:
     """Tags on a rigid body.
 
     Attributes:
-        corners: by a tag's number, its corners in the body's frame (4, 3) [m]; a chessboard is one with more corners.
+        corners: corners in the body's frame (4, 3) [m], by tag number; a chessboard is a tag with more corners.
     """
 
     def __init__(self, tags: Mapping[int, FloatArray]) -> None:
@@ -33,7 +33,7 @@ class TagBody:
 
     @classmethod
     def of(cls, config: VisionConfig) -> TagBody:
-        """Create the body that [vision] names.
+        """Create the body of [vision].
 
         Raises:
             ConfigError: it is not described.
@@ -64,7 +64,7 @@ class TagBody:
         """Create a body from the tags of a cluster.
 
         Raises:
-            ConfigError: it has none, or the same one twice.
+            ConfigError: there are no tags, or one is listed twice.
         """
         if not config.tags:
             raise ConfigError(
@@ -81,7 +81,7 @@ class TagBody:
 
 
 def bends(corners: FloatArray) -> FloatArray:
-    """Return the heights (k, 3) of a plate's corners (k, 3) when it is bent along x, twisted, or bent along y.
+    """Return the heights (k, 3) of a plate's corners (k, 3) if it is bent along x, twisted, or bent along y.
 
     Each is relative to the plane nearest to the corners, and of RMS 1.
     """

@@ -29,7 +29,7 @@ class ChessboardFinder:
         self._warned = False
 
     def suspicion(self, grey: ImageArray) -> Reason | None:
-        """Return what is wrong with the light of the whole image, if anything is."""
+        """Return the fault of the whole image's light, if there is one."""
         if is_black(grey):
             return Reason.LOW_CONTRAST
         return Reason.SATURATED if too_white(grey) is not None else None
@@ -49,7 +49,7 @@ class ChessboardFinder:
         return {} if seen is None else {0: seen}
 
     def _partly(self, grey: ImageArray) -> TagImage | Reason | None:
-        """Return the board where only a slower search finds it; else the reason if another or a part is in view."""
+        """Return the board if only a slower search finds it, or the reason if another or a part is in view."""
         grid = any_grid(grey)
         if grid is None:
             return None
@@ -93,7 +93,7 @@ class ChessboardFinder:
         return float(np.square(residuals - free @ change).sum()) / (residuals.size - int(rank))
 
     def _squares_fault(self, grey: ImageArray, px: FloatArray) -> Reason | None:
-        """Return what is wrong with the squares' levels: too little contrast, or more of them beyond the border."""
+        """Return the fault of the squares' levels: too little contrast, or more squares beyond the border."""
         columns, rows = np.meshgrid(np.arange(-1, self._board.columns + 1), np.arange(-1, self._board.rows + 1))
         middles = np.stack([columns, rows], axis=-1) + 0.5
         H, _ = cv2.findHomography(self._board.corners_m[:, :2] / self._board.square_m, px, 0)

@@ -17,14 +17,14 @@ Vector = tuple[float, float, float]
 
 
 class TagConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """The table [vision.tag]: the tag, or what all tags of a cluster have in common.
+    """The table [vision.tag]: the tag, or the properties common to all tags of a cluster.
 
     Attributes:
-        dictionary: which tags there are.
-        id: number of the tag, where it is one.
+        dictionary: family of the tags.
+        id: number of the tag, if there is a single one.
         side_m: side of its black square as printed [m]: measure it.
-        side_sigma_m: how far that may be off, 1-sigma [m]: a caliper on printed edges. One camera takes all distances
-            from it.
+        side_sigma_m: 1-sigma of that measurement [m]: a caliper on printed edges. One camera derives all distances from
+            it.
     """
 
     dictionary: Dictionary = "apriltag_36h11"
@@ -39,8 +39,8 @@ class PlacedTag(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     Attributes:
         id: its number.
         xyz: its centre in the marker's frame [m].
-        rpy: how its frame (x right, y up, z out of it) is turned in the marker's [rad], URDF convention.
-        side_m: side of its black square [m]; where it is not that of [vision.tag].
+        rpy: rotation of its frame (x right, y up, z out of it) in the marker's [rad], URDF convention.
+        side_m: side of its black square [m], if it differs from that of [vision.tag].
     """
 
     id: Annotated[int, Meta(ge=0)]
@@ -61,8 +61,8 @@ class ChessboardConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     Attributes:
         columns, rows: number of squares, one even and one odd.
         square_m: side of a square as printed [m]: measure across all of them.
-        square_sigma_m: how far that may be off, 1-sigma [m]: a caliper's 0.1 mm across five squares. One camera takes
-            all distances from it, and what it claims of them in proportion.
+        square_sigma_m: 1-sigma of that measurement [m]: a caliper's 0.1 mm across five squares. One camera derives all
+            distances from it, and their uncertainty in proportion.
     """
 
     columns: Annotated[int, Meta(le=40)]
@@ -73,7 +73,7 @@ class ChessboardConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     def __post_init__(self) -> None:
         name = f"a chessboard of {self.columns}x{self.rows} squares"
         if min(self.columns, self.rows) < 4:
-            raise ValueError(f"{name} is too small. Take 4 and more each way")  # patterns like it are in any texture
+            raise ValueError(f"{name} is too small. Take 4 and more each way")  # any texture contains patterns like it
         if (self.columns + self.rows) % 2 == 0:
             raise ValueError(
                 f"{name} looks the same turned by half a turn. Take an even and an odd number, as in 8x5 or 7x6"

@@ -1,9 +1,9 @@
 """Measure the four straight edges of a tag's black square to hundredths of a pixel, with their uncertainty.
 
-A matched filter on each line across the edge finds where black becomes white. Each line has levels and gradients of its
-own on both sides, so uneven light and glare move no edge. The blur is estimated by a second filter. Two errors are
-subtracted: the light that blur brings from the modules beyond and from the end of the paper, and the apparent shift of
-an ideal edge of that blur on the same pixels.
+A matched filter on each line across the edge finds the transition from black to white. Each line has its own levels and
+gradients on both sides, so uneven light and glare do not move the edge. The blur is estimated by a second filter. Two
+errors are subtracted: the light that blur brings from the modules beyond and from the end of the paper, and the
+apparent shift of an ideal edge of that blur on the same pixels.
 
 All four edges are measured at once, in arrays that are padded to the longest edge and the widest reach.
 """
@@ -47,10 +47,10 @@ class Edges:
         scatter: covariance (4, 2, 2) of place and slope [px²] from the points' scatter, if they were independent.
         shared: covariance (4, 2, 2) of the error common to all points of an edge [px²].
         residuals: residuals of each edge's points in units of their scatter; 0 where a point was left out.
-        widening: error of the assumed blur [px] times its information,
-        information: inverse of its variance [1/px²], for a noise of one grey level.
-        spots: two places on each edge (4, 2, 2) [px], whose
-        levels: levels of black and white are these (4, 2, 2) [grey levels].
+        widening: error of the assumed blur [px], multiplied by its information.
+        information: inverse variance of the blur [1/px²], for a noise of one grey level.
+        spots: two places on each edge (4, 2, 2) [px].
+        levels: levels of black and white at the spots (4, 2, 2) [grey levels].
     """
 
     origins: FloatArray
@@ -84,7 +84,7 @@ class Light:
 
     Attributes:
         gradients: of black and white (2, 2) [grey levels/px].
-        cov: of each of the two gradients (2, 2, 2) [grey levels²/px²], from what the planes leave.
+        cov: covariance of each of the two gradients (2, 2, 2) [grey levels²/px²], from the residuals of the planes.
     """
 
     gradients: FloatArray
@@ -96,11 +96,11 @@ class _Rays:
     """Lines across the four edges, and the samples on them.
 
     Attributes:
-        s: places of the lines along their edge (4, n), from −1 to 1.
-        used: mask (4, n) of the lines; the rest pads.
+        s: positions of the lines along their edge (4, n), from −1 to 1.
+        used: mask (4, n) of the lines; the others are padding.
         counts: number of lines of each edge (4,).
-        steps: places of the samples along the lines (4, m) [px], outward.
-        weights: 1 for samples (4, m), 0 for those that pad.
+        steps: positions of the samples along the lines (4, m) [px], outward.
+        weights: 1 for samples (4, m), 0 for padding.
         spots: u and v (2, 4, n, m) [px] of the samples.
         ends: distance (4, 2, n) [px] to the inner end of the black border and the outer end of a white margin.
         beyond: u and v (2, 4, 2, n) [px] of the centres of the modules beyond these ends; none if corners are rough.
@@ -125,11 +125,11 @@ class _Points:
     """Points of the edges on the lines across them.
 
     Attributes:
-        places: position of the edge on each line, outward (4, n) [px], as the place of all together needs it,
-        steady: the same, as their slope needs it.
+        places: position of the edge on each line, outward (4, n) [px], for the fit of the edge's place.
+        steady: the same, for the fit of the edge's slope.
         clear: mask (4, n) of the lines that show black and white.
         beyond: correction for the modules beyond (4, n) [px].
-        unlit: variances (4, 2) of place and slope of all together that the light's uncertainty leaves [px²].
+        unlit: variances (4, 2) of the fitted place and slope due to the uncertainty of the light [px²].
         widening, information, levels: see `Edges`.
     """
 
@@ -150,7 +150,7 @@ def find_edges(
 
     Args:
         light: None if the corners may be wrong by pixels.
-        shorter: share of their usual length that the lines across the edges have.
+        shorter: length of the lines across the edges, relative to the usual one.
     """
     begin, end = corners_px, corners_px[[1, 2, 3, 0]]
     lengths = np.linalg.norm(end - begin, axis=1)
@@ -242,8 +242,9 @@ def _module_ends(to_modules: FloatArray, points: FloatArray, normals: FloatArray
 
 
 def _beyond(to_px: FloatArray, to_modules: FloatArray, places: FloatArray) -> FloatArray:
-    """Return u and v (2, 4, 2, n) [px] of the centres of the modules beyond the ends of black border and margin, which
-    are at `places` (4, 2, 2, n): of each edge u and v of both ends.
+    """Return u and v (2, 4, 2, n) [px] of the centres of the modules beyond the ends of black border and margin.
+
+    `places` (4, 2, 2, n) are u and v of both ends of each edge.
     """
     count = places.shape[3]
     row, weight = (to_modules[:, ::2, :2] @ places.reshape(4, 2, -1) + to_modules[:, ::2, 2:]).swapaxes(0, 1)
@@ -260,7 +261,7 @@ def leave(grey: ImageArray, places: FloatArray) -> bool:
 
 
 def _within(grey: ImageArray, places: FloatArray) -> FloatArray:
-    """Return the places, u and v (2, ...), each moved to the nearest one that can be sampled."""
+    """Return the places, u and v (2, ...), each clipped to the nearest one that can be sampled."""
     height, width = grey.shape
     return np.stack([np.clip(places[0], 1.0, width - 2.0), np.clip(places[1], 1.0, height - 2.0)])
 
@@ -286,7 +287,7 @@ def _ideal(places: FloatArray, origins: FloatArray, normals: FloatArray, blur_px
 
 
 def _interpolated(pixels: list[FloatArray], parts: FloatArray) -> FloatArray:
-    """Interpolate bilinearly, at parts, u and v (2, ...), of a pixel, the values of four neighbouring pixels."""
+    """Interpolate the values of four neighbouring pixels bilinearly at fractions of a pixel, u and v (2, ...)."""
     right, down = parts
     top = pixels[0] + (pixels[1] - pixels[0]) * right
     bottom = pixels[2] + (pixels[3] - pixels[2]) * right
@@ -294,7 +295,7 @@ def _interpolated(pixels: list[FloatArray], parts: FloatArray) -> FloatArray:
 
 
 def _rough_points(profiles: FloatArray, rays: _Rays, blur_px: float) -> _Points | Reason:
-    """Return the points from the share of black on each line (4, n, m): rough, but from anywhere on the lines."""
+    """Return rough points from the share of black on each line (4, n, m); the edge may be anywhere on the lines."""
     samples = rays.weights.sum(axis=1)[:, None]
     plain = np.maximum(1.0, np.rint(0.5 * _Settings.plain * samples))
     number = np.arange(rays.weights.shape[1])
@@ -330,9 +331,9 @@ def _points(
         profiles: grey levels (4, n, m) on the lines.
         ideal: levels of an ideal edge at 0 there, 0 black and 1 white.
         beyond: grey levels (4, 2, n) beyond the ends of black border and margin.
-        cumulants: the fourth one (4,) of the blur across each edge, in units of `blur_px`.
+        cumulants: fourth cumulant (4,) of the blur across each edge, in units of `blur_px`.
         gradients: change of black and white (4, 2, 2) per unit of s [grey levels] and of `steps` [grey levels/px].
-        unlit: their variances (4, 2, 2).
+        unlit: variances of the gradients (4, 2, 2).
     """
     filters, steady, information = _filters(rays.steps, rays.weights, blur_px)
     s = rays.s[..., None]
@@ -371,7 +372,7 @@ def _points(
     clear = rays.used & (own[..., 1] - own[..., 0] > 0.5 * contrast)
     squared = np.square(contrast) * clear * information[:, None]
     correction = -(shown @ filters[:, 2, :, None])[..., 0] / contrast
-    # Both edges across a gradient are moved the same way: their errors add, which the factor allows for.
+    # Both edges across a gradient move the same way: their errors add, which the factor accounts for.
     sides = np.concatenate([1.0 - side, side], axis=1)
     pulls = np.stack(
         [((sides * around) @ filters[:, 2, :, None])[..., 0], (sides @ across)[..., 0]], axis=2
@@ -383,7 +384,7 @@ def _points(
 
 
 def blurred_step(places: FloatArray, cumulant: float | FloatArray) -> FloatArray:
-    """Return the levels of a step from 0 to 1 at 0, at places in units of its blur.
+    """Return the levels of a step from 0 to 1 at 0, at positions in units of its blur.
 
     Edgeworth's series of a Gaussian blur and its fourth cumulant.
     """
@@ -393,14 +394,14 @@ def blurred_step(places: FloatArray, cumulant: float | FloatArray) -> FloatArray
 
 
 def _filters(steps: FloatArray, weights: FloatArray, blur_px: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return filters (4, 4, m) over samples at `steps` (4, m) [px], one (4, m) more, and the blur's information (4,).
+    """Return filters (4, 4, m) over samples at `steps` (4, m) [px], one more (4, m), and the blur's information (4,).
 
-    The first give the levels of black and white at the edge, and the contrast times its shift and times the error of
-    the blur; the one more is for the shift too, with levels that have a prior. What the light's gradients leave across
-    the edge has a prior in all.
+    The four filters give the levels of black and white at the edge, and the contrast times its shift and times the
+    error of the blur. The additional filter gives the shift too, with a prior on the levels. All have a prior on the
+    remainder of the light's gradients across the edge.
 
-    An edge along the rows or columns has the same place within the pixels all along, so that what a pixel makes of its
-    shape does not average out. Filters for the shift are wider than the edge: they hardly depend on that shape.
+    An edge along the rows or columns has the same position within the pixels all along, so that the pixels' effect on
+    its shape does not average out. Filters for the shift are wider than the edge: they hardly depend on that shape.
     """
     wide = math.hypot(blur_px, _Settings.wider_px)
     blurs = np.array([blur_px, wide, wide])[:, None, None]
@@ -434,7 +435,7 @@ def _line_filters(s: FloatArray, kept: Mask) -> FloatArray:
 def _fitted(
     rays: _Rays, points: _Points
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, tuple[FloatArray, ...]] | Reason:
-    """Fit lines through the points; return the reason if there is none.
+    """Fit lines through the points; return the reason if none can be fitted.
 
     The result is `places`, `slopes`, `scatter`, `shared` and `residuals`, see `Edges`.
     """
@@ -456,7 +457,7 @@ def _fitted(
     residuals = (both - lines[:, None, 0] - lines[:, None, 1] * rays.s[..., None]) * kept[..., None]
     freedom = kept.sum(axis=1) - 2.0
     squares = np.maximum(np.square(residuals).sum(axis=1), freedom[:, None] * _Settings.floor_px**2)
-    # With few points the scatter may be larger than it seems: Student's t has this variance.
+    # With few points the scatter may be larger than estimated: this is the variance of Student's t.
     sigmas = np.sqrt(squares / np.maximum(freedom - 2.0, 1.0)[:, None])
     scatter = sigmas[:, :, None] * (filters @ filters.mT) * sigmas[:, None]
     beyond = filters @ points.beyond[..., None]

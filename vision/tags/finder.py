@@ -27,22 +27,22 @@ class TagFinder:
     """Detector of the tags with the given numbers."""
 
     def __init__(self, config: TagConfig, ids: Collection[int]) -> None:
-        """Prepare OpenCV's detector of the dictionary. ConfigError if a tag's number is not in it."""
+        """Prepare OpenCV's detector of the dictionary; raise ConfigError if a tag's number is not in it."""
         for id in ids:
             require_tag(config.dictionary, id)
         self._config, self._ids = config, ids
         self._detector = _detector(tags_of(config.dictionary))
         self._suspect, self._warned = 0, False
-        # Of the six by six dictionaries of ArUco, one is the beginning of the next.
+        # Among ArUco's six by six dictionaries, each is the beginning of the next.
         kinds = {"apriltag_36h11", "aruco_6x6_1000", "aruco_mip_36h12"} - {config.dictionary}
         self._others = {name: number for name, number in DICTIONARIES.items() if name in kinds} | OTHER_DICTIONARIES
         if config.dictionary.startswith("aruco_6x6"):
             del self._others["aruco_6x6_1000"]
 
     def suspicion(self, grey: ImageArray) -> Reason | None:
-        """Return what is seen instead of the tags: one mirrored, or one of another dictionary.
+        """Return the likely cause of missing tags: a mirrored tag, or one of another dictionary.
 
-        Each call looks for one of these, in turn, and stays with what it finds.
+        Each call searches for one of these, in turn, and keeps what it finds.
         """
         names = ["", *self._others]
         name = names[self._suspect]
@@ -79,10 +79,10 @@ class TagFinder:
 
 
 def _detector(dictionary: Any, *, exact: bool = False) -> cv2.aruco.ArucoDetector:
-    """Return a detector of a dictionary; `exact`, of tags without a wrong module alone."""
+    """Return a detector of a dictionary; if `exact`, only of tags without a wrong module."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE  # `measure_tag` does better
-    # Else a tag's paper, one module wider all around, is taken for the same square, and the tag is not found.
+    # Otherwise a tag's paper, one module wider all around, counts as the same square, and the tag is missed.
     parameters.minMarkerDistanceRate = _Settings.apart_share
     parameters.perspectiveRemovePixelPerCell = 8  # with OpenCV's 4, small and oblique tags are missed
     if exact:

@@ -1,6 +1,6 @@
 """Measure a tag in one eye's image: its four corners to hundredths of a pixel, with their covariance.
 
-The four edges of the black square are measured where they are straight, between the corners, see `edge`. The blur
+The four edges of the black square are measured between the corners, where they are straight, see `edge`. The blur
 is estimated from the edges themselves. The corners are the intersections of the edges' lines.
 """
 
@@ -33,7 +33,7 @@ class TagImage:
         id: its number in the dictionary.
         corners_px: its corners (4, 2) [px]: top left, top right, bottom right, bottom left of the tag as printed.
         cov_px: covariance (8, 8) of u and v of the first, then of the second corner ... [px²].
-        skew_px: 1-sigma (4, 2) [px] of what the rows' unknown readout moves all corners of all tags by.
+        skew_px: 1-sigma (4, 2) [px] of the common shift of all tags' corners due to the unknown readout of the rows.
     """
 
     id: int
@@ -43,7 +43,7 @@ class TagImage:
 
 
 def measure_tag(grey: ImageArray, id: int, corners_px: FloatArray, config: TagConfig) -> TagImage | Reason:
-    """Measure the tag whose corners are near `corners_px` (4, 2) in a grey image, or return why it is doubtful."""
+    """Measure the tag whose corners are near `corners_px` (4, 2) in a grey image, or return the reason for doubt."""
     found = _measured(grey, id, corners_px, 1.0, config)
     if isinstance(found, Reason):
         # The margin may be narrower than a module, the tag very oblique, or near the image's border.
@@ -55,7 +55,7 @@ def measure_tag(grey: ImageArray, id: int, corners_px: FloatArray, config: TagCo
 def _measured(
     grey: ImageArray, id: int, corners_px: FloatArray, shorter: float, config: TagConfig
 ) -> TagImage | Reason:
-    """Measure the tag with lines across its edges that are so much shorter than usual."""
+    """Measure the tag with shorter lines across its edges, by the factor `shorter`."""
     blur_px = _Settings.usual_blur_px
     light: Light | None = None
     number, before_px = 0, math.inf
@@ -96,7 +96,7 @@ def _blur(edges: Edges, before_px: float) -> float:
 
 
 def _light(edges: Edges) -> Light:
-    """Return the light that the levels along the edges show."""
+    """Return the light estimated from the levels along the edges."""
     spots, levels = edges.spots.reshape(-1, 2), edges.levels.reshape(-1, 2)
     design = spots - spots.mean(axis=0)
     inverse = np.linalg.inv(design.T @ design)
@@ -107,7 +107,7 @@ def _light(edges: Edges) -> Light:
 
 
 def _likeness(edges: Edges) -> FloatArray:
-    """Return the variances (2,) of an edge's place and slope relative to those that independent points would have.
+    """Return the variances (2,) of an edge's place and slope relative to those for independent points.
 
     Interpolation and blur spread a pixel's noise to its neighbours, and neither a print nor a lens is straight. So slow
     waves along the edges have more noise than quick ones. The power of waves of index k from 2 on is that of a random
@@ -116,9 +116,9 @@ def _likeness(edges: Edges) -> FloatArray:
     waves = [_slow_waves(len(points)) for points in edges.residuals]
     power = np.concatenate([np.square(w @ points) for w, points in zip(waves, edges.residuals, strict=True)])
     index = np.concatenate([np.arange(2.0, 2.0 + len(w)) for w in waves])
-    # The prior counts as waves that are quick enough to show no walk.
+    # The prior counts as waves too quick to show a random walk.
     apart = np.linalg.norm(edges.spots[:, 1] - edges.spots[:, 0], axis=1) / [len(r) - 1 for r in edges.residuals]
-    # White noise, smoothed as by a Gaussian of interpolation's variance; far points share none.
+    # White noise, smoothed as by a Gaussian of interpolation's variance; distant points are independent.
     smoothed = max(math.sqrt(4.0 * math.pi * INTERPOLATION) * float(np.mean(1.0 / apart)), 1.0)
     power = np.append(power, smoothed)
     design = np.stack([np.ones_like(power), np.append(index**-2.0, 0.0)])
@@ -129,7 +129,7 @@ def _likeness(edges: Edges) -> FloatArray:
     level = cov @ (design * count) @ power
     noise, steep = max(float(level[0]), 0.0), max(float(level[1]), 1e-9)
     chance = math.sqrt(2.0 * float(cov[1, 1])) * max(noise, smoothed)
-    # Walks that chance may show are left out, larger ones are taken for a little smaller (James and Stein).
+    # Walks within chance are ignored, larger ones are shrunk a little (James and Stein).
     walk = steep * max(1.0 - (_Settings.chance * chance / steep) ** 2, 0.0)
     return (noise if walk else alone) + walk * np.array([4.0, 1.0])
 
@@ -155,8 +155,9 @@ def _meetings(edges: Edges) -> FloatArray:
 def _corner_covariance(edges: Edges, together: float) -> FloatArray:
     """Return the covariance (8, 8) of the corners; each lies on the edge before it and on its own edge.
 
-    A corner x on both lines n·x = place moves by dx with n₁·dx = dp₁ and n₂·dx = dp₂, where dp is the line's shift
-    there: that of its place, and of its slope times s. `together` is the variance [px²] of the shift of all edges.
+    A corner x on both lines n·x = place moves by dx with n₁·dx = dp₁ and n₂·dx = dp₂. dp is the shift of the line at
+    the corner: that of its place, plus that of its slope times s. `together` is the variance [px²] of the shift of all
+    edges.
     """
     directions = edges.directions / np.linalg.norm(edges.directions, axis=1)[:, None]
     normals = np.column_stack([directions[:, 1], -directions[:, 0]])

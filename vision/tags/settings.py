@@ -1,4 +1,4 @@
-"""Settings of the tracker of tags, and how much they matter."""
+"""Settings of the tag tracker and their sensitivity."""
 
 from __future__ import annotations
 

@@ -51,11 +51,11 @@ _TELLING = (
 class TagTracker:
     """Tracker of one marker made of tags in rectified images of one or two eyes.
 
-    It searches near the marker's last position, else in the whole images. `track` always returns a fix or the reason
-    for a miss.
+    It searches near the marker's last position, otherwise in the whole images. `track` always returns a fix or the
+    reason for a miss.
 
-    A small plane looks nearly the same tilted one way and the other. Two eyes nearly always resolve this, one eye does
-    not. Then the pose of the previous frame decides, if it was unambiguous; else the frame is ambiguous.
+    A small plane looks nearly the same tilted to either side. Two eyes nearly always resolve this, one eye does not.
+    Then the pose of the previous frame decides if it was unambiguous; otherwise the frame is ambiguous.
     """
 
     def __init__(
@@ -69,10 +69,10 @@ class TagTracker:
     ) -> None:
         """Prepare for images of `calibration`, whose first and last rows are exposed `readout_s` [s] apart.
 
-        Where that is not known, `readout_s` is 0 and `readout_sigma_s` the RMS of what it may be.
+        If the readout is unknown, `readout_s` is 0 and `readout_sigma_s` its RMS.
 
         Raises:
-            ConfigError: the calibration describes no cameras, or a tag's number is not in the dictionary.
+            ConfigError: the calibration does not describe cameras, or a tag's number is not in the dictionary.
         """
         check_calibration(calibration)
         self.calibration, self.body, self.config = calibration, body, config or TagConfig()
@@ -84,7 +84,7 @@ class TagTracker:
         self._seen: tuple[float, list[dict[int, FloatArray]]] = -math.inf, []  # with refused frames
         self._before = self._seen
         self._planes: dict[frozenset[int], tuple[FloatArray, FloatArray]] = {}
-        self._met = False  # a marker that has been found is neither mirrored nor of another dictionary
+        self._met = False  # a marker found before is neither mirrored nor of another dictionary
 
     def track(self, frame: StereoFrame) -> MarkerFix | MarkerMiss:
         """Return the marker in `frame`, in the left optical frame, or the reason for a miss.
@@ -111,7 +111,7 @@ class TagTracker:
         return self._fix(frame.t, found)
 
     def forget(self) -> None:
-        """Look for the marker in the whole images next time."""
+        """Search the whole images next time."""
         self._last, self._seen = None, (-math.inf, [])
 
     def _fix(self, t: float, pose: Pose) -> MarkerFix:
@@ -142,10 +142,10 @@ class TagTracker:
         return pose
 
     def _at_one_time(self, t: float, seen: list[dict[int, TagImage]]) -> list[dict[int, TagImage]]:
-        """Return the tags with their corners where they were when the rolling shutter read the marker's middle row.
+        """Return the tags with their corners at the time when the rolling shutter read the marker's middle row.
 
-        Each corner moves as it did since the last frame. Tags that were not seen there stay, and the time is uncertain.
-        Where the readout is not known, corners stay, and have as `skew_px` how far its 1-sigma would move them.
+        Each corner is assumed to move as since the last frame. New tags are not moved, and the time is uncertain. If
+        the readout is unknown, no corners are moved, and `skew_px` is the shift for a readout of 1 sigma.
         """
         row_s = self._readout_s / self.calibration.image_size_px[1]
         middle = np.mean([tag.corners_px[:, 1].mean() for eye in seen for tag in eye.values()])
@@ -169,7 +169,7 @@ class TagTracker:
         return moved
 
     def _agreeing(self, left: dict[int, TagImage], right: dict[int, TagImage]) -> list[dict[int, TagImage]] | Reason:
-        """Return both eyes' tags, of which they share some, without those whose rows differ."""
+        """Return both eyes' tags, some of them common, without those whose rows differ."""
         both = left.keys() & right.keys()
         apart = {id for id in both if not self._rows_agree(left[id], right[id])}
         if apart.issuperset(both):
@@ -223,7 +223,7 @@ class TagTracker:
             if stayed is None:
                 return Reason.AMBIGUOUS
             best = stayed
-        # What the claimed noise does not explain, nor chance (2-sigma), is taken for more noise.
+        # The part of the misfit beyond the claimed noise and chance (2-sigma) is treated as more noise.
         unexplained = max(misfit - 2.0 * math.sqrt(2.0 / freedom), 1.0)
         return Pose(best.rotation, best.x, best.cov * unexplained, best.squares)
 
@@ -251,7 +251,7 @@ class TagTracker:
         return poses[nearest] if turned[nearest] < _Settings.stayed * apart else None
 
     def _starts(self, seen: list[dict[int, TagImage]]) -> list[tuple[FloatArray, FloatArray]]:
-        """Return a first pose from the corners that all eyes see."""
+        """Return initial poses from the corners that all eyes see."""
         if not self.calibration.is_stereo:
             ids = list(seen[0])
             corners = np.concatenate([self.body.corners[id] for id in ids])
@@ -267,7 +267,7 @@ class TagTracker:
         return [fitted_motion(np.array(body), np.array(points))] if len(points) >= 3 else []
 
     def _mirrored(self, rotation: FloatArray, x: FloatArray, seen: list[dict[int, TagImage]]) -> FloatArray:
-        """Return the mirrored rotation, with which the corners' (best-fitting) plane looks nearly the same."""
+        """Return the mirrored rotation, under which the (best-fitting) plane of the corners looks nearly the same."""
         middle, axes = self._plane(frozenset(_ids(seen)))
         return mirrored(rotation @ axes, x + rotation @ middle) @ axes.T
 
@@ -301,7 +301,7 @@ def _ids(seen: Iterable[dict[int, TagImage]]) -> set[int]:
 
 
 def _why(eyes: Iterable[Seen]) -> Reason:
-    """Return the most informative reason why tags were not measured; NO_MARKER where none was found."""
+    """Return the most informative reason why tags were not measured; NO_MARKER if none was found."""
     reasons = {tag for eye in eyes for tag in eye.values() if isinstance(tag, Reason)}
     return next((reason for reason in _TELLING if reason in reasons), Reason.NO_MARKER)
 

@@ -1,1 +1,1 @@
-"""The competitors, one module a method."""
+"""The competitors, one module for each method."""

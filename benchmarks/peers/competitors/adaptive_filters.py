@@ -1,4 +1,4 @@
-"""Adaptive filters (padasip) on the features of a KB-Map: one filter a coordinate."""
+"""Adaptive filters (padasip) on the features of a KB-Map: one filter for each coordinate."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Least-squares calibration with scipy, and the nominal model as it is.
+"""Least-squares calibration with scipy, and the unchanged nominal model.
 
-Method of calibration toolboxes (FIGAROH; Hollerbach, Khalil and Gautier 2008): small placement errors of every joint
-frame, reduced to the identifiable ones by a pivoted QR of the regressor, then Levenberg-Marquardt without a prior.
+The method of calibration toolboxes (FIGAROH; Hollerbach, Khalil and Gautier 2008): small placement errors of every
+joint frame, reduced to the identifiable ones by a pivoted QR of the regressor; then Levenberg-Marquardt, no prior.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _MOST_EVALUATIONS = 100
 
 @dataclass(frozen=True)
 class Placements:
-    """A chain whose d + 1 fixed transforms are each followed by a small motion: a turn [rad] and a shift [m]."""
+    """A chain whose d + 1 fixed transforms are each followed by a small motion: a rotation [rad] and a shift [m]."""
 
     chain: RigidChain
     change: FloatArray
@@ -33,7 +33,7 @@ class Placements:
         return self.linearised(self.change, q)[0]
 
     def linearised(self, change: FloatArray, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return positions (n, 3) and their derivatives (n, 3, 6 d + 6) by the change, (turn, shift) frame by frame."""
+        """Return positions (n, 3) and derivatives (n, 3, 6 d + 6) by the change (rotation, shift), frame by frame."""
         motions = change.reshape(-1, 6)
         rotation, origin = np.broadcast_to(np.eye(3), (len(q), 3, 3)), np.zeros((len(q), 3))
         rotations: list[FloatArray] = []
@@ -57,7 +57,7 @@ class Placements:
 
 
 def _left_jacobian(turn: FloatArray) -> FloatArray:
-    """exp(φ + δ) = exp(J δ) exp(φ) to first order (Chirikjian 2012, section 10.8)."""
+    """Return J with exp(φ + δ) = exp(J δ) exp(φ) to first order (Chirikjian 2012, section 10.8)."""
     angle = float(np.linalg.norm(turn))
     if angle < 1e-6:
         return np.eye(3)
@@ -70,7 +70,7 @@ def identifiable(model: Placements, q: FloatArray) -> IntArray:
     """Return the indices of the parameters identifiable from q (pivoted QR of the regressor at the present change)."""
     _, jacobian = model.linearised(model.change, q)
     flat = jacobian.reshape(3 * len(q), -1)
-    # The stubs of scipy know neither what pivoting adds to the result, nor a function as jac below.
+    # scipy's stubs lack the third result that pivoting adds, and a function as jac below.
     factors: Any = qr(flat, mode="r", pivoting=True)
     triangle, pivots = factors
     diagonal = np.abs(np.diag(triangle))

@@ -47,7 +47,7 @@ class BodySchema:
 
     @classmethod
     def random(cls, problem: Problem) -> BodySchema:
-        """Draw a random arm about as large as the cloud of positions, with the same centre."""
+        """Sample a random arm about as large as the cloud of positions, with the same centre."""
         size = float(np.linalg.norm(problem.x - problem.x.mean(axis=0), axis=1).mean())
         axes = problem.rng.normal(size=(problem.joints, 3))
         axes /= np.linalg.norm(axes, axis=1, keepdims=True)
@@ -63,7 +63,7 @@ class BodySchema:
         return x
 
     def learn(self, q: FloatArray, x: FloatArray, order: IntArray, rates: FloatArray) -> None:
-        """Take one step for each pair of an order, of q (n, d) and x (n, 3), at its rate."""
+        """Take one step for each pair in `order`, from q (n, d) and x (n, 3), at its rate."""
         step = _Stepper(self)
         cosines, sines = np.cos(q)[..., None], np.sin(q)[..., None]
         for index, rate in zip(order.tolist(), rates.tolist(), strict=True):
@@ -71,14 +71,14 @@ class BodySchema:
 
 
 class _Stepper:
-    """Changes a schema in place, pair by pair, in memory that is laid out once."""
+    """In-place gradient steps of a schema, pair by pair, in preallocated memory."""
 
     def __init__(self, schema: BodySchema) -> None:
         self.axes, self.links = schema.axes, schema.links
         self.scale = 1.0 / schema.length**2
         joints = len(schema.axes)
         self.turns = np.empty((joints, 3, 3))
-        # The rotation before each joint and, last, of the marker.
+        # Rotations in front of each joint and, last, of the marker.
         self.before = np.empty((joints + 1, 3, 3))
         self.before[0] = np.eye(3)
         self.products = [(self.before[k], self.turns[k], self.before[k + 1]) for k in range(joints)]
@@ -96,7 +96,7 @@ class _Stepper:
             np.matmul(first, turn, out=product)
         shares = (before @ links[:, :, None])[:, :, 0]
         beyond = np.add.accumulate(shares[::-1])[::-1]
-        # In the frame before each joint: the error; in the one after it: what the joint carries.
+        # The error in the frame before each joint; the carried vector in the frame after it.
         u = (x - beyond[0]) @ before
         v = (beyond[1:, None] @ before[1:])[:, 0]
         u_joints = u[:-1]
@@ -105,7 +105,7 @@ class _Stepper:
         gradient += (sine * v.take(_AFTER, axis=1)) * u_joints.take(_AFTER_NEXT, axis=1)
         gradient -= (sine * v.take(_AFTER_NEXT, axis=1)) * u_joints.take(_AFTER, axis=1)
         gradient -= np.vecdot(gradient, axes)[:, None] * axes
-        # Normalised, so that a rate of 1 takes about the whole error away whatever the arm's size.
+        # Normalised, so that a rate of 1 removes about the whole error, whatever the arm's size.
         pace = rate / (len(links) + float(np.vdot(v, v)) * self.scale)
         links += pace * u
         axes += (pace * self.scale) * gradient

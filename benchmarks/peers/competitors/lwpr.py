@@ -33,10 +33,10 @@ class Settings:
     Attributes:
         first_metric: diagonal of a new field's distance metric D (inputs scaled to about -1 .. 1).
         generate: activation below which a new field is made (w_gen).
-        learning_rate: of the distance metric (α), relative to the size of the gradient's terms.
+        learning_rate: α of the distance metric, relative to the size of the gradient's terms.
         penalty: weight γ of the metric's size.
-        forgetting: λ of all sums at first; it goes to `last_forgetting` (annealed as in the paper).
-        add_projection: error ratio φ below which another projection is worth while.
+        forgetting: initial λ of all sums; it approaches `last_forgetting` (annealed as in the paper).
+        add_projection: error ratio φ below which another projection is added.
     """
 
     first_metric: float = 10.0
@@ -51,10 +51,10 @@ class Settings:
 
 
 class LWPR:
-    """Inputs (d,), several outputs at once; every output has its own fields.
+    """Learner with inputs (d,) and several outputs at once; every output has its own fields.
 
     A field's sums are one row of a table: a pair costs one gather and one scatter of the active fields. In between they
-    are columns, so that what is one number a field lies side by side.
+    are stored by column, so that values of the same quantity are contiguous over the fields.
     """
 
     def __init__(self, inputs: int, outputs: int, settings: Settings | None = None) -> None:
@@ -68,8 +68,8 @@ class LWPR:
         self._decayed = self._decayed_first + sum(sizes[name] for name in ("h", "r2", "cv"))
         self._table = np.empty((_FIRST_ROWS, sum(sizes.values())))
         self._output, self._centre = np.empty(_FIRST_ROWS, dtype=np.intp), np.empty((_FIRST_ROWS, inputs))
-        # Most fields never see enough pairs to change their metric: the first one serves them all. Those that do, the
-        # Cholesky roots of their metrics, and where in these a field's is.
+        # Most fields never see enough pairs to change their metric: they all share the first one. For the others:
+        # Cholesky roots of their metrics, and each field's index among these.
         self._moved, self._root = np.empty(0, dtype=np.intp), np.empty((0, inputs, inputs))
         self._place = np.empty(_FIRST_ROWS, dtype=np.intp)
         self._upper = np.triu(np.ones((inputs, inputs)))
@@ -155,7 +155,7 @@ class LWPR:
         columns[: self._decayed_first] *= keep
         field["seen"] += 1.0
         field["weight"] += w
-        # Inputs, output and, once there is one, the projected input of each field.
+        # Inputs, output and, as soon as it exists, the projected input of each field.
         z = np.empty((self.inputs + 2, len(at)))
         z[:-2], z[-2] = x[:, None], y
         field["mean"] += w / field["weight"] * (z[:-1] - field["mean"])
@@ -170,9 +170,9 @@ class LWPR:
         self._table[at] = columns.T
 
     def _project(self, field: dict[str, FloatArray], w: FloatArray, z: FloatArray) -> FloatArray:
-        """Partial least squares of inputs and output in z (d + 2, k), which becomes what is left of them.
+        """Apply partial least squares to inputs and output in z (d + 2, k), which becomes their remainder.
 
-        Returns what the mean, a regression on a constant, and each projection regress on (r + 1, k).
+        Return the coefficients of the mean (a regression on a constant) and of each projection (r + 1, k).
         """
         used = field["used"]
         least, most = int(used.min()), int(used.max())
@@ -228,7 +228,7 @@ class LWPR:
         ready = np.flatnonzero(total > self.settings.trusted_pairs * self.inputs)
         by_weight = None
         if len(ready):
-            # The pair's own share and leverage, what the slopes do to all earlier errors and to their leverages.
+            # The pair's own share and leverage, and the effect of the slopes on all earlier errors and leverages.
             before = error * _dots(share, field["h"]) + _dots(share * share, field["r2"])
             by_weight = cost * (1.0 + 2.0 * w * leverage / room) - w * (2.0 * before + field["cv"] / total)
         columns[self._decayed_first : self._decayed] *= keep
@@ -237,7 +237,7 @@ class LWPR:
         field["r2"] += (cost * w / room) * (s * s)
         if by_weight is None:
             return None
-        # While its leave-one-out error is far above its training error a field knows too little to move.
+        # A leave-one-out error far above the training error shows that the field has too few pairs to move.
         mse = field["mse"][field["used"][ready].astype(np.intp), ready]
         settled = np.minimum((mse / np.maximum(field["cv"][ready], _TINY)) ** 4, 1.0)
         return ready, by_weight[ready] / total[ready], w[ready] / total[ready], settled
@@ -275,8 +275,8 @@ def _dots(first: FloatArray, second: FloatArray) -> FloatArray:
 def _layout(inputs: int, projections: int) -> dict[str, tuple[int, ...]]:
     """Return the names and shapes in a field's row.
 
-    First come the sums that a pair decays first, then those that the metric needs undecayed, then the rest. `moments`
-    are those of a projection with inputs, output and itself.
+    The order is: sums that a pair decays first, sums that the metric needs undecayed, then the rest. `moments` are
+    those of a projection with inputs, output and itself.
     """
     d, r = inputs, projections
     first = {"u": (r, d), "moments": (r, d + 2), "weight": (), "mse": (r + 1,)}

@@ -1,4 +1,4 @@
-"""Our learners that mix a chain with a map, and several models side by side."""
+"""Our learners that combine a chain with a map, and several models side by side."""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Parametrised self-organising maps: products of Lagrange polynomials through a grid of poses.
 
-PSOM (Ritter 1993; Walter 1998) takes the readings at the grid's own poses as they are. PSOM+ (Klanke and Ritter 2005)
-places the grid's reference points so that scattered, noisy pairs are met in the least-squares sense, with a penalty on
-roughness.
+PSOM (Ritter 1993; Walter 1998) uses the readings at the grid's own poses directly. PSOM+ (Klanke and Ritter 2005) fits
+the grid's reference points to scattered, noisy pairs by least squares, with a penalty on roughness.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ _PENALTY_OF_MEAN = 1e-3
 
 @dataclass(frozen=True)
 class Grid:
-    """Chebyshev nodes (the choice that keeps polynomials tame) on each joint's range, scaled to -1 .. 1."""
+    """Chebyshev nodes (which keep polynomials from oscillating) on each joint's range, scaled to -1 .. 1."""
 
     low: FloatArray
     high: FloatArray
@@ -64,7 +63,7 @@ def lagrange(angles: FloatArray, nodes: FloatArray) -> FloatArray:
 
 
 def nodes_for(joints: int, readings: int) -> tuple[int, ...] | None:
-    """Nodes a joint for at most `readings` poses, the first joints (longest levers) get one more where it fits."""
+    """Return nodes per joint for at most `readings` poses; the first joints (long levers) get one more if it fits."""
     count = math.floor(readings ** (1.0 / joints) + 1e-9)
     if count < 1 or readings < 2**joints:
         return None

@@ -6,7 +6,7 @@ hand while the last joints rest at b0, every position follows from two much shor
     x(a, b) = T(a) T(a0)⁻¹ x(a0, b)
 
 The first virtual robot, T(a), needs the hand's orientation: three markers are read at each pose, which counts as three
-readings. The second one is the marker while the first joints rest. Each is learnt with poses of its own: by PSOMs as in
+readings. The second one is the marker while the first joints rest. Each is learnt at its own poses: by PSOMs as in
 the papers, or by KB-Maps (Ulbrich et al. 2012 combine the two).
 """
 
@@ -35,7 +35,7 @@ LearnPart = Callable[[FloatArray, FloatArray, int, Read, np.random.Generator], l
 
 @dataclass(frozen=True)
 class VirtualRobots:
-    """Two learnt parts, and how many joints the first one has."""
+    """Two learnt parts, and the number of joints of the first one."""
 
     first: list[Fitted]
     second: Fitted
@@ -86,7 +86,7 @@ def learn(learn_part: LearnPart, problem: Problem, earlier: Fitted | None) -> Fi
 
 
 def shares(problem: Problem) -> tuple[int, int, int]:
-    """Joints of the first part, and poses of the two: half of the readings for the first, which take three each."""
+    """Return the joints of the first part, and the poses of both: the first gets half the readings, at three a pose."""
     split = problem.joints // 2
     second = problem.pairs * 2 // 5
     return split, (problem.pairs - second) // 3, second

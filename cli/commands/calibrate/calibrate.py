@@ -47,7 +47,7 @@ CAMERA_FRAME = "calibrated_camera"
 @Parameter(name="*")
 @dataclass(frozen=True)
 class FitOptions:
-    """Settings of the fit, and what is known beforehand."""
+    """Settings of the fit, and prior knowledge."""
 
     sigma_mm: Annotated[
         float | None,
@@ -73,7 +73,7 @@ class FitOptions:
         return None if self.sigma_mm is None else 1e-3 * self.sigma_mm
 
     def trusted(self) -> Trusted:
-        """Return what of the URDF is right."""
+        """Return the parts of the URDF to be trusted."""
         if self.trust_urdf and self.only is not None:
             raise RequestError("--trust-urdf has no offsets to find. Give it, or --only offsets")
         return "urdf" if self.trust_urdf else "nothing" if self.only is None else "links"
@@ -81,10 +81,10 @@ class FitOptions:
     def fitted(
         self, robot: RobotDescription, recording: Recording, common: CommonErrors | None
     ) -> tuple[Calibration, Calibration | None]:
-        """Return the calibration, and that with everything free where the URDF is trusted and the pairs suffice.
+        """Return the calibration, and one with everything free if the URDF is trusted and the pairs suffice.
 
         Args:
-            common: returns the errors that all positions share, as for `Calibration.of`; None: none are known.
+            common: returns the errors that all positions share, as for `Calibration.of`; None if none are known.
         """
         from bodyschema.calibration.rigid_chain import Calibration, fewest_pairs
 
@@ -114,7 +114,7 @@ class PlanOptions:
     poses: Annotated[int, Parameter(help="How many poses of --next-poses.", validator=Number(gte=1, lte=200))] = 20
 
     def written(self, found: Calibration) -> list[str]:
-        """Write the poses, if asked for; return what they would gain."""
+        """Write the poses, if requested; return their expected gain as text."""
         from bodyschema.calibration.next_poses import NextPoses
 
         if self.next_poses is None:
@@ -186,22 +186,22 @@ def arm(
     """Calibrate camera, tool and joint offsets, with 95 % intervals; writes a calibrated URDF.
 
     Learns a rigid chain from all pairs, around the nominal one. Outliers are left out. All pairs have to be of one
-    tool: from a store those are learnt that the learner beside it counts since the tool was last changed. Where
-    residuals jump as with another tool, this is said, with the row, and nothing is written.
+    tool: from a store, only the pairs since the learner's last tool change are used. If residuals jump as with another
+    tool, the row is reported, and nothing is written.
 
-    Pairs whose columns are exchanged, count the other way, have another zero or unit, or are of another robot, are
-    refused. Zeros off by more than five times --zeros-deg, and links worse than those of any arm, are printed and not
+    Pairs are refused if their columns are exchanged, reversed, or have another zero or unit, or if they are of another
+    robot. Joint offsets larger than five times --zeros-deg, and links worse than those of any arm, are printed and not
     written. --force overrules both.
 
-    The URDF opens in pybullet, Pinocchio and ROS: it has the camera and the marker as links of their own, and takes
-    its positions from them to rounding as the learnt chain does. Meshes, masses and limits stay.
+    The URDF opens in pybullet, Pinocchio and ROS. It has the camera and the marker as links, and its positions agree
+    with the learnt chain's to rounding. Meshes, masses and limits stay.
 
-    Needs: a recording or a store, and its robot.toml; no hardware. The daemon may be running: its store is read. What
-    robot.toml calls not known (`pose_known`, `marker_known`) is taken from the pairs alone, the rest is trusted to
-    1° and 10 mm.
+    Needs: a recording or a store, and its robot.toml; no hardware. The daemon may be running: its store is read. Poses
+    that robot.toml declares unknown (`pose_known`, `marker_known`) are taken from the pairs alone, the rest is trusted
+    to 1° and 10 mm.
 
-    Next: `bodyschema run --robot OUT/robot.toml` starts from what was learnt. With --lerobot the joint offsets go into
-    the servos instead, by LeRobot's own calibration file.
+    Next: `bodyschema run --robot OUT/robot.toml` starts from the calibrated robot. With --lerobot the joint offsets go
+    into the servos instead, by LeRobot's own calibration file.
     """
     from bodyschema.calibration.next_poses import check_target
     from bodyschema.daemon.config import Config
@@ -297,7 +297,7 @@ def _common_errors(config: Config, source: Path, taken: SourceOptions) -> tuple[
 
 
 def _contained(found: Calibration) -> list[str]:
-    """Return what the intervals contain of the cameras' error, and how to leave it out."""
+    """Return text on the cameras' error in the intervals, and on how to leave it out."""
     if found.common is None:
         return []
     rms_m = math.sqrt(float((found.common**2).sum(axis=(1, 2)).mean()))
@@ -319,7 +319,7 @@ def _require_writable(report: CalibrationReport, *, force: bool) -> None:
 
 
 def _written(config: Config, found: Calibration, report: CalibrationReport, out: Path, *, replace: bool) -> list[str]:
-    """Write the calibrated robot into `out`; return what to say of it."""
+    """Write the calibrated robot into `out`; return messages about it."""
     from bodyschema.robot.calibrated_files import write_calibrated
     from bodyschema.robot.hand_eye import write_launch_file
 

@@ -37,7 +37,7 @@ CAMERAS, BOARD = Path("cameras.toml"), Path("board.pdf")
 @Parameter(name="*")
 @dataclass(frozen=True)
 class KnownCameras:
-    """What is known of the cameras beforehand."""
+    """Prior knowledge of the cameras."""
 
     baseline_mm: Annotated[
         float | None,
@@ -59,7 +59,7 @@ class KnownCameras:
 @Parameter(name="*")
 @dataclass(frozen=True)
 class Instead:
-    """What to do instead of calibrating."""
+    """Actions instead of a calibration."""
 
     check: Annotated[bool, flag("Check that a calibration still holds, from one look at the board.")] = False
     calibration: Annotated[
@@ -95,22 +95,22 @@ def cameras(
 ) -> None:
     """Calibrate two cameras, or the lens of one, from views of a board: writes cameras.toml and a report.
 
-    About 20 pairs of images, or 20 images of one camera alone (--one), the board held still in each: all over the
-    images, tilted by 20° to 40° each way, near and far. Without IMAGES the robot's own cameras look: the command says
-    what to show next, and takes a view as soon as the board is still and the view is new; it ends when the calibration
-    is good enough, or with Ctrl-C. Views that do not fit the others are left out and named. A calibration that is not
-    good enough is refused, with the reasons. No image shows an error of the board's size, so measure the ruler on the
-    print. One camera alone does not need to know it.
+    Use about 20 pairs of images, or 20 images of a single camera (--one), with the board held still in each: all over
+    the images, tilted by 20° to 40° each way, near and far. Without IMAGES the robot's own cameras are used: the
+    command says what to show next, and takes a view as soon as the board is still and the view is new. It ends when the
+    calibration is good enough, or with Ctrl-C. Views that do not fit the others are left out and named. A calibration
+    that is not good enough is refused, with the reasons. No image shows an error of the board's size, so measure the
+    ruler on the print. (A single camera does not need the size.)
 
-    --print-board writes the board in true size to --out, else board.pdf. Print it at 100 % ("actual size"), measure the
-    two rulers on the page, and glue the sheet onto something flat and stiff: glass, aluminium, thick board. A bent
-    sheet gives a wrong calibration that looks like a good one. Calibrate with the same options; add --ruler-mm if a
-    ruler does not have its stated length.
+    --print-board writes the board in true size to --out, by default board.pdf. Print it at 100 % ("actual size"),
+    measure the two rulers on the page, and glue the sheet onto something flat and stiff: glass, aluminium, thick board.
+    A bent sheet gives a wrong calibration that looks like a good one. Calibrate with the same options; add --ruler-mm
+    if a ruler does not have its stated length.
 
-    --check takes the last pair of images that shows the board to both eyes; without IMAGES the robot's own cameras look
-    until the board is held still. A camera that was turned up or down or about its line of sight moves the rows apart;
-    one that was turned inwards or outwards changes the size that a square seems to have. Exit code 1 when the
-    calibration does not hold.
+    --check takes the last pair of images that shows the board to both eyes; without IMAGES it waits until the robot's
+    own cameras see the board held still. A camera that was tilted up or down, or rotated about its line of sight, moves
+    the rows apart; one that was turned inwards or outwards changes the apparent size of a square. Exit code 1 if the
+    calibration no longer holds.
 
     Needs: the printed board (or a plain chessboard), and images of it, no hardware; or robot.toml with cameras, and no
     running sampler.
@@ -201,7 +201,7 @@ def _print_board(made: Board, paper: str, out: Path) -> None:
 def _live(
     config: Config, board: Board, known: KnownCameras, save: Path | None
 ) -> tuple[Gathered, Calibrated, tuple[str, ...]]:
-    """Return the views, their calibration, and what the cameras reported of their focus."""
+    """Return the views, their calibration, and the cameras' reports on their focus."""
     from bodyschema.cli.cameras.calibration import calibrated, kept_in, live_views
     from bodyschema.cli.cameras.live_calibration import LiveCalibration, guidance_on
     from bodyschema.daemon.wiring.cameras import focus_complaints, open_eyes, require_cameras

@@ -50,7 +50,7 @@ def compare(
 
 
 def view(report: ComparisonReport) -> Group:
-    """Return a view of what was compared, the figures and the worst rows."""
+    """Return a view of the compared recordings, the figures and the worst rows."""
     from bodyschema.cli.terminal.screen import ruled_table
 
     figures = ruled_table("", "mean", "RMS", "median", "max")

@@ -52,12 +52,12 @@ def diagnose(
 ) -> None:
     """Find what the simulation gets wrong in a recording, why, and how much correcting it helps.
 
-    Every known effect is tried at every joint, alone and together, and evaluated on blocks of rows that were not
-    fitted. What remains are causes with their numbers and how sure they are; or that nothing is wrong; or that this
-    recording cannot decide, or that no known effect explains it. The exit code is 0 whatever is found.
+    Every known effect is tried at every joint, alone and together, and evaluated on held-out blocks of rows. The result
+    is one of these: causes with their numbers and probabilities; nothing is wrong; this recording cannot decide; or no
+    known effect explains the error. The exit code is 0 for all of them.
 
-    Without --out nothing is written. Pairs whose columns are exchanged, count the other way, have another zero or unit,
-    or are of another robot, are refused.
+    Without --out nothing is written. Pairs are refused if their columns are exchanged, reversed, or have another zero
+    or unit, or if they are of another robot.
 
     Needs: a recording or a store and its robot.toml, no hardware; with --live a running sampler.
 
@@ -107,7 +107,7 @@ def _show(found: ReportedDiagnosis, lines: list[str], out: Path | None) -> None:
 
 @contextmanager
 def _progress(console: Console) -> Iterator[Callable[[str], None]]:
-    """One line that changes on a terminal; elsewhere a line for each step."""
+    """Yield a function that shows progress: one changing line on a terminal, elsewhere a line for each step."""
     if console.is_terminal:
         with console.status("reading") as status:
             yield status.update

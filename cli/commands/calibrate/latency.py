@@ -30,7 +30,7 @@ def latency(
     write: Annotated[bool, flag("Put the latency into robot.toml; without it the change is shown.")] = False,
     as_json: Annotated[bool, flag("Print the figures as JSON.", name="--json")] = False,
 ) -> None:
-    """Measure the latency of the cameras' time stamps, with its uncertainty. Move the arm by hand for 5 s.
+    """Measure the latency of the cameras' timestamps, with its uncertainty. Move the arm by hand for 5 s.
 
     Move it to and fro, quickly but unevenly, with more than one joint and the marker in sight of both cameras. The
     estimate is the time shift at which the marker follows the joint angles best. No calibrated model is needed:

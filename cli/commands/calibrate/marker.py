@@ -142,14 +142,14 @@ def learn(
 ) -> None:
     """Learn a ball's colour or a cluster's shape from images, and print the table for robot.toml.
 
-    Ball: with --at, it is the region that has the colour of that pixel and is connected to it. With --auto, give three
-    images or more in which the ball moves; the most colourful moving object is taken. With --auto and no images, the
-    robot's own cameras watch while you move the ball.
+    Ball: with --at, it is the connected region with the colour of that pixel. With --auto, give three images or more in
+    which the ball moves; the most colourful moving object is taken. With --auto and no images, the robot's own cameras
+    watch while you move the ball.
 
     Cluster (--side-mm): the poses of its tags. Take about 20 pairs of images and turn the cluster from one to the next,
-    so that every two neighbouring tags are seen together at some time. The tags' poses and all cluster poses are fitted
-    together; the marker's frame is that of the tag with the lowest number. Observations that do not fit one rigid body
-    are left out and named.
+    so that every two neighbouring tags are visible together at some time. The tags' poses and all cluster poses are
+    fitted together; the marker's frame is that of the tag with the lowest number. Observations that do not fit one
+    rigid body are left out and named.
 
     Needs: images, and for a cluster cameras.toml of those cameras; or robot.toml with cameras, and no running sampler.
 

@@ -55,10 +55,10 @@ def replay(
 ) -> None:
     """Feed a recording through sampler and learner; prints the error before and after on rows left out.
 
-    The two processes run as they do live, on ports and with a store of their own, so a running daemon is not
-    disturbed. Contiguous blocks of rows are held out. "Before" is the nominal model with what robot.toml calls not
-    known fitted to the other rows; "after" is what the learner answers when it has learnt them. Rows whose columns are
-    exchanged, count the other way, have another zero or unit, or are of another robot, are refused.
+    The two processes run as in live use, on their own ports and with their own store, so a running daemon is not
+    disturbed. Contiguous blocks of rows are held out. "Before" is the nominal model, with the unknowns of robot.toml
+    fitted to the other rows; "after" is the learner's answer when it has learnt them. Rows are refused if their columns
+    are exchanged, reversed, or have another zero or unit, or if they are of another robot.
 
     Needs: a recording and its robot.toml; neither hardware nor a running daemon.
 
@@ -125,7 +125,7 @@ def _make_folder(folder: Path) -> None:
 
 @contextmanager
 def _progress(console: Console) -> Iterator[Callable[[SamplerStatus, LearnerStatus], None]]:
-    """One line that changes on a terminal; elsewhere a line every two seconds."""
+    """Yield a function that shows progress: one changing line on a terminal, elsewhere a line every two seconds."""
     if console.is_terminal:
         with console.status("starting sampler and learner") as status:
             yield lambda sampler, learner: status.update(_line(sampler, learner))

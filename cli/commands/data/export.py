@@ -52,11 +52,11 @@ def export(
     """Turn pairs into files of other programs, and a robot with what was found into MJCF, URDF or a correction.
 
     A store may be in use by a running sampler. MCAP opens in Foxglove: joints and positions under `/pair`, the marker
-    under `/marker`, and as metadata what the joints were read with (servos, firmware, homing offsets). .rrd opens in
-    Rerun: the moving robot, its cameras, and the marker as measured and as robot.toml or extended.toml predicts it.
+    under `/marker`, and the devices of the joints (servos, firmware, homing offsets) as metadata. .rrd opens in Rerun:
+    the moving robot, its cameras, and the marker as measured and as predicted by robot.toml or extended.toml.
 
-    A robot is an extended.toml that `bodyschema diagnose` wrote, or a robot.toml. What the format cannot hold is
-    printed, and stands in the file. examples/correction has programs that read the correction at run time.
+    A robot is an extended.toml that `bodyschema diagnose` wrote, or a robot.toml. Effects that the format cannot hold
+    are printed, and listed in the file. examples/correction has programs that read the correction at run time.
 
     Needs: for a recording robot.toml, which names its joints; for Parquet and MCAP the extra `export`
     (`pip install 'bodyschema[export]'`), for .rrd the extra `rerun`. MuJoCo, if it is installed, replays the MJCF.

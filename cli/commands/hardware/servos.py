@@ -49,17 +49,17 @@ def servos(
 ) -> None:
     """Show the settings that servos keep without power; with NAME=VALUE, write them to the EEPROM.
 
-    Without NAME=VALUE nothing is written: names, present values and permitted values are listed. A write is shown
-    first and has to be confirmed; then torque is switched off (hold the arm, because it will sink), and every value is
-    read back. What was written is kept with the old value, and --undo writes it back; settings that were changed
+    Without NAME=VALUE nothing is written: names, present values and permitted values are listed. A write is shown first
+    and has to be confirmed; then torque is switched off (hold the arm, because it will sink), and every value is read
+    back. Each written value is logged with the old one, and --undo writes the old one back; settings that were changed
     otherwise since then are left alone.
 
-    `id` and `baud` are set alone. An ID that is taken is refused; after a change of rate each servo is searched at the
-    new rate. Values are register values, except for the rate in bit/s and words (operating_mode=current).
+    `id` and `baud` can only be set alone. An ID that is taken is refused; after a change of rate each servo is searched
+    for at the new rate. Values are register values, except for the rate in bit/s and words (operating_mode=current).
 
     --zero prints the joint's present position as zero_ticks for robot.toml, and writes nothing. With --in-servo, the
-    servo's homing offset is written instead, so that its position here is robot.toml's zero_ticks. Either way, pairs
-    measured before have another zero. Exit code 1 if something was not written.
+    servo's homing offset is written instead, so that its present position becomes robot.toml's zero_ticks. Either way,
+    earlier pairs have another zero. Exit code 1 if something was not written.
 
     Needs: robot.toml with servos, or --port and --id; and no running sampler.
 

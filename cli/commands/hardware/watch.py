@@ -64,20 +64,20 @@ def watch(
 
     `joints`: angle, speed, current and temperature of each joint while you move it by hand. Servo torque is switched
     off first: hold the arm, because it will sink. With --zero-force the servos then hold it, until Ctrl-C or any fault:
-    stay ready to hold it. The line below the table shows where, by the URDF, the marker went when you moved the last
-    joint: if it went the other way, the sign is wrong. Angles beyond the URDF's limits are reported, too.
+    stay ready to hold it. The line below the table shows the marker's motion that the URDF predicts for the last moved
+    joint: if it really went the other way, the sign is wrong. Angles beyond the URDF's limits are reported, too.
 
-    `cameras`: the images with what was detected in them, in a browser on this machine or as files. Yellow: a disc of
-    the marker's colour. Green: the marker, with the corresponding row of the other image in yellow, and the row
-    difference as a red bar, ten times as long. Red: rejected detections, with the reason. Tags have their numbers; the
-    marker made of them has its axes x, y, z in red, green, blue. Without a calibration, the raw images are shown.
+    `cameras`: the images with their detections, in a browser on this machine or as files. Yellow: a disc of the
+    marker's colour. Green: the marker, with the corresponding row of the other image in yellow, and the row difference
+    as a red bar, ten times as long. Red: rejected detections, with the reason. Tags have their numbers; the marker made
+    of them has its axes x, y, z in red, green, blue. Without a calibration, the raw images are shown.
 
-    `marker`: what other marker sources send: rate, position, uncertainty, delay, and what is wrong with their messages.
+    `marker`: the data of other marker sources: rate, position, uncertainty, delay, and faults of their messages.
 
     Needs: robot.toml with servos, encoders or a ROS 2 robot; with cameras (docs/cameras.md); or with [marker_source]
     (docs/marker_sources.md). No running sampler, because ports and cameras can be opened only once.
 
-    Next: correct what was named; `bodyschema calibrate cameras`, `bodyschema calibrate latency`; `bodyschema run`.
+    Next: correct the reported faults; `bodyschema calibrate cameras`, `bodyschema calibrate latency`; `bodyschema run`.
     """
     if what == "joints":
         _joints(robot, once=once, json=json, zero_force=zero_force)
@@ -186,7 +186,7 @@ def _first(watch: JointsWatch) -> Seen:
 
 
 def _begin(watch: JointsWatch, force: Powered) -> None:
-    """Switch zero-force on and print its answer. RequestError if it is refused."""
+    """Switch zero-force on and print its answer; raise RequestError if it is refused."""
     answer = force.ask(True)
     while not answer.done():
         watch.look()

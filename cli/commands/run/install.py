@@ -153,7 +153,7 @@ def _written(files: MachineFiles, texts: dict[Path, str], *, yes: bool, dry_run:
 
 
 def _remove(files: MachineFiles, *, yes: bool, dry_run: bool) -> None:
-    """Show the files and what runs by them, and remove them if that is confirmed."""
+    """Show the files and the services that use them, and remove them if that is confirmed."""
     there = files.installed()
     if not there:
         say(f"`bodyschema install {files.kind}` has installed nothing here. Nothing was changed.")

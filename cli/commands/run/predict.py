@@ -63,7 +63,7 @@ def predict(
 
 
 def _show_notes(config: ClientConfig, rows: list[list[float]], deg: bool) -> None:
-    """Print remarks on joint values [rad, m] that the arm cannot have."""
+    """Show remarks on joint values [rad, m] that are impossible for the arm."""
     import numpy as np
 
     from bodyschema.daemon.config import Config
@@ -73,7 +73,7 @@ def _show_notes(config: ClientConfig, rows: list[list[float]], deg: bool) -> Non
 
 
 def _notes(config: Config, q: FloatArray, deg: bool) -> Iterator[str]:
-    """Yield remarks on joint values q (n, d) [rad, m] that the arm cannot have."""
+    """Yield remarks on joint values q (n, d) [rad, m] that are impossible for the arm."""
     import numpy as np
 
     from bodyschema.calibration.plausibility.limits import beyond_limits, limits_text
@@ -91,7 +91,7 @@ def _notes(config: Config, q: FloatArray, deg: bool) -> Iterator[str]:
 
 
 def _rows(values: tuple[float, ...], config: ClientConfig, deg: bool) -> list[list[float]]:
-    """Return the vectors of joint values [rad, m]. RequestError if the input is none."""
+    """Return the vectors of joint values [rad, m]; raise RequestError if the input contains none."""
     from bodyschema.daemon.transport.wire import JointsRequest, joint_angles, joint_rows
 
     if values:
@@ -102,7 +102,7 @@ def _rows(values: tuple[float, ...], config: ClientConfig, deg: bool) -> list[li
         request = _from_standard_input(config)
     rows = joint_rows(request, config.joints)
     if not all(math.isfinite(value) for row in rows for value in row):
-        joint_angles(request, config.joints)  # which says where
+        joint_angles(request, config.joints)  # which names the place
     if not deg:
         return rows
     slides = config.slides

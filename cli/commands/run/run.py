@@ -47,7 +47,7 @@ def run(
     no pairs are taken.
 
     `bodyschema run learner` learns the kinematics and answers queries. New pairs come from the sampler, on this machine
-    or another; without one, the learner answers from what it has learnt. With several robots, each pair is learnt as it
+    or another; without one, the learner answers from the pairs so far. With several robots, each pair is learnt as it
     arrives, and less urgent work is done in turns (docs/fleet.md).
 
     Needs: robot.toml (`bodyschema init`) with joints and cameras, or a recording in its table [drivers]; with --sim,

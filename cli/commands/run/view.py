@@ -28,7 +28,7 @@ PORT = 8420
 def shown(robot_file: Path, port: int = PORT) -> Iterator[subprocess.Popen[bytes]]:
     """Run the page as a separate process until the end of the with statement.
 
-    The page is not essential: a port that is taken is only logged.
+    The page is not essential: if its port is taken, this is only logged.
     """
     command = module_command("bodyschema", "view", "--robot", str(robot_file), "--port", str(port))
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL, env=os.environ | with_parent(), process_group=0)

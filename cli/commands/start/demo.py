@@ -42,17 +42,17 @@ def demo(
 ) -> None:
     """Watch the whole thing learn, in simulation, in about a minute.
 
-    A humanoid's arm is guided by a virtual hand, its head cameras see a red ball on the tool. The sampler and the
+    A humanoid's arm is guided by a virtual hand, and its head cameras see a red ball on the tool. The sampler and the
     learner run as the two real processes; half-way the tool becomes 250 mm longer.
 
-    With --marker cluster the ball is a cube of AprilTags, and how it is turned is learnt too. With --marker
-    tag it is one tag alone, seen only while it faces the cameras: the hand turns it to them.
+    With --marker cluster the ball is replaced by a cube of AprilTags, whose orientation is learnt too. With --marker
+    tag it is a single tag, visible only while it faces the cameras: the hand turns it to them.
 
-    With --camera mono one eye is closed: its distance follows from the size of the tag.
+    With --camera mono one eye is closed: the marker's distance follows from the size of the tag.
 
     With --bus the joints are read as on a real arm, by the driver: from Dynamixel or Feetech servos or a board of
-    encoders (serial) on a serial port, or from a ROS 2 robot behind a zenoh router. All of these are a bench at the
-    bytes, and stand where the simulated arm is.
+    encoders (serial) on a serial port, or from a ROS 2 robot behind a zenoh router. All of these are emulated at the
+    byte level, and follow the simulated arm.
 
     Needs: the extra `sim` (`pip install 'bodyschema[sim]'`), and no hardware.
 

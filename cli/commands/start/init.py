@@ -62,7 +62,7 @@ def init(
     """Write a commented robot.toml. Never replaces a file.
 
     With --urdf the longest chain of joints is filled in; fingers and joints that mimic others are left out. With
-    --from scan each joint gets a servo: you are asked which, and the result is checked against the URDF. With
+    --from scan each joint gets a servo, chosen by you, and the result is checked against the URDF. With
     --lerobot IDs, directions and zeros come from LeRobot's calibration: one robot.toml for a leader, another one for a
     follower. --webcam, --tag-mm, --ball-mm and --chessboard fill in camera and marker. Without --urdf the names are
     examples. Nothing is written to any servo.
@@ -70,7 +70,7 @@ def init(
     Needs: your robot's URDF; with --from scan, powered servos; with --lerobot, LeRobot's calibration of the arm; with
     --sim, nothing.
 
-    Next: correct what is marked CHECK, then `bodyschema config`. With servos: `bodyschema watch joints`. With --sim
+    Next: correct the lines marked CHECK, then `bodyschema config`. With servos: `bodyschema watch joints`. With --sim
     nothing is left to correct: `bodyschema run --sim`.
     """
     _require_one_way(sim=sim, lerobot=lerobot, source=source, urdf=urdf)
@@ -102,7 +102,7 @@ def _seen(
     *,
     plugged_in: bool,
 ) -> Seen:
-    """Return the cameras, those that are plugged in if `plugged_in`, and the marker."""
+    """Return the cameras and the marker; the cameras are the connected ones if `plugged_in`."""
     from bodyschema.cli.hardware.robot_template import Seen
     from bodyschema.daemon.wiring.wiring import connected_cameras
 
@@ -120,7 +120,7 @@ def _seen(
 
 
 def _with_servos(guess: Guess, robot: Path, candidates: Sequence[Candidate], seen: Seen, *, yes: bool) -> None:
-    """Write robot.toml with a servo for each joint, and take it back where it does not fit the URDF."""
+    """Write robot.toml with a servo for each joint, and remove it again if it does not fit the URDF."""
     from bodyschema.cli.hardware.robot_template import robot_toml
     from bodyschema.cli.servos.fitting import first_of, fit, servo_tables
     from bodyschema.daemon.config import Config
@@ -207,7 +207,7 @@ def _asked(joint: str, left: Sequence[Candidate]) -> Candidate | None:
 
 
 def _name(servo: Candidate, left: Sequence[Candidate]) -> str:
-    """Return its ID, with its port where the ID is not unique."""
+    """Return its ID, with its port if the ID is not unique."""
     alone = sum(other.id == servo.id for other in left) == 1
     return str(servo.id) if alone else f"{servo.id}@{servo.port}"
 
@@ -220,7 +220,7 @@ def _summary(fitting: Fitting) -> list[str]:
 
 
 def _require_one_way(*, sim: bool, lerobot: str | None, source: str | None, urdf: Path | None) -> None:
-    """Raise ConfigError if several ways to begin are given, or one without what it needs."""
+    """Raise ConfigError if several ways to begin are given, or one without its required options."""
     ways = [name for name, given in (("--sim", sim), ("--lerobot", lerobot), ("--from", source)) if given]
     if len(ways) > 1:
         raise ConfigError(f"{' and '.join(ways)} exclude each other", remedy="Give one of them")

@@ -1,4 +1,4 @@
-"""Present play in a drive."""
+"""Present backlash in a drive."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .presenter import FoundCause, Presenter, Workshop
 
 
 class Backlash(Presenter):
-    """Present play in a drive."""
+    """Presenter of backlash in a drive."""
 
     effect = "backlash"
     noun = "play of joint {joint}"

@@ -7,7 +7,7 @@ from .presenter import FoundCause, Presenter, Workshop
 
 
 class CameraFocal(Presenter):
-    """Present a wrong focal length."""
+    """Presenter of a wrong focal length."""
 
     effect = "camera_focal"
     noun = "a wrong focal length"

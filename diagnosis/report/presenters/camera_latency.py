@@ -1,4 +1,4 @@
-"""Present images whose time stamps are late."""
+"""Present images with late timestamps."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .presenter import FoundCause, Presenter, Workshop
 
 
 class CameraLatency(Presenter):
-    """Present images whose time stamps are late."""
+    """Presenter of images with late timestamps."""
 
     effect = "camera_latency"
     noun = "late images"

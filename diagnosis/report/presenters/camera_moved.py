@@ -7,7 +7,7 @@ from .presenter import FoundCause, Presenter, Workshop, pose, toml_pose
 
 
 class CameraMoved(Presenter):
-    """Present a camera that was bumped."""
+    """Presenter of a camera that was bumped."""
 
     effect = "camera_moved"
     noun = "the {seen_by} having moved"

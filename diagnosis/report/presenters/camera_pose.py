@@ -1,4 +1,4 @@
-"""Present a camera that stands elsewhere."""
+"""Present a wrong camera pose."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from .presenter import FoundCause, Presenter, Workshop, pose, toml_pose
 
 
 class CameraPose(Presenter):
-    """Present a camera that stands elsewhere."""
+    """Presenter of a wrong camera pose."""
 
     effect = "camera_pose"
     noun = "a wrong place of the {seen_by}"

@@ -7,7 +7,7 @@ from .presenter import FoundCause, Presenter, Workshop
 
 
 class CameraRefocused(Presenter):
-    """Present a lens that refocused."""
+    """Presenter of a lens that refocused."""
 
     effect = "camera_refocused"
     noun = "a lens that refocused"

@@ -1,4 +1,4 @@
-"""Present a wrong scale of what is measured."""
+"""Present a wrong scale of the measurements."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from .presenter import FoundCause, Presenter, Workshop
 
 
 class CameraScale(Presenter):
-    """Present a wrong scale of what is measured."""
+    """Presenter of a wrong scale of the measurements."""
 
     effect = "camera_scale"
     noun = "a wrong scale of all that is measured"

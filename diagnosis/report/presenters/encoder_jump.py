@@ -1,4 +1,4 @@
-"""Present a zero that jumped."""
+"""Present a joint offset that jumped."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .presenter import FoundCause, Presenter, Workshop
 
 
 class EncoderJump(Presenter):
-    """Present a zero that jumped."""
+    """Presenter of a joint offset that jumped."""
 
     effect = "encoder_jump"
     noun = "a jump of joint {joint}'s zero"

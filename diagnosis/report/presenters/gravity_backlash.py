@@ -1,4 +1,4 @@
-"""Present play in a joint that hangs on one flank."""
+"""Present backlash in a joint whose load holds it on one flank."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .presenter import FoundCause, Presenter, Workshop
 
 
 class GravityBacklash(Presenter):
-    """Present play in a joint that hangs on one flank."""
+    """Presenter of backlash in a joint whose load holds it on one flank."""
 
     effect = "gravity_backlash"
     noun = "play of joint {joint}, which hangs on one flank"

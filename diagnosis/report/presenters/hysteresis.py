@@ -11,7 +11,7 @@ from .presenter import FoundCause, Presenter, Workshop
 
 
 class Hysteresis(Presenter):
-    """Present friction behind an elastic drive."""
+    """Presenter of friction behind an elastic drive."""
 
     effect = "hysteresis"
     noun = "hysteresis of joint {joint}"

@@ -1,4 +1,4 @@
-"""Present a joint that yields under the weight."""
+"""Present a joint that deflects under the weight."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .presenter import DEG, FoundCause, Presenter, Workshop
 
 
 class JointCompliance(Presenter):
-    """Present a joint that yields under the weight."""
+    """Presenter of a joint that deflects under the weight."""
 
     effect = "joint_compliance"
     noun = "joint {joint} giving under the weight"

@@ -7,7 +7,7 @@ from .presenter import FoundCause, Presenter, Workshop
 
 
 class JointCoupling(Presenter):
-    """Present a joint that moves with another."""
+    """Presenter of a joint that moves with another."""
 
     effect = "joint_coupling"
     noun = "joint {joint} moving with joint {source}"

@@ -7,7 +7,7 @@ from .presenter import DEG, FoundCause, Presenter, Workshop, with_sign
 
 
 class JointEccentricity(Presenter):
-    """Present an encoder that sits off its axis."""
+    """Presenter of an encoder that sits off its axis."""
 
     effect = "joint_eccentricity"
     noun = "an eccentric encoder of joint {joint}"

@@ -1,4 +1,4 @@
-"""Present a wrong joint zero."""
+"""Present a joint offset."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ _TURN_ORIGIN = "turn the origin of joint {} by as much about"
 
 
 class JointOffset(Presenter):
-    """Present a wrong joint zero."""
+    """Presenter of a joint offset."""
 
     effect = "joint_offset"
     noun = "a wrong zero of joint {joint}"

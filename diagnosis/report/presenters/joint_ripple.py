@@ -7,7 +7,7 @@ from .presenter import DEG, FoundCause, Presenter, Workshop, with_sign
 
 
 class JointRipple(Presenter):
-    """Present a periodic error of a drive."""
+    """Presenter of a periodic error of a drive."""
 
     effect = "joint_ripple"
     noun = "a ripple of joint {joint}"

@@ -9,7 +9,7 @@ _BACKWARDS = -1.0  # a scale error below this reverses the joint's direction
 
 
 class JointScale(Presenter):
-    """Present a wrong gear ratio."""
+    """Presenter of a wrong gear ratio."""
 
     effect = "joint_scale"
     noun = "a wrong ratio of joint {joint}"

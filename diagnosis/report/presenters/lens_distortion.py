@@ -1,4 +1,4 @@
-"""Present lenses that still distort."""
+"""Present remaining lens distortion."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .presenter import FoundCause, Presenter, Workshop
 
 
 class LensDistortion(Presenter):
-    """Present lenses that still distort."""
+    """Presenter of remaining lens distortion."""
 
     effect = "lens_distortion"
     noun = "lens distortion"

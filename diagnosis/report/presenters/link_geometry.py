@@ -11,7 +11,7 @@ from .presenter import FoundCause, Presenter, Workshop, pose, short
 
 
 class LinkGeometry(Presenter):
-    """Present a link that differs from the URDF."""
+    """Presenter of a link that differs from the URDF."""
 
     effect = "link_geometry"
     noun = "a wrong link before joint {joint}"

@@ -12,7 +12,7 @@ from .presenter import FoundCause, Presenter, Workshop
 
 
 class Outliers(Presenter):
-    """Present fixes that are not the marker."""
+    """Presenter of fixes that are not the marker."""
 
     effect = "outliers"
     noun = "fixes that are not the marker"

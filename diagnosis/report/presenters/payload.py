@@ -8,7 +8,7 @@ from .presenter import FoundCause, Presenter, Workshop, listed
 
 
 class Payload(Presenter):
-    """Present a mass that the URDF lacks."""
+    """Presenter of a mass that the URDF lacks."""
 
     effect = "payload"
     noun = "an unknown mass on the hand"

@@ -36,7 +36,7 @@ class _Settings:
 class FoundCause:
     """A cause with its numbers."""
 
-    # where, source: the joint it acts on, and the joint that causes it; None where there is none
+    # where, source: the joint it acts on, and the joint that causes it; None without one
     where: str | None
     source: str | None
     numbers: Mapping[str, float]  # of shifts and turns, only those given count
@@ -76,7 +76,7 @@ class FoundCause:
 
     @property
     def when(self) -> str:
-        """Its moment, with a preposition; empty where it is not given."""
+        """Its moment, with a preposition; empty if it is unknown."""
         if "t0" not in self.numbers:
             return ""
         return f" at {'t =' if self.timed else 'row'} {self.numbers['t0']:.1f}"
@@ -96,7 +96,7 @@ class FoundCause:
 
 @dataclass(frozen=True)
 class Workshop:
-    """What is known of the robot to which a remedy is applied."""
+    """Knowledge about the robot to which a remedy is applied."""
 
     robot: RobotDescription  # the robot as described
     steps: FloatArray  # encoder step of each joint (d,) [rad, m]; 0 where it is unknown
@@ -108,14 +108,14 @@ class Workshop:
         return f" (--out writes {corrected_file(self.robot)}, which has it)"
 
     def joint(self, found: FoundCause) -> int:
-        """Return the index in q of the joint at which a cause is."""
+        """Return the index in q of a cause's joint."""
         return self.robot.joints.index(found.where or "")
 
     def slides(self, found: FoundCause) -> bool:
         return bool(self.robot.chain.prismatic[self.joint(found)])
 
     def amount(self, found: FoundCause, base: str) -> str:
-        """Return a number of a cause that is an angle or a length, with its ticks where they are known."""
+        """Return a number of a cause that is an angle or a length, with its ticks if they are known."""
         name = f"{base}_m" if self.slides(found) else f"{base}_rad"
         return f"{found.signed(base)}{self._ticks(found, found.numbers[name])}"
 
@@ -134,13 +134,13 @@ class Workshop:
         return f" ({count:+d} tick{'' if abs(count) == 1 else 's'}{of})"
 
     def pose_of(self, effect: str) -> FloatArray:
-        """Return the pose (4, 4) of another cause, the identity where it was not found."""
+        """Return the pose (4, 4) of another cause; the identity if it was not found."""
         cause = self.causes.get(effect)
         return np.eye(4) if cause is None else pose(FoundCause.of(cause).numbers)
 
 
 class Presenter(ABC):
-    """Sentences and a plot for one effect."""
+    """Base class: sentences and a plot for one effect."""
 
     effect: ClassVar[str]  # name of the effect
     # the cause in a few words without figures, with {joint}, {source} and {seen_by} to fill in; if empty, the effect's
@@ -151,18 +151,18 @@ class Presenter(ABC):
 
     @abstractmethod
     def finding(self, found: FoundCause) -> str:
-        """Return a cause as a clause: what is wrong, where, by how much."""
+        """Return a cause as a clause: fault, place and size."""
 
     @abstractmethod
     def remedy(self, workshop: Workshop, found: FoundCause) -> str:
-        """Return what to do about a cause."""
+        """Return the remedy of a cause."""
 
     def panel(self, residuals: Residuals, effect: Effect) -> Panel:
         return self.plot(residuals, effect)
 
 
 class PlainPresenter(Presenter):
-    """Presenter of an effect without one of its own, as of another package."""
+    """Presenter of an effect that has none, such as one of another package."""
 
     def __init__(self, kind: EffectType) -> None:
         self._kind = kind
@@ -176,7 +176,7 @@ class PlainPresenter(Presenter):
 
 
 def pose(numbers: Mapping[str, float]) -> FloatArray:
-    """Return the pose (4, 4) of a shift and a turn; numbers that are not given are 0."""
+    """Return the pose (4, 4) of a shift and a rotation; missing numbers are 0."""
     names = ("x_m", "y_m", "z_m", "rx_rad", "ry_rad", "rz_rad")
     return transforms(np.array([[numbers.get(name, 0.0) for name in names]]))[0]
 

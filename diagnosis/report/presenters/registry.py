@@ -13,7 +13,7 @@ from .presenter import PlainPresenter, Presenter
 
 
 def presenter_of(effect: str) -> Presenter:
-    """Return the presenter of an effect; a plain one for an effect that has none of its own."""
+    """Return the presenter of an effect, or a plain one if it has none."""
     return PRESENTERS.get(effect) or PlainPresenter(EFFECT_TYPES[effect])
 
 

@@ -13,7 +13,7 @@ from .presenter import FoundCause, Presenter, Workshop
 
 
 class Settling(Presenter):
-    """Present a joint that was read before it came to rest."""
+    """Presenter of a joint that was read before it came to rest."""
 
     effect = "settling"
     noun = "joint {joint} read before it rests"

@@ -1,4 +1,4 @@
-"""Present a slow drift of what is measured."""
+"""Present a slow drift of the measurements."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .presenter import FoundCause, Presenter, Workshop
 
 
 class ThermalDrift(Presenter):
-    """Present a slow drift of what is measured."""
+    """Presenter of a slow drift of the measurements."""
 
     effect = "thermal_drift"
     noun = "a drift that settles"

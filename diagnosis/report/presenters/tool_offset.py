@@ -1,4 +1,4 @@
-"""Present a marker that sits elsewhere on the hand."""
+"""Present a marker at another position on the hand."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from .presenter import FoundCause, Presenter, Workshop, listed, pose
 
 
 class ToolOffset(Presenter):
-    """Present a marker that sits elsewhere on the hand."""
+    """Presenter of a marker at another position on the hand."""
 
     effect = "tool_offset"
     noun = "a wrong place of the marker"

@@ -9,7 +9,7 @@ from .presenter import FoundCause, Presenter, Workshop, listed, pose
 
 
 class ToolSlip(Presenter):
-    """Present a marker that slipped on the hand."""
+    """Presenter of a marker that slipped on the hand."""
 
     effect = "tool_slip"
     noun = "a marker that slipped"

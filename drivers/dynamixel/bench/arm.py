@@ -26,7 +26,7 @@ class _Settings:
 
 
 class DrivenShaft:
-    """The angle of a servo's shaft: it goes where the servo holds it, and stays where nothing does."""
+    """The angle of a servo's shaft, which follows its servo's goal, and stays where it is without torque."""
 
     def __init__(self, angle: float, fastest_rad_s: float = _Settings.fastest_rad_s) -> None:
         """Start at `angle` [rad], 0 in the middle of the servo's range."""
@@ -51,7 +51,7 @@ class DrivenShaft:
         moved_s, angle = self._moves[-1]
         if t <= moved_s:
             return self._before(t)
-        self._moves.append((t, angle))  # a servo that stops asks where it is
+        self._moves.append((t, angle))  # a servo that stops asks for its present angle
         goal = None if self.servo is None or self.jammed else self.servo.held_at(t)
         if goal is not None and math.isfinite(moved_s):
             most = self._fastest * (t - moved_s)
@@ -61,7 +61,7 @@ class DrivenShaft:
 
     def _before(self, t: float) -> float:
         after: tuple[float, float] | None = None
-        for before in reversed(self._moves):  # what is asked for is most often not long ago
+        for before in reversed(self._moves):  # most requests are for a recent time
             if before[0] > t:
                 after = before
                 continue

@@ -42,12 +42,12 @@ RAM_OF_FACTORY = ("status_return", "temperature")
 class Servo(EmulatedServo):
     """An emulated servo.
 
-    Its action on the shaft is reported by `motor_current` and `held_at`: an `angle` that follows these moves as a real
+    Its action on the shaft is available as `motor_current` and `held_at`: an `angle` that follows these moves as a real
     arm would.
 
     Attributes:
         excess_a: current drawn above the regulated one [A].
-        fast: it supports FAST_SYNC_READ.
+        fast: True if it supports FAST_SYNC_READ.
     """
 
     delay_unit_us = TICKS_PER_REPLY_DELAY_US
@@ -142,7 +142,7 @@ class Servo(EmulatedServo):
     def _look_at_watchdog(self, t: float) -> None:
         """Stop the servo if no instruction arrived for too long (e-Manual, Bus Watchdog).
 
-        It accepts no further goals. In current control the shaft is free then, in position control it is held in place.
+        It then accepts no further goals. The shaft is free in current control, and held in place in position control.
         """
         if not self._is_protocol2 or (watchdog := self["watchdog"]) <= 0 or not self["torque"]:
             return

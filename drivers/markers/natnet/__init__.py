@@ -1,1 +1,1 @@
-"""OptiTrack's NatNet protocol, versions 3 and 4, as Motive streams it: no SDK is needed."""
+"""OptiTrack's NatNet protocol, versions 3 and 4, as streamed by Motive; no SDK is needed."""

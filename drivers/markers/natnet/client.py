@@ -26,7 +26,7 @@ class _Settings:
 
 
 class NatnetReceiver:
-    """The stream of a NatNet server, by multicast or to this client alone, as the server is set up."""
+    """The stream of a NatNet server, by multicast or unicast, depending on the server's settings."""
 
     def __init__(self, table: NatnetTable, clock: Clock) -> None:
         self._table, self._clock = table, clock
@@ -160,7 +160,7 @@ class NatnetReceiver:
             ) from error
 
     def _send(self, data: bytes) -> None:
-        """Send a command; a server that is not there shows by its silence."""
+        """Send a command; an absent server is detected by its silence."""
         self._asked = self._clock.now()
         if self._commands is None:
             return
@@ -180,7 +180,7 @@ class NatnetReceiver:
             self._send(packets.connect())
 
     def _sorted(self, data: bytes, sender: tuple[str, int], arrived: float) -> Packet | None:
-        """Return a packet's frame; take notice of what else it may be."""
+        """Return the frame in a packet; process packets of any other kind and return None."""
         if sender[0] != self._table.server:
             return None
         self._heard = arrived
@@ -193,6 +193,6 @@ class NatnetReceiver:
             elif message == Message.FRAME:
                 return Packet(contents, self._table.server, arrived)
         except Unusable:
-            # Let the stream count it: as a frame, it is refused with its reason.
+            # Pass it on as a frame, so that the stream rejects and counts it with its reason.
             return Packet(data[packets.HEADER.size :][:8], self._table.server, arrived)
         return None

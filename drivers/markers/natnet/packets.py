@@ -1,6 +1,6 @@
 """The packets of NatNet 3.0 to 4.x: little-endian, a header (message, size) and the message's fields without padding.
 
-After the bitstream that OptiTrack publishes with its SDK's depacketization samples.
+The layout follows the bitstream that OptiTrack publishes with its SDK's depacketization samples.
 """
 
 from __future__ import annotations
@@ -56,13 +56,13 @@ class RigidBody:
     id: int  # its streaming ID
     x: tuple[float, float, float]  # position of its pivot [m]
     turn: tuple[float, float, float, float]  # quaternion (x, y, z, w)
-    error: float  # mean distance of its markers from where the body has them [m]
-    is_tracked: bool  # whether the pose was measured in this frame
+    error: float  # mean distance of its markers from their places on the body [m]
+    is_tracked: bool  # True if the pose was measured in this frame
 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A frame of motion capture data, as far as it is used."""
+    """The used part of a frame of motion capture data."""
 
     number: int  # of the frame
     bodies: tuple[RigidBody, ...]
@@ -77,12 +77,12 @@ def packet(message: Message, contents: bytes = b"") -> bytes:
 
 
 def connect() -> bytes:
-    """Return the packet that asks a server for its version, and to send its frames."""
+    """Return the packet that asks a server for its version and starts its frames."""
     return packet(Message.CONNECT, b"Ping\0")
 
 
 def opened(data: bytes) -> tuple[int, bytes]:
-    """Return the message and the contents of a packet; raise Unusable if its size is not the one announced."""
+    """Return the message and the contents of a packet; raise Unusable if its size differs from the announced one."""
     if len(data) < HEADER.size:
         raise Unusable(Fault.MALFORMED, f"{len(data)} bytes are no NatNet packet")
     message, size = HEADER.unpack_from(data)
@@ -103,7 +103,7 @@ def server_info(contents: bytes) -> ServerInfo:
 
 
 def frame(contents: bytes, version: Version) -> Frame:
-    """Read a frame; raise Unusable if its sections do not fit into its bytes."""
+    """Read a frame; raise Unusable if its sections exceed its bytes."""
     reader = _Reader(contents)
     is_sized = version >= SIZED_SINCE
     number = reader.int32()
@@ -133,7 +133,7 @@ def body_names(contents: bytes, version: Version) -> dict[int, str]:
         if end is not None:
             reader.go_to(end)
         elif not _skip_model(reader, kind, version):
-            break  # rigid bodies come before what NatNet 3 gives no size for
+            break  # rigid bodies come before the parts to which NatNet 3 gives no size
     return names
 
 
@@ -166,7 +166,7 @@ def _rest_of_body(reader: _Reader, version: Version) -> None:
 
 
 class _Reader:
-    """Reader of a packet's contents, front to back; checks each step against the bytes that are left."""
+    """Front-to-back reader of a packet's contents; checks each step against the remaining bytes."""
 
     def __init__(self, data: bytes) -> None:
         self._data, self.at = data, 0

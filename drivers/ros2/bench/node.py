@@ -29,7 +29,7 @@ class Node:
     """An emulated node.
 
     Attributes:
-        set_by_s: how far its clock was set forwards since the start [s].
+        set_by_s: how far its clock was set forward since the start [s].
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class Node:
 
         Args:
             paths: the position of each joint [rad] or [m] as a function of time [s].
-            drift: how much faster its clock runs than ours.
+            drift: relative excess of its clock rate over ours.
             send: encodes each message, corrupted or not.
         """
         self.names, self.period_s, self.set_by_s = tuple(paths), 1.0 / rate_hz, 0.0
@@ -58,7 +58,7 @@ class Node:
         return EPOCH_NS + round((t * self._rate + self.set_by_s) * NANO)
 
     def at(self, t: float) -> Sent | None:
-        """Return the message that it publishes at `t` [s]; None when it is silent."""
+        """Return the message that it publishes at `t` [s]; None if it is silent."""
         stamp_ns = self.stamp_ns(t)
         positions = tuple(path(t) for path in self._paths.values())
         still = (0.0,) * len(positions)

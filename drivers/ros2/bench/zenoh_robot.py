@@ -43,7 +43,7 @@ class ZenohRobot:
             token = rmw.publisher_token(self._domain, str(session.info.zid()), "bench", self._topic, JOINT_STATE)
             self._token = session.liveliness().declare_token(token)
             key = rmw.topic_key(self._domain, self._topic, JOINT_STATE)
-        # Like a robot with rmw_zenoh, drop what a slow reader cannot take.
+        # Like a robot with rmw_zenoh, drop messages that a slow reader cannot take.
         self._publisher = session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP)
         return self
 

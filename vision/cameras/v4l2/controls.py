@@ -1,4 +1,4 @@
-"""Settings of a camera: write them, and report what it did not accept."""
+"""Settings of a camera: write them, and report those that it did not accept."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def apply(capture: VideoCapture, settings: UvcSettings, name: str) -> list[str]:
     """Apply `settings` to the camera and return a message for each that it did not accept.
 
     Raises:
-        SourceError: the camera sends images of another size, for which the calibration does not hold.
+        SourceError: the size of the camera's images is not that of the calibration.
     """
     width, height = raw_size_px(settings)
     capture.set(cv2.CAP_PROP_BUFFERSIZE, settings.buffers)
@@ -119,9 +119,9 @@ def _control_complaints(capture: VideoCapture, settings: UvcSettings, name: str)
 
 
 class FocusWatch:
-    """Monitor of a camera's focus: whether the camera may move its lens, and whether it did.
+    """Monitor of a camera's focus: detects that the camera may move its lens, or has moved it.
 
-    Replugged, a lens may stand elsewhere than before, so the first position of all is the one to keep.
+    After replugging, a lens may be in another position, so the very first position is the reference.
     """
 
     def __init__(self, name: str) -> None:

@@ -27,7 +27,7 @@ OpenCapture = Callable[[str], VideoCapture]
 
 
 def open_v4l2(device: str) -> VideoCapture:
-    """Open the device in OpenCV's V4L2 backend, the only one that passes on the kernel's time stamps."""
+    """Open the device in OpenCV's V4L2 backend, the only one that passes on the kernel's timestamps."""
     os.environ.setdefault(*SELECT_TIMEOUT)
     return cv2.VideoCapture(device, cv2.CAP_V4L2)
 
