@@ -1,10 +1,12 @@
 """Benefit of weighting each direction of a position by its covariance in the online learner.
 
 Run `python -m benchmarks.directions [--arms N] [--pairs N ...] [--joints 4|6] [--eyes 1|2] [--encoder DEG] [--alike]`.
-The desk arm and the camera of `benchmarks.one_camera`, or an arm of six joints. One eye: covariances of the corners of
-a tag, 0.05 px each, with a depth that is taken to be 2.5 times surer than these alone leave it, as the edges have it:
-10 times less sure than across. Two eyes: a baseline of 250 mm, 0.1 px. The camera's pose and the marker's place are
-unknown. `--alike` states the same variance in all directions.
+The arm is the desk arm of `benchmarks.one_camera` or one of six joints, seen by that benchmark's camera. The camera's
+pose and the marker's position are unknown. `--alike` states the same variance in all directions.
+
+One eye: covariances from the corners of a tag, 0.05 px each. The depth is taken to be 2.5 times more certain than the
+corners alone determine it, which is what the tag's edges achieve: a tenth of the certainty across the line of sight.
+Two eyes: a baseline of 250 mm, 0.1 px.
 """
 
 from __future__ import annotations

@@ -146,7 +146,7 @@ def information(x: FloatArray, look: Look, pictures: list[FloatArray], calibrati
 
 
 def against_the_bound(table: Table, name: str, look: Look, frames: int, bounds: int, seed: int) -> None:
-    """Add the error in space at 1 m, beside its bound."""
+    """Add the error in space at 1 m beside its bound."""
     rng = np.random.default_rng(seed)
     tracker = StereoTracker(AT_ONE_METRE)
     errors, sigmas, limits = [], [], []

@@ -90,7 +90,7 @@ def some_rotation(rng: np.random.Generator) -> Rotation:
 
 
 def moving(tags: int, eyes: int) -> Table:
-    """Return how moving tags fare, with and without a known readout."""
+    """Return the errors of moving tags, with and without a known readout time."""
     table = Table("tag_moving", [Column("speed"), Column("`readout_s`"), *COLUMNS])
     camera = VGA if eyes == 2 else replace(VGA, baseline_m=0.0)
     look = Look(samples=6, noise_sd=2.0, blur_px=0.6, wall=0.5)
@@ -123,7 +123,7 @@ def moving(tags: int, eyes: int) -> Table:
 
 
 def display(tags: int) -> Table:
-    """Return how tags on a display fare, by display pixels a camera pixel."""
+    """Return the errors of tags on a display, by display pixels per camera pixel."""
     table = Table("tag_display", [Column("camera"), Column("display pixels a camera pixel"), *COLUMNS])
     camera = replace(SMALL, baseline_m=0.0)
     phone = {"bayer": True, "tone": 1.0 / 2.2, "jpeg": 85}

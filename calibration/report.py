@@ -203,7 +203,7 @@ class CalibrationReport(msgspec.Struct, frozen=True, kw_only=True):
         drawn_error_m = _mean_error(calibration.placed.chain.positions(recording.q), recording)
         doubts = [*seen.sentences, *_computed(drawn_error_m), *_stamped_late(calibration)]
         doubts += _many_left_out(calibration, first)
-        if jump is None:  # the figures of two tools are of neither
+        if jump is None:  # figures of two tools mixed belong to neither
             doubts += [*_far_off(calibration, zeros, _Settings.far_off), *made_badly]
         values, halves = named.values, named.half_widths
         figures = [
@@ -323,7 +323,7 @@ def _many_left_out(calibration: Calibration, first: int) -> list[str]:
 
 
 def _badly_made(calibration: Calibration) -> list[str]:
-    """Return a message if the geometric errors reach the largest that are considered; else an empty list."""
+    """Return a message if the geometric errors reach the largest that are considered, otherwise an empty list."""
     made, (axes, points) = calibration.workmanship, ToleranceSettings.workmanship[-1]
     if made is None or made.axes < axes:
         return []

@@ -201,7 +201,7 @@ def _learners(
     sigma_m: float | None,
     common: FloatArray | None,
 ) -> tuple[tuple[RigidLearner, ...], FloatArray]:
-    """Return learners of all pairs with the tolerances that a sample of the pairs makes probable, and their shares."""
+    """Return learners of all pairs for the tolerances that a sample of the pairs makes probable, and their weights."""
     told = None if recording.cov is None else recording.cov + RobustSettings.rounding_m**2 * np.eye(3)
     some = np.unique(np.linspace(0, len(recording) - 1, _Settings.judged_pairs).astype(np.intp))
 

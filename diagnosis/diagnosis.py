@@ -232,7 +232,7 @@ class Diagnosis:
         left = left[kept]
         roots = np.linalg.inv(fit.observations.whitening)
         stated = roots @ np.swapaxes(roots, 1, 2)
-        # Scale the stated noise to the size of the residuals, corrected for what the fit absorbed.
+        # Scale the stated noise to the size of the residuals, corrected for the degrees of freedom of the fit.
         spent = min(fit.background.spent(fit.noise.sigma) / max(left.size, 1), DiagnosisSettings.most_spent)
         size = np.square(left).sum() / np.trace(stated[kept], axis1=1, axis2=2).sum() / (1.0 - spent) * (1.0 - shared)
         # The play of a loose marker is not noise.

@@ -38,7 +38,7 @@ class Stages:
         self._say(stage.what)
 
     def __call__(self, said: str) -> None:
-        """Tell a step of the current stage."""
+        """Report a step of the current stage."""
         # The number of steps of a stage is unknown: each takes a quarter of what is left of it.
         self._done += max(self._stage.ends - self._done, 0.0) * 0.25
         self._say(f"{self._stage.what}: {said}")

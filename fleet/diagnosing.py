@@ -173,7 +173,7 @@ def workers(scheduler: str | None, jobs: int, count: int | None = None) -> Itera
     from dask import config
     from distributed import Client, LocalCluster
 
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # errors that matter are reported by the diagnoses
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # the diagnoses report the errors that matter
     with safe_children(), config.set({"distributed.scheduler.allowed-failures": _Settings.workers_lost}):
         if scheduler is not None:
             with _client_of(scheduler) as client:

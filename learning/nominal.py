@@ -150,7 +150,7 @@ class NominalModel:
         if not self.pose_known:
             known = replace(known, base_rotation=math.inf, base_translation=math.inf)
         if not self.marker_known:
-            # A marker is on the hand. First pairs along a short path would fit one metres away just as well.
+            # A marker is on the hand. First pairs along a short path would fit a marker one metre away equally well.
             known = replace(known, tool=ArmSettings.other_tool_m)
         return known
 

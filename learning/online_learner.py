@@ -129,7 +129,7 @@ class OnlineLearner:
     def claimed_error_m(self) -> float | None:
         """Return the expected mean distance [m] in the data's region to noise-free camera measurements.
 
-        None while there are too few pairs. The region: within a few degrees (`region_rad` per joint) of the kept pairs.
+        None if there are too few pairs. The region is within a few degrees (`region_rad` per joint) of the kept pairs.
         """
         with self._lock:
             regime, snapshot = self._regimes.present, self._snapshot

@@ -59,7 +59,7 @@ class ErrorMemory(msgspec.Struct):
 
     @property
     def rms_m(self) -> float:
-        """RMS distance between prediction and measurement [m], shrunk to the expected one while errors are few."""
+        """RMS distance between prediction and measurement [m], shrunk towards the expected one while errors are few."""
         missing = max(UncertaintySettings.warm_pairs - self.weight, 0.0)
         weight = max(self.weight, UncertaintySettings.warm_pairs)
         return math.sqrt((sum(self.square) + missing * self.expected_m**2) / weight)
@@ -414,6 +414,6 @@ def model_discrepancy(
 
 
 def _near(errors: FloatArray, scatter: float) -> NDArray[np.bool_]:
-    """Return True for errors that the fit has not left out; for all if these are the minority: then the fit is off."""
+    """Return the mask of errors that the fit has not left out; all if these are the minority: then the fit is off."""
     near = np.linalg.norm(errors, axis=1) <= RobustSettings.outlier_sigmas * scatter
     return near if near.mean() > 0.5 else np.ones_like(near)

@@ -143,7 +143,7 @@ def _opened(source: Path) -> Iterator[_Bag]:
         what = f"reading it takes more than {FileLimits.memory_bytes // 2**30} GiB of memory"
         remedy = "Record the topics of joints and marker alone, or cut the bag: `ros2 bag convert`"
         raise RecordingError(what, file=source, remedy=remedy) from error
-    except Exception as error:  # of damaged bytes rosbags raises whatever comes
+    except Exception as error:  # for damaged bytes rosbags may raise anything
         said = (str(error).strip() or type(error).__name__).split("\n")[0][: _Settings.most_said].rstrip(".")
         remedy = "A bag whose recording was cut off: `ros2 bag reindex`; one of splits: name the folder"
         raise RecordingError(f"the bag cannot be read: {said}", file=source, remedy=remedy) from error

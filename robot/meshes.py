@@ -123,7 +123,7 @@ class MeshSet:
         triangles, cell = read_mesh(file), 0.0
         self._sizes[name] = len(triangles)
         size = float(np.ptp(triangles, axis=(0, 1)).max())
-        while len(triangles) > self._most and size > 0.0:  # more will not be drawn of it
+        while len(triangles) > self._most and size > 0.0:  # no more of it will be drawn
             cell = max(size / 1000.0, MeshLimits.cell_growth * cell)
             triangles = merged(triangles, cell)
         if not len(triangles):

@@ -91,7 +91,7 @@ def read_toml(
 
 def line_of_endless_key(text: str) -> int | None:
     """Return the first line (from 1) with a key of more than `most_parts` parts, which parse slowly; else None."""
-    # With `q` in the place of each string and comment; there are as many lines.
+    # Replace each string and comment by `q`; the number of lines stays the same.
     plain = _QUOTED.sub(lambda found: "q" + "\n" * found[0].count("\n"), text)
     for number, line in enumerate(plain.split("\n"), 1):
         most = _Settings.most_parts

@@ -15,7 +15,7 @@ COMMAND = "python -m benchmarks.goals --json goals.json --data FOLDER"
 
 
 def overview(rows: Iterable[Row], results: Mapping[str, Sequence[Values]]) -> Table:
-    """Return one line for each row, how many of its figures are met and the verdict, and the totals."""
+    """Return one line for each row (the number of figures that meet their goal, and the verdict), and the totals."""
     judgements = [(row, [judged(figure, results) for figure in row.figures]) for row in rows]
     met, goals = sum(_met(cells) for _, cells in judgements), len(judgements)
     reached = sum(_standing(cells) == Verdict.MET.value for _, cells in judgements)

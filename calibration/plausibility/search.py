@@ -178,7 +178,7 @@ class ReadingSearch:
             return np.zeros((1, 3))
 
     def has_far_zero(self, joint: int, fit: ReadingFit) -> bool:
-        """Return True if a joint's zero is far off in `fit`, and the unchanged columns fit clearly worse with less."""
+        """Return True if a joint's offset in `fit` is large, and a smaller one fits the columns clearly worse."""
         if self.chain.prismatic[joint] or abs(fit.zeros[joint]) <= SearchSettings.far_zero_rad:
             return False
         q, here = self.q.copy(), np.arange(self.chain.joints) == joint
@@ -194,12 +194,12 @@ class ReadingSearch:
         return ratio > THRESHOLDS.much_better and self.is_certain(math.log(ratio), LimitSettings.measured_share)
 
     def errors(self, q: FloatArray, x: FloatArray) -> FloatArray:
-        """Return the distances (s,) [m] of sets of pairs q (s, n, d) and x (s, n, 3), with the columns as they are."""
+        """Return the distances (s,) [m] of sets of pairs q (s, n, d) and x (s, n, 3), with unchanged columns."""
         placed = place(self.chain, q, x, zeros_std=self._std, tool_std=LimitSettings.tool_m)
         return np.maximum(placed.errors(LimitSettings.measured_share), self.exact_m)
 
     def distances(self, q: FloatArray, x: FloatArray, pairs: list[tuple[FloatArray, FloatArray]]) -> FloatArray:
-        """Return the distances (s, n) [m] of sets of pairs from the arm as pairs q (n, d) and x (n, 3) place it."""
+        """Return the distances (s, n) [m] of sets of pairs from the arm placed by pairs q (n, d) and x (n, 3)."""
         placed = place(self.chain, q[None], x[None], zeros_std=self._std, tool_std=LimitSettings.tool_m)
         p = self._parameters
         change = np.zeros(p.size)
@@ -208,11 +208,11 @@ class ReadingSearch:
         return np.stack([np.linalg.norm(at - seen, axis=1) for at, (_, seen) in zip(drawn, pairs, strict=True)])
 
     def is_certain(self, gain: float, share: float = 1.0) -> bool:
-        """Return True if the poses are evidence enough for a reading that fits better, as in `Poses.nats`."""
+        """Return True if the poses are sufficient evidence for a reading that fits better, as in `Poses.nats`."""
         return self.poses.nats(gain, self.chain.joints, share) > SearchSettings.certain
 
     def placed_by(self, rows: NDArray[np.intp]) -> Placements:
-        """Place the nominal chain to sets of rows (s, n), with the columns as they are."""
+        """Place the nominal chain to sets of rows (s, n), with unchanged columns."""
         return place(self.chain, self.q[rows], self.x[rows], zeros_std=self._std, tool_std=LimitSettings.tool_m)
 
     def on_hand(self, placed: Placements, one: int) -> FloatArray:
@@ -240,7 +240,7 @@ class ReadingSearch:
         if best not in turned or best == reading:
             return None
         fit = fits[best]
-        # Without a fit the known marker itself has led from this reading to another one.
+        # Without a fit, the known marker itself has led from this reading to another one.
         clearly = as_given is None or fit.nats + SearchSettings.certain < as_given.nats
         far = SearchSettings.nearer * fit.tool_m < (as_given or self.fits[reading]).tool_m
         return (best, fit) if clearly and far else None
@@ -307,7 +307,7 @@ class ReadingSearch:
         read = [(each.angles(self.q, slides), each.positions(self.x), each.scale) for each in rivals]
         changes = np.array([reading.changes for reading in rivals])
         probable = evidences(self.chain, read, self.poses.rows) - SearchSettings.a_change * changes
-        # Where the columns as they are fit best, another reading has to be certain twice.
+        # If the unchanged columns fit best, another reading needs twice the usual certainty.
         probable[rivals.index(as_it_is)] += 2.0 * SearchSettings.certain if nearest == as_it_is else 0.0
         best = rivals[int(probable.argmax())]
         nats, error = self.fits[best].nats, self.fits[best].error

@@ -142,7 +142,7 @@ def _evidences(chain: RigidChain, q: FloatArray, placed: Placements, x: FloatArr
     residuals = (x[good] - drawn).ravel() + jacobian @ tolerated
     larger = (drawn - drawn.mean(axis=0)).ravel()
     noises = np.square(_Settings.noises * np.sqrt(np.square(distances[good]).mean() / 3.0))
-    # All that the parameters explain is in a few directions.
+    # The parameters explain only a few directions.
     basis, effects = np.linalg.qr(jacobian)
     both = np.stack([residuals, larger])
     within = both @ basis

@@ -55,7 +55,7 @@ class Tags:
 
 
 def numbers_of(ids: str, most: int = 100) -> list[int]:
-    """Parse tag numbers as in 0-5,9. ConfigError if they cannot be parsed, or one is repeated."""
+    """Parse tag numbers as in 0-5,9; raise ConfigError if they cannot be parsed, or one is repeated."""
     found: list[int] = []
     for part in ids.split(","):
         run = _RUN.fullmatch(part.strip())

@@ -43,7 +43,7 @@ class _Settings:
 
 
 class FindingTurns:
-    """Limits all users of the background thread together to 1/`share` of a processor. For that thread alone.
+    """Limiter of all users of the background thread together to 1/`share` of a processor. For that thread alone.
 
     Attributes:
         due_at: time of the next permitted finding.

@@ -348,7 +348,7 @@ def show_name() -> None:
 
 
 def more_rarely(robots: int) -> float:
-    """Return the factor by which states and checkpoints are rarer when `robots` robots share a process."""
+    """Return the factor by which states and checkpoints are less frequent when `robots` robots share a process."""
     return max(1.0, robots / _Settings.as_often_as_one)
 
 

@@ -33,7 +33,7 @@ class JointBuffer:
         self,
         prismatic: NDArray[np.bool_],
         max_gap_s: float,
-        capacity: int = 8192,  # number of readings that are kept at most
+        capacity: int = 8192,  # maximum number of readings
         *,
         live: bool = False,  # `put` never waits
         kept_s: float = 0.0,  # readings up to this long before the frame are kept [s]

@@ -55,7 +55,7 @@ class _Said:
 
 
 class UnrepeatedHandler(logging.StreamHandler[TextIO]):
-    """Suppresses repeats: the same text within `repeated_s`, or more than `often` texts that differ only in numbers.
+    """Handler that suppresses repeats: the same text within `repeated_s`, or more than `often` similar texts.
 
     Texts are similar if they differ only in numbers. The number of suppressed messages is logged with the next record
     after that time, and at the end.

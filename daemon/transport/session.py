@@ -317,7 +317,7 @@ def _source(query: zenoh.Query) -> str:
 
 @contextmanager
 def client(route: str | Route, open_timeout_s: float = SessionSettings.open_timeout_s) -> Iterator[ZenohSession]:
-    """Open a short-lived session to a process. BusError if it cannot be reached."""
+    """Open a short-lived session to a process; raise BusError if it cannot be reached."""
     with ZenohSession(connect=route, client=True, open_timeout_s=open_timeout_s) as bus:
         yield bus
 

@@ -100,7 +100,7 @@ def _standing(
         rival = beside.exchanged(candidate, fit.log_likelihood - RivalSettings.hopeless)
         doubt = float(np.log(max(candidate.trials / max(itself.trials, 1), 1e-3)))
         if can_be_measured(cause, candidate.effect) and _difference(fit, rival) < WorthSettings.same:
-            # That one number of a link among many does what a scale does is no chance.
+            # It is not by chance that one number of a link among many equals a scale's effect.
             doubt = 0.0
         more = rival.log_likelihood - fit.log_likelihood - beside.cost_of(candidate) - doubt
         more += search.for_zero(fit, itself, candidate)
@@ -157,7 +157,7 @@ def is_like_sag(without: Fit, cause: Effect, least: float) -> bool:
     beside = beside_fit(without, columns).reshape(without.left.size, -1)
     left = without.evident.ravel()
     toward, squares = beside.T @ left, np.square(beside).sum(axis=0)
-    # The share of a column that the fit's own parameters leave may be rounding alone.
+    # The share of a column beyond the fit's own parameters may be rounding alone.
     told = (toward > 0.0) & (squares > TangentSettings.told_apart * np.square(columns).sum(axis=(0, 1)))
     explained = np.square(toward[told]) / squares[told]
     rows = 3.0 * float(without.noise.weights.sum())

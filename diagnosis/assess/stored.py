@@ -148,7 +148,7 @@ def _sums(errors: FloatArray, markers: NDArray[np.bool_]) -> FloatArray:
 
 
 def _new_poses(motion: Motion) -> Motion:
-    """Return a motion whose joints have their readings in another order, each joint in its own."""
+    """Return a motion in which the readings of each joint are permuted independently."""
     rng, rows = np.random.default_rng(0), np.linspace(0, len(motion) - 1, min(len(motion), _Settings.poses)).astype(int)
     q = np.stack([rng.permutation(own)[rows] for own in motion.q.T], axis=1)
     return replace(motion, q=q, t=None if motion.t is None else motion.t[rows], segment=motion.segment[rows])

@@ -152,7 +152,7 @@ class Background:
 
 
 def rows_in_part(weights: FloatArray) -> NDArray[np.intp]:
-    """Return the rows that do not count in full, of weights (n,): the only ones that weighted products visit again."""
+    """Return the rows whose weights (n,) are below 1: only these need to be visited again by weighted products."""
     return np.flatnonzero(1.0 - weights > BackgroundSettings.counts_in_full)
 
 

@@ -87,7 +87,7 @@ def conclusion(diagnosis: Diagnosis) -> DiagnosisFile:
 
 def _tolerances(diagnosis: Diagnosis) -> Tolerances:
     found = diagnosis.tolerated
-    # A drive errs once and twice per turn, each with a sine and a cosine, of which half the square is the mean.
+    # A drive has errors of one and two periods per turn, each with a sine and a cosine, whose mean square is one half.
     angle_rad, drive_rad = BackgroundSettings.angle_rad, math.sqrt(4 / 2) * BackgroundSettings.drive_rad
     units = np.array([1e3 * BackgroundSettings.length_m, np.degrees(angle_rad), np.degrees(drive_rad)])
     sizes, seen = units * np.asarray(found.scales)[:3], found.seen[:3]
@@ -130,7 +130,7 @@ def _mean_mm(diagnosis: Diagnosis) -> Errors:
 
 def _causes(diagnosis: Diagnosis, seen_by: str) -> tuple[Cause, ...]:
     fit, worse = diagnosis.extended, [max(diagnosis.worse_without[c.identity], 1.0) for c in diagnosis.causes]
-    # Causes that describe the error, and do not explain it, may not be there at all.
+    # Causes that only describe the error may not exist at all.
     sure, causes = ResultSettings.even if diagnosis.ended_early else 1.0, []
     parts = zip(fit.causes, diagnosis.standings, diagnosis.shares.causes, worse, strict=True)
     for cause, standing, share, squares in parts:
@@ -177,7 +177,7 @@ def merged_ripples(fit: Fit) -> set[Identity]:
 
 
 def _or_unnamed(cause: Cause, what: str) -> Cause:
-    """Return a cause that may be something without a name, or a part of it."""
+    """Return a cause that may be an unnamed one, or a part of it."""
     rival = Indistinguishable("unexplained", None, None, "this_motion", ResultSettings.even, what)
     probability = min(cause.probability, ResultSettings.even)
     return msgspec.structs.replace(cause, probability=probability, rivals=(rival, *cause.rivals))

@@ -75,7 +75,7 @@ class Cause(msgspec.Struct, frozen=True):
 
     @property
     def leaves_open(self) -> bool:
-        """True where a rival is not much less probable, and the cause is not small."""
+        """True if a rival is not much less probable, and the cause is not small."""
         return self.probability < ResultSettings.sure and bool(self.rivals) and not self.is_small
 
     @property
@@ -85,7 +85,7 @@ class Cause(msgspec.Struct, frozen=True):
 
     @property
     def is_correction(self) -> bool:
-        """True for one that makes a small difference, and is no more probable than not: its cause is not known."""
+        """True if it makes a small difference and is no more probable than not: its cause is unknown."""
         return self.is_small and self.probability <= ResultSettings.even
 
 
@@ -134,7 +134,7 @@ class Tolerances(msgspec.Struct, frozen=True):
 
     @property
     def leaves_open(self) -> bool:
-        """True where a cause may be there in their place, and they are not small."""
+        """True if a cause may exist instead of them, and they are not small."""
         probable = any(rival.probability > 1.0 - ResultSettings.sure for rival in self.rivals)
         return self.links_share_percent >= ResultSettings.small_percent and probable
 

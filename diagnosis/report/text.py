@@ -106,7 +106,7 @@ def remedies(diagnosis: DiagnosisFile, robot: RobotDescription, steps: FloatArra
 
 
 def _if_sure(cause: Cause, remedy: str, diagnosis: DiagnosisFile) -> str:
-    """Return the remedy, preceded by what to confirm before any change."""
+    """Return the remedy, preceded by the checks to make before any change."""
     is_open = cause.probability < ResultSettings.sure
     open_ones = [rival for rival in cause.rivals if rival.by == "this_motion" and is_open]
     rivals = [rival_named(rival, diagnosis.seen_by) for rival in open_ones[:2]]

@@ -46,7 +46,7 @@ class Blocks:
 
     @classmethod
     def cut(cls, rows: int, most: int = HeldOutSettings.most_blocks) -> Blocks:
-        """Cut rows into blocks of equal length, as many as make sense."""
+        """Cut rows into blocks of equal length, as many as reasonable."""
         count = int(np.clip(rows // HeldOutSettings.fewest_rows_a_block, HeldOutSettings.folds, most))
         return cls(np.arange(rows) * count // max(rows, 1), count)
 

@@ -490,7 +490,7 @@ def _parts(effect: Effect) -> list[tuple[object, ...]]:
 
 
 def _volume(spent: FloatArray) -> float:
-    """Return what integrating over the scales costs beyond taking the best, from the data spent on each (4,) [nats]."""
+    """Return the cost [nats] of integrating over the scales instead of taking the best, from the data spent (4,)."""
     return float(0.5 * np.log1p(2.0 * spent * BackgroundSettings.spread**2).sum())
 
 

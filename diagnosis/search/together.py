@@ -116,7 +116,7 @@ def tolerated(fit: Fit) -> Tolerated:
 
 
 def is_at_limit(scales: Scales | None) -> bool:
-    """Return True if tolerances of links or axes are as large as they may be."""
+    """Return True if tolerances of links or axes are at their upper limit."""
     return (
         scales is not None
         and max(scales.lengths, scales.angles) > (1.0 - SetSettings.still) * BackgroundSettings.largest_scale

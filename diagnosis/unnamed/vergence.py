@@ -37,7 +37,7 @@ def undone(x: FloatArray, calibration: StereoCalibration, turn: FloatArray) -> F
 
 
 def by_turn(x: FloatArray, calibration: StereoCalibration, axes: FloatArray) -> FloatArray:
-    """Return derivatives (n, 3, a) [m/rad] of `reported` at points (n, 3), for turns about axes (a, 3)."""
+    """Return derivatives (n, 3, a) [m/rad] of `reported` at points (n, 3), for rotations about axes (a, 3)."""
     step = _Settings.step_rad
     ends = [(reported(x, calibration, step * axis), reported(x, calibration, -step * axis)) for axis in axes]
     return np.stack([(above - below) / (2.0 * step) for above, below in ends], axis=2)

@@ -379,7 +379,7 @@ class _Numbers:
 
 
 def stream_checks(stream: MarkerStream, clock: Clock, read_s: float = _Settings.read_s) -> Iterator[Check]:
-    """Yield checks of the positions that come, of their rate and time, and of the messages that cannot be used.
+    """Yield checks of the positions, of their rate and time, and of the unusable messages.
 
     Args:
         stream: a closed stream; it is closed again afterwards.

@@ -370,5 +370,5 @@ class Inbox:
 
 
 def spare_after(layout: Layout, register: Register) -> int:
-    """Return how many bytes after a register may be read with it."""
+    """Return how many bytes after a register may be read together with it."""
     return min(_Settings.most_spare_bytes, layout.size - register.end)

@@ -177,7 +177,7 @@ class EepromEditor:
         return _lost(change, trouble)
 
     def _tell(self, bus: Bus, servo: IdentifiedServo, register: Register, value: int, deaf_s: float = 0.02) -> None:
-        """Write, whatever is answered: under which ID and at which rate it is answered depends on the firmware."""
+        """Write and ignore the answer: its ID and baud rate depend on the firmware."""
         bus.write(servo.model, servo.id, register, register.bytes(value))
         bus.settle()
         bus.listen(self._clock.now() + deaf_s)  # while it writes

@@ -50,7 +50,7 @@ class GravityBacklash(StructureEffect):
         return with_moment(run.by_joint[:, :, [k]] * 0.5 * side[:, None, None])
 
     def trial_shapes(self, motion: Motion) -> FloatArray:
-        """Return shares of the largest load."""
+        """Return fractions of the largest load."""
         return np.array(_Settings.holds)
 
     def unknown_state(self, run: SimulationRun, effect: Effect) -> NDArray[np.bool_]:

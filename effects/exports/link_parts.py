@@ -94,7 +94,7 @@ def _primitive(shape: Shape) -> dict[str, str]:
 
 
 def rod(end: FloatArray) -> dict[str, str] | None:
-    """Return a rod from a link's origin to `end` (3,) [m] in its frame; None where it would be too short."""
+    """Return a rod from a link's origin to `end` (3,) [m] in its frame; None if it would be too short."""
     if np.linalg.norm(end) < PartSettings.shortest_rod_m:
         return None
     size = texts(np.array([PartSettings.rod_radius_m]))

@@ -247,7 +247,7 @@ def log_ratios_if_it_bends(
 
     Args:
         angles: configurations (n, d) [rad, or for a prismatic joint the equivalent], at most `BendSettings.most_pairs`.
-        errors: of a model that knows none of the pairs, in units of their noise (n, 3).
+        errors: errors of a model not fitted to any of the pairs, in units of their noise (n, 3).
         known: their derivatives by the known parameters, whose prior is of variance 1 (n, 3, k).
         turning: their derivatives by each joint, scaled so that 1 moves the marker by about the noise (n, 3, d).
         changed: their derivatives by the parameters that may change (n, 3, c).

@@ -102,7 +102,7 @@ class ChangeScore:
     """Probability of a change.
 
     Attributes:
-        log_odds: logarithm of the Shiryaev-Roberts statistic: of all likelihood ratios together.
+        log_odds: logarithm of the Shiryaev-Roberts statistic, the sum of all likelihood ratios.
         alarm: True if that exceeds the limit set by `DetectorSettings.pairs_between_false_alarms`.
         onsets: candidate first pairs (m,) of the change, counted from the detector's first.
         shares: probability of each onset (m,), given a change.
@@ -333,7 +333,7 @@ class ChangeDetector:
         return ChangeScore(log_odds, log_odds > self._limit, onsets, shares.sum(axis=1), shares.sum(axis=0))
 
     def _grown_noise(self) -> SharedNoise:
-        """Return the noise, or more where the newest pairs scatter more: that is not a change of the arm."""
+        """Return the noise, or more if the newest pairs scatter more, since that is not a change of the arm."""
         if len(self._differences) < DetectorSettings.recent:
             return self._noise
         chance = 1.0 + DetectorSettings.clearly * math.sqrt(1.0 / DetectorSettings.recent)

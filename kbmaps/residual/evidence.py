@@ -166,7 +166,7 @@ class GroupedModel:
         return np.array([column for span in spans for column in range(span.start, span.stop)], dtype=np.intp)
 
     def select(self, candidates: tuple[str, ...]) -> None:
-        """Add groups while the evidence gains by more than their price, then drop those that it does not need."""
+        """Add groups while the evidence gains by more than their price, then drop those that are not needed."""
         self.settle()
         refused: set[str] = set()
         while True:

@@ -139,7 +139,7 @@ def _from_a_random_chain(pairs: Pairs, prior: CorePrior, bases: Sequence[JointBa
     z, _ = LevenbergMarquardt().run(problem, z, SearchSettings.first_steps)
     left = math.sqrt(float(np.square(problem.residuals(z)).mean()))
     if left > SearchSettings.plausible * pairs.size:
-        # Most failed starts show by now; settling them would take longer than the next start.
+        # Most failed starts are evident by now; converging them would take longer than the next start.
         return Fit(z, left, np.ones(len(pairs.x), dtype=np.bool_))
     blind = Pairs(pairs.weights, pairs.x, np.full(len(pairs.x), np.nan))
     return _settle(blind, prior, z, noise)

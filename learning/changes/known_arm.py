@@ -33,7 +33,7 @@ class KnownArm:
         return KnownArm(chain or self.chain, self.tolerances, residual or self.residual)
 
     def with_other_tool(self) -> KnownArm:
-        """Return the same arm with a marker elsewhere on the hand."""
+        """Return the same arm with another marker position on the hand."""
         residual = None if self.residual is None else self.residual.with_other_tool(ArmSettings.other_tool_m)
         return KnownArm(self.chain.with_other_tool(ArmSettings.other_tool_m), self.tolerances, residual)
 

@@ -145,7 +145,7 @@ class ChangeMonitor:
         self._next_at = self._asked_at = 0
         self._pairs: list[_Watched] = []
         self._earlier: deque[_Watched] = deque(maxlen=MonitorSettings.looked_back)
-        # Compares the pairs with the current reference; None before there is one.
+        # Compares the pairs with the current reference; None before the first one.
         self.detector: ChangeDetector | None = None
         self._white = WhiteNoise.as_claimed(0)
         self._change: ChangeScore | None = None

@@ -40,7 +40,7 @@ class Stick:
             bullet.removeBody(self._id, physicsClientId=client)
             self._id = -1
         length = float(np.linalg.norm(tip))
-        # What stands in the world, before a camera that the arm carries, is on no stick.
+        # A marker fixed in the world, in front of a camera on the arm, is on no stick.
         if length < UrdfSettings.shortest_rod_m or self._body.stands(self._link):
             return
         shape = bullet.createVisualShape(

@@ -201,7 +201,7 @@ def _plain_squares(grey: ImageArray) -> tuple[int, int] | None:
 
 
 def any_grid(grey: ImageArray) -> FloatArray | None:
-    """Return the corners (rows, columns, 2) [px], more columns than rows, of as much of a chessboard as is in view."""
+    """Return the corners (rows, columns, 2) [px] of the visible part of a chessboard, with more columns than rows."""
     found, px, grid = cv2.findChessboardCornersSBWithMeta(grey, _Settings.smallest_grid, cv2.CALIB_CB_LARGER)
     if not found:
         return None

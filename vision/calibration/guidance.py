@@ -60,7 +60,7 @@ class Coverage:
 
     @property
     def progress(self) -> float:
-        """Share of the wanted coverage that is reached, 0 to 1."""
+        """Fraction of the wanted coverage reached, 0 to 1."""
         wanted = len(self.tilted()) + len(self.eyes) * GRID[0] * GRID[1] + 2 + _Settings.wanted_views
         lacking = len(self._tilts_missing()) + len(self._cells_missing()) + len(self._distances_missing())
         return 1.0 - (lacking + max(_Settings.wanted_views - self.whole_views, 0)) / wanted

@@ -42,7 +42,7 @@ class DepthChecked:
 
     @property
     def health(self) -> tuple[str, ...]:
-        """A persistent contradiction, with what to do."""
+        """A persistent contradiction, with the remedy."""
         wrong = [(eyes, depth) for eyes, depth, sigmas in self._apart if sigmas > _Settings.sigmas]
         if len(self._apart) < _Settings.frames or len(wrong) < _Settings.contradicting_share * _Settings.frames:
             return ()

@@ -21,7 +21,7 @@ class LookSettings:
 
 
 def of_image(image: ImageArray, name: str) -> str | None:
-    """Return what is wrong with the light in an image, or None."""
+    """Return the fault of the light in an image, or None."""
     levels = image[:: LookSettings.step_px, :: LookSettings.step_px]
     if is_black(levels):
         return f"the {name}'s image is black: is the lens cap on? Else more light, or a longer exposure_s"

@@ -32,7 +32,7 @@ class Stamps:
 
     @property
     def sigma_s(self) -> float:
-        """1-sigma of the stamps [s]."""
+        """1-sigma of the timestamps [s]."""
         return _Settings.kernel_sigma_s if self.source == "kernel" else _Settings.arrival_sigma_s
 
     def stamp(self, kernel_s: float, arrival_s: float) -> float | None:

@@ -85,7 +85,7 @@ class CommonError:
         return np.asarray((corners - pinhole.principal_point_px) / pinhole.focal_px, np.float64)
 
     def _within_view(self, x: FloatArray) -> FloatArray:
-        """Return the positions x (n, 3), each moved to where the cameras could see it: models may predict others."""
+        """Return positions x (n, 3), each moved into the cameras' view, since models may predict outside it."""
         ahead = np.maximum(x[:, 2:], CommonErrorSettings.nearest_m)
         return np.concatenate([ahead * np.clip(x[:, :2] / ahead, *self._view), ahead], axis=1)
 
@@ -121,7 +121,7 @@ def _by_one_eye(lens: Lens, x: FloatArray) -> FloatArray:
     steps = CommonErrorSettings.step * np.array([[0.0, 0.0], [1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
     moved = _moved(lens, (seen + steps).reshape(-1, 2)).reshape(len(x), len(steps), 2, -1)
     spread = (moved[:, 1, 0] - moved[:, 2, 0] + moved[:, 3, 1] - moved[:, 4, 1]) / (2.0 * CommonErrorSettings.step)
-    # Of the solid angle, from that in the image's plane, and with the length of (x/z, y/z, 1).
+    # Growth of the solid angle, from that in the image plane and the length of (x/z, y/z, 1).
     outward = (seen @ moved[:, 0])[:, 0] / (1.0 + np.square(seen).sum(axis=2))
     growth = 0.5 * (spread - outward)
     ahead = np.concatenate([seen[:, 0], np.ones((len(x), 1))], axis=1)

@@ -141,7 +141,7 @@ class Lens:
             value, right, down = self.project((ahead + shifts[:, None]).reshape(-1, 3)).reshape(3, -1, 2)
             (a, c), (b, d) = ((right - value) / h).T, ((down - value) / h).T
             u, v = (value - px).T
-            # Where a lens folds the image over there is no direction; the step is kept short, and says nothing.
+            # Where a lens folds the image over, there is no direction; the short step only keeps the result finite.
             determinant = np.maximum(a * d - b * c, LensSettings.least_slope * self.focal_px[0] * self.focal_px[1])
             step = np.column_stack([d * u - b * v, a * v - c * u]) / determinant[:, None]
             found = found - step

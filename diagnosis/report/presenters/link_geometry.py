@@ -30,7 +30,7 @@ class LinkGeometry(Presenter):
 
 
 def _axes(how: str, amounts: Mapping[str, float]) -> str:
-    """Return along or about which axes of its frame a link is off; empty for all three."""
+    """Return the axes of its frame along or about which a link is off; empty for all three."""
     # A smaller one is left out: it changes the size of all by less than 2 %.
     least = 0.2 * max(map(abs, amounts.values()))
     axes = [axis for axis, amount in amounts.items() if abs(amount) >= least]

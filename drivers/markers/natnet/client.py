@@ -49,7 +49,7 @@ class NatnetReceiver:
             self._commands = listening("0.0.0.0", 0)
             self._await_server()
             self._join()
-            until = self._clock.now() + _Settings.answer_s  # without an answer the bodies' IDs are used
+            until = self._clock.now() + _Settings.answer_s  # without an answer, bodies are identified by ID only
             while not self.names and self._clock.now() < until:
                 self._ask(packets.packet(Message.REQUEST_MODEL), lambda: bool(self.names))
         except BaseException:
@@ -133,10 +133,10 @@ class NatnetReceiver:
             )
 
     def _ask(self, question: bytes, is_answered: Callable[[], bool]) -> None:
-        """Send a question and take what comes until it is answered, for `ask_every_s` at most."""
+        """Send a question and process received packets until it is answered, for `ask_every_s` at most."""
         self._send(question)
         until = self._clock.now() + _Settings.ask_every_s
-        # Frames may come all the time, so the time is looked at, too.
+        # Frames may arrive without a pause, so check the time too.
         while not is_answered() and self._commands is not None and self._clock.now() < until:
             if await_any([self._commands], until, self._clock):
                 got = received(self._commands, self._clock)
@@ -175,7 +175,7 @@ class NatnetReceiver:
         if now - self._heard > _Settings.gone_after_s:
             raise SourceLost(f"the NatNet server {self._table.server} has fallen silent", retry_s=_Settings.retry_s)
         if now - self._asked > _Settings.alive_every_s:
-            # CONNECT is answered, so that a server without frames still shows that it lives.
+            # CONNECT is answered, so a server without frames still shows that it is alive.
             self._send(packets.packet(Message.KEEP_ALIVE))
             self._send(packets.connect())
 

@@ -132,7 +132,7 @@ class FocusWatch:
         self._read_s = -np.inf
 
     def look(self, capture: VideoCapture, now_s: float) -> None:
-        """Read the focus of the open camera, if it was not just read."""
+        """Read the focus of the open camera, unless it was just read."""
         if now_s - self._read_s < LookSettings.every_s:
             return
         self._read_s = now_s
