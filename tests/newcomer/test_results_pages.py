@@ -79,7 +79,7 @@ def test_a_table_can_show_cells_of_another(tmp_path: Path) -> None:
     assert "| off by 0.1 mm |" in rendered("<!-- table: summary -->\n<!-- end -->\n", tmp_path)
 
 
-def test_the_command_of_a_table_leaves_out_where_it_is_written() -> None:
+def test_command_of_table_omits_output_path() -> None:
     code = "from benchmarks.tables import running; print(running())"
     words = [sys.executable, "-c", code, "/somewhere/data", "--tables", "here", "--pairs", "3"]
     said = subprocess.run(words, cwd=DOCS.parent, capture_output=True, text=True, check=True).stdout
