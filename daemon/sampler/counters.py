@@ -8,7 +8,7 @@ from bodyschema.daemon.transport.status import JointRange
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import FloatArray, Reason
 from bodyschema.interfaces.rejections import REMEDIES, WORDS
-from bodyschema.interfaces.waits import STATUS_EVERY_S
+from bodyschema.interfaces.waits import Waits
 from bodyschema.robot.description import RobotDescription
 
 # A complaint needs nearly all of the newest frames (10 s of a usual camera; fewer at the start) to be refused.
@@ -91,7 +91,7 @@ class SamplerCounters:
         """Update the rates at the end of a window."""
         now = self._wall.now()
         passed = now - self._window_start
-        if passed < STATUS_EVERY_S:  # a shorter window would make single frames show
+        if passed < Waits.status_every_s:  # a shorter window would make single frames show
             return
         counts = (self.readings, self.frames, self.pairs)
         rates = [(count - before) / passed for count, before in zip(counts, self._window_counts, strict=True)]
