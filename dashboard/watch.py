@@ -24,7 +24,7 @@ from bodyschema.dashboard.scene import arm
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import BusError, RecordingError, RequestError
 from bodyschema.interfaces.protocols import Clock
-from bodyschema.interfaces.waits import ANSWER_LIMIT_S, STATUS_EVERY_S
+from bodyschema.interfaces.waits import Waits
 
 
 class _Settings:
@@ -156,7 +156,7 @@ class Watch:
         with self._picturing:
             now = self._clock.now()
             if self._picture is None or now - self._picture[0] > _Settings.picture_every_s:
-                jpeg = self._sessions["sampler"].ask_one(self._keys.picture, timeout_s=ANSWER_LIMIT_S)
+                jpeg = self._sessions["sampler"].ask_one(self._keys.picture, timeout_s=Waits.answer_limit_s)
                 self._picture = now, jpeg
             return self._picture[1]
 
@@ -190,7 +190,7 @@ class Watch:
                 log.debug("%s", error)  # the page shows which process does not answer
             except Exception:
                 log.exception("the page is not up to date")
-            if self._stopping.wait(STATUS_EVERY_S):
+            if self._stopping.wait(Waits.status_every_s):
                 return
 
     def _look(self) -> None:
@@ -244,7 +244,7 @@ class Watch:
 
     def _predict(self, q: list[list[float]]) -> PredictReply:
         payload = encode(JointsRequest([*q]))
-        reply = self._sessions["learner"].ask_one(self._keys.predict, payload, timeout_s=ANSWER_LIMIT_S)
+        reply = self._sessions["learner"].ask_one(self._keys.predict, payload, timeout_s=Waits.answer_limit_s)
         return decode(reply, PredictReply)
 
     def _catch_up(self) -> None:

@@ -25,7 +25,7 @@ from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
 from bodyschema.daemon.transport.wire import decode
 from bodyschema.daemon.transport.zenoh_config import ENDPOINT, PROCESSES
 from bodyschema.interfaces.errors import BusError, RequestError
-from bodyschema.interfaces.waits import ANSWER_LIMIT_S
+from bodyschema.interfaces.waits import Waits
 
 EVERYBODY = "*"
 
@@ -141,7 +141,7 @@ class Fleet:
     def _look_at(self, place: Place, members: dict[str, Member]) -> None:
         bus = self.bus(place.route)
         asked = [EVERYBODY]
-        tokens = bus.alive(Keys(EVERYBODY).alive(EVERYBODY), timeout_s=ANSWER_LIMIT_S)
+        tokens = bus.alive(Keys(EVERYBODY).alive(EVERYBODY), timeout_s=Waits.answer_limit_s)
         if not tokens:  # no process answers, or only queries by name are permitted
             asked = list(place.robots)
             tokens = [token for name in asked for token in bus.alive(Keys(name).alive(EVERYBODY))]
@@ -161,7 +161,7 @@ class Fleet:
 
 
 def _states(bus: ZenohSession, robots: str, process: str, kind: type[Status]) -> Iterator[Status]:
-    for reply in bus.ask(Keys(robots).status(process), timeout_s=ANSWER_LIMIT_S):
+    for reply in bus.ask(Keys(robots).status(process), timeout_s=Waits.answer_limit_s):
         if reply.error is None:
             with suppress(RequestError):  # another version's message counts as no answer
                 yield decode(reply.payload, kind)

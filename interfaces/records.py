@@ -11,10 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 FloatArray = NDArray[np.float64]
 ImageArray = NDArray[np.uint8]
 
-# A position farther away than this is not one in metres [m].
-FARTHEST_M = 1000.0
-# No joint goes so far: such a number is not an angle in radians, nor a way in metres [rad or m].
-LARGEST_Q = 1e6
+
+class PairLimits:
+    # A position farther away than this is not one in metres [m].
+    farthest_m = 1000.0
+    # No joint goes so far: such a number is not an angle in radians, nor a way in metres [rad or m].
+    largest_q = 1e6
 
 
 def frozen_array(values: ArrayLike) -> FloatArray:

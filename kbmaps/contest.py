@@ -119,11 +119,8 @@ class PrequentialComparison:
         for name in added:
             self._errors.setdefault(name, np.full(self._length, math.nan))
         self._pairs += count
-        self._length = min(
-            self._length + count,
-            ContestSettings.longest,
-            int(max(ContestSettings.shortest, ContestSettings.share * self._pairs)),
-        )
+        most = int(max(ContestSettings.shortest, ContestSettings.share * self._pairs))
+        self._length = min(self._length + count, ContestSettings.longest, most)
         none = np.full(count, math.nan)
         for name, values in self._errors.items():
             more = added.get(name, none)

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from bodyschema.interfaces.errors import RequestError
-from bodyschema.interfaces.records import FARTHEST_M, LARGEST_Q, FloatArray, Pair
+from bodyschema.interfaces.records import FloatArray, Pair, PairLimits
 from bodyschema.learning.config import LearnerConfig
 from bodyschema.learning.data_outlook import LearnerEvidence
 from bodyschema.learning.model_bank import PRIOR, SOLVED
@@ -495,11 +495,11 @@ def _check_pair(pair: Pair, counters: Counters, joints: int) -> None:
         raise RequestError(f"pair {pair.seq} has {len(pair.q)} joint angles, this robot has {joints}")
     if not all(np.isfinite(part).all() for part in (pair.q, pair.x, pair.cov)):
         raise RequestError(f"pair {pair.seq} has a number that is not finite")
-    if np.abs(pair.x).max() > FARTHEST_M:
+    if np.abs(pair.x).max() > PairLimits.farthest_m:
         raise RequestError(f"pair {pair.seq} lies {np.abs(pair.x).max():.0f} m away; positions are in metres")
-    if np.abs(pair.q).max() > LARGEST_Q:
+    if np.abs(pair.q).max() > PairLimits.largest_q:
         raise RequestError(f"pair {pair.seq} has the joint angle {np.abs(pair.q).max():.3g}; angles are in radians")
-    if np.abs(pair.cov).max() > FARTHEST_M**2:
+    if np.abs(pair.cov).max() > PairLimits.farthest_m**2:
         raise RequestError(f"pair {pair.seq} says that it may be {np.sqrt(np.abs(pair.cov).max()):.3g} m wrong")
     spread = np.linalg.eigvalsh(pair.cov)
     if spread[0] < -OnlineSettings.rounding_share * max(spread[-1], 0.0):

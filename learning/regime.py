@@ -113,9 +113,8 @@ class Regime:
         predicted = self.models.predict(INSTANT, pair.q)
         doubted = self._judged([pair], predicted[None])[0]
         # An outlier gets a step no longer than any other pair.
-        self.models.learn(
-            pair.q, pair.x - predicted, self._limit_m / OutlierSettings.times_farther if doubted else np.inf
-        )
+        longest_m = self._limit_m / OutlierSettings.times_farther if doubted else np.inf
+        self.models.learn(pair.q, pair.x - predicted, longest_m)
         return not doubted
 
     def meet(self, pair: Pair) -> None:
@@ -346,11 +345,8 @@ class Regime:
 
     def _choose(self) -> None:
         self.answering = self._claims.best(self.answering)
-        if (
-            self.answering == PRIOR
-            and self.memory.count >= OrientationSettings.fewest_to_trust
-            and self._claims.untried(RIGID)
-        ):
+        enough = self.memory.count >= OrientationSettings.fewest_to_trust
+        if self.answering == PRIOR and enough and self._claims.untried(RIGID):
             self.answering = RIGID  # the same, after some pairs
         self._choose_map()
 

@@ -204,13 +204,7 @@ class Regimes:
     def follow_change(self, regime: Regime, pair: Pair) -> bool:
         """Begin the regime of another tool if the consecutive outliers of `regime` up to `pair` are its first pairs."""
         gate = regime.gate
-        if not (
-            gate.changed
-            or (
-                gate.perhaps_changed
-                and self._moved_together(regime, regime.limit_m(pair) / OutlierSettings.times_farther)
-            )
-        ):
+        if not (gate.changed or (gate.perhaps_changed and self._moved_together(regime, pair))):
             return False
         q, x = gate.run()
         distances = np.linalg.norm(regime.model.predict(q) - x, axis=1)
@@ -225,9 +219,7 @@ class Regimes:
         if not regime.monitor.ready:
             return None
         gate = regime.gate
-        together = gate.perhaps_changed and self._moved_together(
-            regime, regime.limit_m(pair) / OutlierSettings.times_farther
-        )
+        together = gate.perhaps_changed and self._moved_together(regime, pair)
         noticed = regime.monitor.noticed(run=gate.in_a_row if gate.changed or together else 0)
         fewest = OutlierSettings.explained_change_pairs
         return None if noticed is None or len(noticed.q) - noticed.first < fewest else noticed
@@ -317,8 +309,9 @@ class Regimes:
         self.claims.change_tool(expected_m, regime.answering)
         return self._regime(prior, arm.with_other_tool())
 
-    def _moved_together(self, regime: Regime, expected_m: float) -> bool:
+    def _moved_together(self, regime: Regime, pair: Pair) -> bool:
         """Return True if one other position of the marker on the hand explains the consecutive outliers."""
+        expected_m = regime.limit_m(pair) / OutlierSettings.times_farther
         q, x = regime.gate.run()
         answer = regime.model.predict(q)
         # Without the answering model's terms beyond the map, which hold for any tool.

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 
 from bodyschema.interfaces.errors import BodyschemaError
-from bodyschema.interfaces.records import FARTHEST_M, LARGEST_Q, FloatArray
+from bodyschema.interfaces.records import FloatArray, PairLimits
 from bodyschema.learning.model_bank import PRIOR
 from bodyschema.learning.orientation import OrientationState
 from bodyschema.learning.status import ChangeRecord, CurvePoint
@@ -98,7 +98,7 @@ class LearningState:
     def poisoned(self) -> str | None:
         """Return the name of a net, or of an array of pairs, with impossible values; None if all are valid."""
         nets = dict.fromkeys((name for name in self.arrays if name.startswith(NET)), np.inf)
-        limits = {**nets, "q": LARGEST_Q, "x": FARTHEST_M}
+        limits = {**nets, "q": PairLimits.largest_q, "x": PairLimits.farthest_m}
         for name, limit in limits.items():
             if not (np.isfinite(self.arrays[name]).all() and (np.abs(self.arrays[name]) <= limit).all()):
                 return name

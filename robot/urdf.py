@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from bodyschema.interfaces.errors import RobotError
-from bodyschema.interfaces.records import LARGEST_Q, FloatArray, frozen_array
+from bodyschema.interfaces.records import FloatArray, PairLimits, frozen_array
 from kbmaps import RigidChain
 from kbmaps.rotations import exponentials
 
@@ -301,7 +301,7 @@ def _limits(joint: Any, kind: str, file: Path) -> tuple[float, float]:
     if kind == "prismatic" and max(abs(lower), abs(upper)) > _Settings.largest_place_m:
         what = f"<limit> of {_owner(limit)} lets it slide {max(abs(lower), abs(upper)):.3g} m away"
         raise _wrong(limit, file, what, "Give metres")
-    if kind != "prismatic" and max(abs(lower), abs(upper)) > LARGEST_Q:
+    if kind != "prismatic" and max(abs(lower), abs(upper)) > PairLimits.largest_q:
         what = f"<limit> of {_owner(limit)} lets it turn by {max(abs(lower), abs(upper)):.3g} rad"
         raise _wrong(limit, file, what, 'Give radians, or write type="continuous"')
     return float(lower), float(upper)
@@ -312,7 +312,7 @@ def _origin(element: Any, file: Path) -> FloatArray:
     origin = element.find("origin")
     T = np.eye(4)
     rpy = _numbers(origin, "rpy", (0.0, 0.0, 0.0), file)
-    if np.abs(rpy).max() > LARGEST_Q:  # no digits are left of its part of a turn
+    if np.abs(rpy).max() > PairLimits.largest_q:  # no digits are left of its part of a turn
         what = f"the <origin> of {_owner(origin)} is turned by {np.abs(rpy).max():.3g} rad"
         raise _wrong(origin, file, what, "Give radians")
     T[:3, :3] = rotation_of(rpy)

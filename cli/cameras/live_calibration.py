@@ -17,7 +17,7 @@ from bodyschema.cli.cameras.calibration import Tell, pair_in
 from bodyschema.daemon.sampler.reconnect import ReconnectingSource
 from bodyschema.interfaces.errors import SourceEnded, SourceError
 from bodyschema.interfaces.protocols import Clock, StereoEyes
-from bodyschema.interfaces.waits import LINE_EVERY_S, READ_S
+from bodyschema.interfaces.waits import Waits
 from bodyschema.vision.calibration.calibrate import Calibrated
 from bodyschema.vision.calibration.check import Check, check
 from bodyschema.vision.calibration.gather import Gathered, require_both
@@ -120,7 +120,7 @@ class LiveCalibration:
             raise SourceError(f"these are {_named(*these)}, the views are of {_named(*self._first)}. Plug those in")
 
     def _look(self) -> Look | None:
-        frame = self._source.read(READ_S)
+        frame = self._source.read(Waits.read_s)
         if frame is None:
             if self._source.trouble is not None:
                 self._views.forget()
@@ -168,7 +168,7 @@ def checked_live(
 
     with ReconnectingSource(eyes, "the cameras", clock, require=require) as source, suppress(SourceEnded):
         while clock.now() < until:
-            frame = source.read(READ_S)
+            frame = source.read(Waits.read_s)
             look = None if frame is None else views.look(frame)
             trouble = eyes.health if source.trouble is None else (source.trouble,)
             show(Shown(views.coverage, 0, look, trouble))
@@ -291,7 +291,7 @@ class Lines:
             self._say(f"{now_text(shown)}. {said}" if _is_taken(shown.look) else said)
             self._said.clear()
         elif shown.doing or (shown.look is not None and self._clock.now() >= self._next_s):
-            self._next_s = self._clock.now() + LINE_EVERY_S
+            self._next_s = self._clock.now() + Waits.line_every_s
             self._once(now_text(shown), self._said)
 
     def _once(self, text: str, said: set[str]) -> None:

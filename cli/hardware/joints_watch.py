@@ -19,7 +19,7 @@ from bodyschema.daemon.transport.status import JointRange
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import FloatArray
 from bodyschema.interfaces.servos import EncoderJoints, ServoJoints
-from bodyschema.interfaces.waits import POLL_S
+from bodyschema.interfaces.waits import Waits
 from bodyschema.robot.description import RobotDescription
 
 
@@ -95,7 +95,7 @@ class JointsWatch:
 
     def look(self) -> Seen | None:
         """Read once and return the state; None until all joints are known."""
-        reading = self._reading.read(POLL_S)
+        reading = self._reading.read(Waits.poll_s)
         if reading is not None:
             self._low = reading.q if self._q is None else np.minimum(self._low, reading.q)
             self._high = reading.q if self._q is None else np.maximum(self._high, reading.q)

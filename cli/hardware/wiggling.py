@@ -17,7 +17,7 @@ from bodyschema.daemon.sampler.sources import Sources
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import RecordingError, SourceEnded, SourceLost
 from bodyschema.interfaces.records import JointReading, MarkerFix, MarkerMiss
-from bodyschema.interfaces.waits import READ_S
+from bodyschema.interfaces.waits import Waits
 from bodyschema.interfaces.whole_files import write_whole, writing
 from bodyschema.robot.limited import read_at_most
 
@@ -66,7 +66,7 @@ def collected(sources: Sources, duration_s: float, tell: Callable[[float], None]
     def read_joints() -> None:
         try:
             while not ending.is_set():
-                reading = sources.joints.read(READ_S)
+                reading = sources.joints.read(Waits.read_s)
                 if reading is not None and np.isfinite(reading.q).all():
                     readings.append(reading)
         except SourceEnded:
@@ -82,7 +82,7 @@ def collected(sources: Sources, duration_s: float, tell: Callable[[float], None]
             until = clock.now() + LIMIT_S
             while clock.now() < until and not failures:
                 try:
-                    seen = sources.marker.read(READ_S)
+                    seen = sources.marker.read(Waits.read_s)
                 except SourceEnded:
                     break
                 if isinstance(seen, MarkerMiss):

@@ -24,7 +24,7 @@ from bodyschema.daemon.transport.session import SessionSettings, ZenohSession
 from bodyschema.daemon.transport.zenoh_config import ENDPOINT, HOW_TO
 from bodyschema.interfaces.errors import ConfigError
 from bodyschema.interfaces.protocols import Clock
-from bodyschema.interfaces.waits import POLL_S
+from bodyschema.interfaces.waits import Waits
 from bodyschema.robot.description import NAME
 from bodyschema.robot.toml_file import convert, line_of, read_toml
 
@@ -123,5 +123,5 @@ def run_router(config: RouterConfig, stopping: Callable[[], bool], notifier: Not
         service.tell(f"takes connections on {config.tables.listen}")
         while not stopping():
             service.beat(PASSING_ON)
-            time.sleep(POLL_S)
+            time.sleep(Waits.poll_s)
         service.stopping()

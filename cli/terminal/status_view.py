@@ -24,7 +24,7 @@ from bodyschema.daemon.transport.wire import decode
 from bodyschema.daemon.transport.zenoh_config import PROCESSES
 from bodyschema.interfaces.errors import BusError, RequestError
 from bodyschema.interfaces.servos import BusStatus, ServoStatus
-from bodyschema.interfaces.waits import ANSWER_LIMIT_S, STATUS_EVERY_S
+from bodyschema.interfaces.waits import Waits
 from bodyschema.learning.status import OrientationStatus
 
 
@@ -68,13 +68,13 @@ class Watcher:
         """Yield their states about once a second, without end."""
         while True:
             yield self.look()
-            time.sleep(STATUS_EVERY_S)
+            time.sleep(Waits.status_every_s)
 
     def _ask(self, process: str) -> bytes | None:
         try:
             if process not in self._sessions:
                 self._sessions[process] = ZenohSession(connect=self._routes[process], client=True).__enter__()
-            return self._sessions[process].ask_one(self._keys.status(process), timeout_s=ANSWER_LIMIT_S)
+            return self._sessions[process].ask_one(self._keys.status(process), timeout_s=Waits.answer_limit_s)
         except (BusError, RequestError):
             self._leave(process)
             return None

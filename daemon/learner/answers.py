@@ -25,7 +25,7 @@ from bodyschema.daemon.transport.wire import (
 from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import JointReading
-from bodyschema.interfaces.waits import READ_S, RETRY_S
+from bodyschema.interfaces.waits import Waits
 from bodyschema.learning.model_bank import LearntModel
 from bodyschema.learning.online_learner import OnlineLearner
 from bodyschema.learning.snapshot import NoFrameError, Prediction, Snapshot
@@ -191,10 +191,10 @@ class ExpectedMarker:
                 if not said:
                     log.warning("the expected marker position is not published: %s; trying again", error)
                 said = True
-                self._stop.wait(RETRY_S)
+                self._stop.wait(Waits.retry_s)
 
     def _follow(self, joints: ReconnectingSource[JointReading]) -> None:
         while not self._stop.is_set():
-            reading = joints.read(READ_S)
+            reading = joints.read(Waits.read_s)
             if reading is not None:
                 self.take(reading)

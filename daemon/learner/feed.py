@@ -15,7 +15,7 @@ from bodyschema.daemon.sampler.history import Page, Unreadable
 from bodyschema.daemon.transport.wire import PairMessage, decode, pair_from_wire
 from bodyschema.interfaces.errors import BusError, RequestError
 from bodyschema.interfaces.protocols import Clock
-from bodyschema.interfaces.waits import RETRY_S
+from bodyschema.interfaces.waits import Waits
 from bodyschema.learning.online_learner import OnlineLearner
 
 log = logging.getLogger(__name__)
@@ -171,7 +171,7 @@ class PairFeed:
                 log.debug("history could not be asked: %s", error)
                 if isinstance(error, RequestError):
                     self.problem = f"the sampler does not give the pairs from {begin} on: {error}"
-                self._retry_at = self._clock.now() + RETRY_S
+                self._retry_at = self._clock.now() + Waits.retry_s
                 return
             self._note_stored(reply)
             with self.lock:

@@ -32,7 +32,7 @@ from bodyschema.daemon.transport.session import ZenohSession
 from bodyschema.daemon.transport.wire import encode
 from bodyschema.interfaces.errors import ConfigError, StoreUnwritable
 from bodyschema.interfaces.protocols import Clock
-from bodyschema.interfaces.waits import RETRY_S, STATUS_EVERY_S
+from bodyschema.interfaces.waits import Waits
 from bodyschema.recordings.store.file import lock
 
 
@@ -79,7 +79,7 @@ class Background:
                 log.warning("%s", error)
                 for worker in self._workers:
                     worker.restart_solver()
-                self._stop.wait(RETRY_S)
+                self._stop.wait(Waits.retry_s)
                 continue
             if worked:
                 self._stop.wait(max(self._rest * (time.thread_time() - begin), _Settings.breath_s))
@@ -230,7 +230,7 @@ def attend(
     failed: Sequence[Exception],
 ) -> None:
     """Publish states, write checkpoints and serve requests until the end is requested."""
-    every_s = STATUS_EVERY_S * more_rarely(len(learners))  # a status takes milliseconds
+    every_s = Waits.status_every_s * more_rarely(len(learners))  # a status takes milliseconds
     begin = time.monotonic()
     due = [begin + every_s * k / len(learners) for k in range(len(learners))]
     while not wishes.ending:

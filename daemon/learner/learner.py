@@ -30,7 +30,7 @@ from bodyschema.daemon.wiring.wiring import open_marker_topic
 from bodyschema.interfaces.errors import BodyschemaError, RequestError
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.waits import READ_S
+from bodyschema.interfaces.waits import Waits
 from bodyschema.learning.nominal import NominalModel
 from bodyschema.learning.online_learner import OnlineLearner
 from bodyschema.learning.solvers.solver import Solver, SolverSettings
@@ -316,7 +316,7 @@ class Learner:
         try:
             while not self._stop.is_set():
                 self._service.beat(self._loop)
-                self._feed.step(READ_S)
+                self._feed.step(Waits.read_s)
                 self._learning.judge_due(self._clock.now())
                 with self._feed.lock:
                     self._changes.note(self._learning.change)

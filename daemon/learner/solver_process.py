@@ -26,7 +26,7 @@ import numpy as np
 from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.interpreter import end, module_command
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.waits import END_LIMIT_S
+from bodyschema.interfaces.waits import Waits
 from bodyschema.learning.solvers.orientation import OrientationSolution
 from bodyschema.learning.solvers.solver import DirectSolver, Solved, Task
 from kbmaps import ChainBelief, ChainTolerances, KBMap, OrientedChain, ResidualModel
@@ -226,7 +226,7 @@ class SolverProcess:
             return None
         child.stdin.close()
         try:
-            return end(child, END_LIMIT_S)
+            return end(child, Waits.end_limit_s)
         finally:
             child.stdout.close()
 

@@ -8,7 +8,7 @@ from bodyschema.daemon.transport.status import JointRange
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import FloatArray, Reason
 from bodyschema.interfaces.rejections import REMEDIES, WORDS
-from bodyschema.interfaces.waits import STATUS_EVERY_S
+from bodyschema.interfaces.waits import Waits
 from bodyschema.robot.description import RobotDescription
 
 
@@ -95,7 +95,7 @@ class SamplerCounters:
         """Update the rates at the end of a window."""
         now = self._wall.now()
         passed = now - self._window_start
-        if passed < STATUS_EVERY_S:  # in a shorter window single frames would be visible
+        if passed < Waits.status_every_s:  # in a shorter window single frames would be visible
             return
         counts = (self.readings, self.frames, self.pairs)
         rates = [(count - before) / passed for count, before in zip(counts, self._window_counts, strict=True)]

@@ -17,7 +17,7 @@ from bodyschema.daemon.transport.wire import JointsRequest, PredictReply, decode
 from bodyschema.interfaces.errors import BusError, ConfigError, RequestError
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import FloatArray
-from bodyschema.interfaces.waits import RETRY_S
+from bodyschema.interfaces.waits import Waits
 from bodyschema.robot.description import RobotDescription
 from bodyschema.robot.pointing import Pointing
 
@@ -58,7 +58,7 @@ class HandModel:
         try:
             reply = decode(self._predict(encode(JointsRequest(q.tolist()))), PredictReply)
         except (BusError, RequestError):
-            self._ask_s = self._clock.now() + RETRY_S
+            self._ask_s = self._clock.now() + Waits.retry_s
             return None
         x = np.array(reply.x)
         is_good = reply.in_support[:1] == [True] and max(reply.sigma[0]) <= _Settings.good_m

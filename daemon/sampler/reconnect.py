@@ -12,7 +12,7 @@ from bodyschema.daemon.service.logs import RepeatSettings
 from bodyschema.interfaces.errors import SourceError, SourceLost, StoreUnwritable
 from bodyschema.interfaces.protocols import Clock, Source
 from bodyschema.interfaces.records import FloatArray, MarkerFix, Pair
-from bodyschema.interfaces.waits import FIRST_WAIT_S, LONGEST_WAIT_S
+from bodyschema.interfaces.waits import Waits
 from bodyschema.recordings.store.store import PairStore
 
 log = logging.getLogger(__name__)
@@ -50,7 +50,7 @@ class ReconnectingSource(Generic[R_co]):
         self._forbidden, self._require = forbidden, require
         self._source, self._name, self._wall, self._sleep = source, name, wall, sleep
         self._opened = ExitStack()
-        self._wait_s = FIRST_WAIT_S
+        self._wait_s = Waits.first_s
         self._next_try = 0.0
         self._is_open = False
         self._refused = ""
@@ -91,7 +91,7 @@ class ReconnectingSource(Generic[R_co]):
             return None
         if seen is not None and self.trouble is not None:
             log.info("%s are back", self._name)
-            self.trouble, self._wait_s, self._refused = None, FIRST_WAIT_S, ""
+            self.trouble, self._wait_s, self._refused = None, Waits.first_s, ""
         return seen
 
     def _try_again(self, timeout_s: float) -> bool:
@@ -116,7 +116,7 @@ class ReconnectingSource(Generic[R_co]):
             log.warning("%s are lost: %s; trying to open them again", self._name, error)
             self.losses += 1
         else:
-            self._wait_s = min(2 * self._wait_s, LONGEST_WAIT_S)
+            self._wait_s = min(2 * self._wait_s, Waits.longest_s)
             # Problems that need a person are logged, each once.
             if not isinstance(error, SourceLost) and str(error) != self._refused:
                 self._refused = str(error)

@@ -22,7 +22,7 @@ from bodyschema.daemon.transport.wire import CommandReply, CommandRequest, decod
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import ConfigError, RequestError, SourceEnded
 from bodyschema.interfaces.records import FloatArray, JointReading, MarkerFix, MarkerMiss, Reason
-from bodyschema.interfaces.waits import READ_S, SILENT_AFTER_S, STATUS_EVERY_S
+from bodyschema.interfaces.waits import Waits
 from bodyschema.recordings.store.file import LOW_DISK_BYTES, disk_free
 from bodyschema.recordings.store.store import PairStore
 
@@ -202,7 +202,7 @@ class Sampler:
         while not self._stopping:
             self._tell_when_due()
             try:
-                seen = self._marker.read(READ_S)
+                seen = self._marker.read(Waits.read_s)
             except SourceEnded:
                 break
             self._check_sources()
@@ -226,7 +226,7 @@ class Sampler:
         log.info("the sources are through; %d pairs are in the store", self._seq)
         self._tell()
         while not (self._stopping or self._exit_at_end):
-            time.sleep(READ_S)
+            time.sleep(Waits.read_s)
             self._tell_when_due()
 
     def _take(self, seen: MarkerFix | MarkerMiss) -> Reason | None:
@@ -294,7 +294,7 @@ class Sampler:
         try:
             while not self._stopping:
                 self._service.beat("encoders")
-                reading = self._joints.read(READ_S)
+                reading = self._joints.read(Waits.read_s)
                 if reading is not None:
                     self._take_reading(reading)
                 elif self._joints.trouble is not None:
@@ -363,7 +363,7 @@ class Sampler:
             self._tell()
 
     def _tell(self) -> None:
-        self._next_status = self._wall.now() + STATUS_EVERY_S
+        self._next_status = self._wall.now() + Waits.status_every_s
         status = self.status()
         self._publish_status(encode(status))
         line = f"{status.state}, {status.pairs} pairs, {status.pairs_per_s:.1f}/s"
@@ -407,5 +407,5 @@ class Sampler:
         return [
             f"nothing has come from {name} for {now - since:.0f} s"
             for name, trouble, since in silent
-            if trouble is None and now - since > SILENT_AFTER_S
+            if trouble is None and now - since > Waits.silent_after_s
         ]

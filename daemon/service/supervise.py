@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 from bodyschema.daemon.service.signals import SERVING, with_parent
 from bodyschema.interfaces.errors import BodyschemaError
-from bodyschema.interfaces.waits import FIRST_WAIT_S, LONGEST_WAIT_S, POLL_S
+from bodyschema.interfaces.waits import Waits
 
 log = logging.getLogger(__name__)
 
@@ -34,7 +34,7 @@ class Child:
         self._pipe = -1
         self._started_at = 0.0
         self._start_at = 0.0
-        self._wait_s = FIRST_WAIT_S
+        self._wait_s = Waits.first_s
 
     def tend(self) -> None:
         """Start the process if it is not running and its waiting time is over.
@@ -48,8 +48,8 @@ class Child:
                 self._process, self._pipe = self._started()
                 self._started_at = now
             return
-        if now - self._started_at > LONGEST_WAIT_S:
-            self._wait_s = FIRST_WAIT_S
+        if now - self._started_at > Waits.longest_s:
+            self._wait_s = Waits.first_s
         code = self._process.poll()
         if code is not None:
             self._served = self._served or _has_line(self._pipe)
@@ -94,7 +94,7 @@ class Child:
         how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
         log.error("the %s %s; starting it again in %g s", self.name, how, self._wait_s)
         self._start_at = now + self._wait_s
-        self._wait_s = min(2 * self._wait_s, LONGEST_WAIT_S)
+        self._wait_s = min(2 * self._wait_s, Waits.longest_s)
 
 
 def _has_line(pipe: int) -> bool:
@@ -125,7 +125,7 @@ class Supervisor:
             while not self._stopping:
                 for child in self._children:
                     child.tend()
-                time.sleep(POLL_S)
+                time.sleep(Waits.poll_s)
         finally:
             for child in self._children:
                 child.end()

@@ -263,16 +263,15 @@ def position(name: str, values: Sequence[float]) -> FloatArray:
     """
     import numpy as np
 
-    from bodyschema.interfaces.records import FARTHEST_M
+    from bodyschema.interfaces.records import PairLimits
 
     x = np.array(values, dtype=np.float64)
     if not np.isfinite(x).all():
         raise RequestError(f"{name} is not finite")
     farthest = float(np.abs(x).max())
-    if farthest > FARTHEST_M:
-        raise RequestError(
-            f"{name} lies {farthest:.3g} m away; positions are in metres, at most {FARTHEST_M:.0f} on each axis"
-        )
+    if farthest > PairLimits.farthest_m:
+        most = f"at most {PairLimits.farthest_m:.0f} on each axis"
+        raise RequestError(f"{name} lies {farthest:.3g} m away; positions are in metres, {most}")
     return x
 
 
@@ -340,9 +339,9 @@ def _row_named(request: JointsRequest, row: int) -> str:
 def _require_angles(q: FloatArray, joints: tuple[str, ...], named: Callable[[int], str]) -> None:
     import numpy as np
 
-    from bodyschema.interfaces.records import LARGEST_Q
+    from bodyschema.interfaces.records import PairLimits
 
-    wrong = np.argwhere(~(np.abs(q) <= LARGEST_Q))
+    wrong = np.argwhere(~(np.abs(q) <= PairLimits.largest_q))
     if len(wrong) == 0:
         return
     row, column = wrong[0].tolist()

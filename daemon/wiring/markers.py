@@ -16,7 +16,7 @@ from bodyschema.daemon.sampler.reconnect import ReconnectingSource
 from bodyschema.interfaces.errors import ConfigError, SourceEnded
 from bodyschema.interfaces.protocols import Clock, StereoEyes
 from bodyschema.interfaces.records import ImageArray, Reason
-from bodyschema.interfaces.waits import READ_S
+from bodyschema.interfaces.waits import Waits
 from bodyschema.robot.hand_eye import HandEye
 from bodyschema.robot.rpy import pose_of
 from bodyschema.vision.calibration.image_pairs import Images, read_pairs
@@ -68,7 +68,7 @@ def moving_colour_table(eyes: StereoEyes, clock: Clock, seconds: float, tell: Ca
         began, next_t = clock.now(), -float("inf")
         tell(f"move the ball across the view for {seconds:g} s; keep the cameras still")
         while clock.now() - began < seconds:
-            frame = source.read(READ_S)
+            frame = source.read(Waits.read_s)
             if frame is not None and frame.t >= next_t:
                 next_t = frame.t + seconds / _Settings.images
                 shown.append(frame.left)

@@ -109,11 +109,7 @@ class Background:
         """Return True if an effect is a periodic drive error no larger than those of other drives."""
         if self.scales is None or not effect.kind.of_drive:
             return False
-        usual = (
-            self.scales.slides * BackgroundSettings.drive_m
-            if effect.prismatic
-            else self.scales.drives * BackgroundSettings.drive_rad
-        )
+        usual = (self.scales.slides if effect.prismatic else self.scales.drives) * _of_drive(effect)
         return float(np.linalg.norm(effect.values[effect.amounts])) < BackgroundSettings.like_others * usual
 
     @cached_property
@@ -177,7 +173,9 @@ def _groups(effect: Effect) -> np.ndarray:
 
 def _units(effect: Effect) -> FloatArray:
     if effect.kind.of_drive:
-        return np.full(
-            len(effect.amounts), BackgroundSettings.drive_m if effect.prismatic else BackgroundSettings.drive_rad
-        )
+        return np.full(len(effect.amounts), _of_drive(effect))
     return np.repeat([BackgroundSettings.length_m, BackgroundSettings.angle_rad], 3)
+
+
+def _of_drive(effect: Effect) -> float:
+    return BackgroundSettings.drive_m if effect.prismatic else BackgroundSettings.drive_rad

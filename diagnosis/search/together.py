@@ -117,10 +117,8 @@ def tolerated(fit: Fit) -> Tolerated:
 
 def is_at_limit(scales: Scales | None) -> bool:
     """Return True if tolerances of links or axes are at their upper limit."""
-    return (
-        scales is not None
-        and max(scales.lengths, scales.angles) > (1.0 - SetSettings.still) * BackgroundSettings.largest_scale
-    )
+    limit = (1.0 - SetSettings.still) * BackgroundSettings.largest_scale
+    return scales is not None and max(scales.lengths, scales.angles) > limit
 
 
 def beyond_tolerances(fit: Fit, cause: Effect, doubt: float) -> bool | None:

@@ -19,7 +19,7 @@ from bodyschema.drivers.ros2.senders import Refusal, Sender
 from bodyschema.interfaces.errors import SourceError
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import FloatArray, MarkerFix, MarkerMiss, Reason, frozen_array
-from bodyschema.interfaces.waits import POLL_S, RIVAL_AFTER_S, SILENT_AFTER_S
+from bodyschema.interfaces.waits import Waits
 
 
 class _Settings:
@@ -166,7 +166,7 @@ class MarkerStream:
             packet = self._receiver.receive(deadline)
             if packet is None:
                 # Find out once why nothing arrives; this may take a second.
-                if self._silence is None and self._clock.now() - self._heard > SILENT_AFTER_S:
+                if self._silence is None and self._clock.now() - self._heard > Waits.silent_after_s:
                     self._silence = self._receiver.silence()
                 return None
             self._take(packet)
@@ -240,7 +240,7 @@ class MarkerStream:
 
     def _require_one_sender(self, packet: Packet) -> None:
         if packet.sender != self._sender:
-            if packet.arrived - self._sender_heard < RIVAL_AFTER_S:
+            if packet.arrived - self._sender_heard < Waits.rival_after_s:
                 raise Unusable(Fault.RIVAL, f"{packet.sender} beside {self._sender}")
             if self._sender is not None:
                 self._clock_of = Sender(self._table.max_delay_s)
@@ -258,7 +258,7 @@ class MarkerStream:
                 raise Unusable(Fault.OTHER_BODY, f"{report.body!r}, not {str(self._table.body)!r}")
             return
         self._bodies[report.body] = arrived
-        there = sorted(name for name, t in self._bodies.items() if arrived - t < SILENT_AFTER_S)
+        there = sorted(name for name, t in self._bodies.items() if arrived - t < Waits.silent_after_s)
         if len(there) > 1:
             raise Unusable(Fault.SEVERAL_BODIES, ", ".join(there))
 
@@ -388,9 +388,9 @@ def stream_checks(stream: MarkerStream, clock: Clock, read_s: float = _Settings.
     try:
         with stream:
             fixes: list[MarkerFix] = []
-            end = clock.now() + max(read_s, SILENT_AFTER_S + POLL_S)
+            end = clock.now() + max(read_s, Waits.silent_after_s + Waits.poll_s)
             while clock.now() < end:
-                seen = stream.read(POLL_S)
+                seen = stream.read(Waits.poll_s)
                 if isinstance(seen, MarkerFix):
                     fixes.append(seen)
             complaints = stream.health
@@ -409,7 +409,7 @@ def stream_checks(stream: MarkerStream, clock: Clock, read_s: float = _Settings.
 
 def _of_fixes(subject: str, fixes: list[MarkerFix]) -> Iterator[Check]:
     last = fixes[-1]
-    rate = (len(fixes) - 1) / max(last.t - fixes[0].t, POLL_S)
+    rate = (len(fixes) - 1) / max(last.t - fixes[0].t, Waits.poll_s)
     place = ", ".join(f"{1e3 * value:.1f}" for value in last.x)
     sigma = 1e3 * float(np.sqrt(np.linalg.eigvalsh(last.cov)[-1]))
     said = f"{rate:.0f} positions/s, last at ({place}) mm ± {sigma:.2g} mm, time known to {1e3 * last.t_sigma:.1f} ms"

@@ -22,7 +22,7 @@ from bodyschema.drivers.turns import FASTEST_M_S, FASTEST_RAD_S
 from bodyschema.interfaces.errors import SourceError, SourceLost
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import JointReading, frozen_array
-from bodyschema.interfaces.waits import POLL_S, RIVAL_AFTER_S, SILENT_AFTER_S
+from bodyschema.interfaces.waits import Waits
 
 
 class _Settings:
@@ -317,7 +317,7 @@ class Ros2Joints:
     def _told(self, who: Who, message: JointState, places: Sequence[int], arrived: float) -> float | Refusal:
         """Return the time of the message's positions [s], or the reason to reject it."""
         owners = [owner for place in places if (owner := self._owners[place]) is not None]
-        if any(owner != who and arrived - heard < RIVAL_AFTER_S for owner, heard in owners):
+        if any(owner != who and arrived - heard < Waits.rival_after_s for owner, heard in owners):
             return Refusal.RIVAL
         if len(set(message.names)) < len(message.names):
             return Refusal.TWICE
@@ -356,7 +356,7 @@ class Ros2Joints:
 
     def _complain(self, link: Link) -> None:
         """Report once why there are no readings."""
-        if self._complaint is not None or self._clock.now() - self._read_at < SILENT_AFTER_S:
+        if self._complaint is not None or self._clock.now() - self._read_at < Waits.silent_after_s:
             return
         missing = [self._wanted[place] for place in self._merging.missing()]
         self._complaint = silence(self._config, missing, self._names, self._lately, link.tokens)
@@ -403,9 +403,9 @@ def joint_state_checks(
 
 def _begins(robot: Ros2Joints, clock: Clock) -> bool:
     """Return True if a reading arrives before the robot counts as silent."""
-    end = clock.now() + SILENT_AFTER_S + POLL_S
+    end = clock.now() + Waits.silent_after_s + Waits.poll_s
     while clock.now() < end:
-        if robot.read(POLL_S) is not None:
+        if robot.read(Waits.poll_s) is not None:
             return True
     return False
 

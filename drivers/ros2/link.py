@@ -13,7 +13,7 @@ import zenoh
 
 from bodyschema.interfaces.errors import SourceLost
 from bodyschema.interfaces.protocols import Clock
-from bodyschema.interfaces.waits import POLL_S
+from bodyschema.interfaces.waits import Waits
 
 from . import rmw
 from .config import Ros2Config
@@ -111,9 +111,9 @@ class ZenohLink:
         while True:
             left = until - self._clock.now()
             try:
-                return self._waiting.get(timeout=min(max(left, 0.0), POLL_S))
+                return self._waiting.get(timeout=min(max(left, 0.0), Waits.poll_s))
             except queue.Empty:
-                if left <= POLL_S or not self.is_connected:
+                if left <= Waits.poll_s or not self.is_connected:
                     return None
 
     def tokens(self) -> Sequence[str]:

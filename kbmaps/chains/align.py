@@ -349,9 +349,8 @@ def _robust_mean(offsets: FloatArray, sigma: float) -> FloatArray:
         distances = np.linalg.norm(offsets - centre, axis=1)
         # An offset always explains a single pair.
         spread = max(middle_sigma(distances, len(distances) // 2 + 1), sigma)
-        mean = offsets[distances <= RobustSettings.rounding_m + RobustSettings.uncalibrated_sigmas * spread].mean(
-            axis=0
-        )
+        near = distances <= RobustSettings.rounding_m + RobustSettings.uncalibrated_sigmas * spread
+        mean = offsets[near].mean(axis=0)
         if (mean == centre).all():
             break
         centre = mean

@@ -109,9 +109,8 @@ class _Fitter:
         for k in range(_Settings.steps):
             reach = max(_Settings.first_reach * 0.5**k, _Settings.least_reach)
             distances = state.distances[active]
-            sigma = np.maximum(
-                np.partition(distances, self._middle)[:, self._middle] / MEDIAN_NORM, RobustSettings.rounding_m
-            )
+            sigma = np.partition(distances, self._middle)[:, self._middle] / MEDIAN_NORM
+            sigma = np.maximum(sigma, RobustSettings.rounding_m)
             scale = np.square(reach * sigma)[:, None]
             weights = np.repeat(np.square(scale / (scale + np.square(distances))), 3, axis=1) / sigma[:, None] ** 2
             tried = self._moved(state, active, self._step(state, active, weights, damping[active]))

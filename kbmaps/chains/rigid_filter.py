@@ -157,13 +157,8 @@ class RigidFilter:
         scales = np.zeros(self.parameters.size)
         scales[self._active] = self._scales
         of_steps = [FilterSettings.iterations, FilterSettings.small_bend, _GATE]
-        constants = [
-            *of_steps,
-            FilterSettings.noise_memory,
-            FilterSettings.least_noise_m**2,
-            RotationSettings.small_rad,
-            self._reach,
-        ]
+        of_noise = [FilterSettings.noise_memory, FilterSettings.least_noise_m**2]
+        constants = [*of_steps, *of_noise, RotationSettings.small_rad, self._reach]
         return filter_kernel(
             *self.parameters.tables, scales, self.parameters.turning.astype(np.float64), np.array(constants)
         )

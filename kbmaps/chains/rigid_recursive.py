@@ -364,7 +364,6 @@ class RecursiveRigidLearner(Model):
         if self._window.finds_noise:
             self._filter.noise_square = max(fit.noise, FilterSettings.least_noise_m) ** 2
             coordinates = fit.freedom + self._window.noise.coordinates
-            self._filter.noise_coordinates = float(
-                np.clip(coordinates, FilterSettings.noise_coordinates, FilterSettings.noise_memory)
-            )
+            fewest, most = FilterSettings.noise_coordinates, FilterSettings.noise_memory
+            self._filter.noise_coordinates = float(np.clip(coordinates, fewest, most))
         return fit

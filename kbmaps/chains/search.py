@@ -252,11 +252,8 @@ def find_chain(
     size = float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).mean())
     if not size > RobustSettings.rounding_m:
         raise DegenerateDataError("all positions lie in one place; record pairs that spread out")
-    enough = max(
-        RobustSettings.rounding_m,
-        _Settings.explained * (sigma or 0.0) * math.sqrt(max(3.0 - unknowns / len(angles), 0.0)),
-    )
-    return _best_of(angles, positions, slides, size, rng, starts, enough)
+    enough = _Settings.explained * (sigma or 0.0) * math.sqrt(max(3.0 - unknowns / len(angles), 0.0))
+    return _best_of(angles, positions, slides, size, rng, starts, max(RobustSettings.rounding_m, enough))
 
 
 def _best_of(

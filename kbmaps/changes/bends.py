@@ -167,10 +167,8 @@ def _chosen(runs: Runs, k: int, logs: FloatArray) -> Bends:
     values, axes = runs.axes[k]
     probable = np.flatnonzero(logs > np.log(BendSettings.least))
     every = _weights(k, values)[0]
-    weights, priors = (
-        every[probable % len(every)],
-        np.concatenate([_prior(runs, k, turn) for turn in BendSettings.turns]),
-    )
+    weights = every[probable % len(every)]
+    priors = np.concatenate([_prior(runs, k, turn) for turn in BendSettings.turns])
     turned = np.tensordot(axes.T, runs.rows[..., :-1], axes=1)
     known = np.empty((len(probable), turned.shape[2], turned.shape[0] * 3))
     for h, (prior, weight) in enumerate(zip(priors[probable], weights, strict=True)):

@@ -213,12 +213,11 @@ def slopes(model: Predictor, q: ArrayLike, bases: Sequence[JointBasis]) -> Float
     form; likewise with 2 h for a prismatic joint.
     """
     angles = rows_or_vector("q", q, len(bases))
-    steps = _Settings.slope_step * np.eye(len(bases))
+    step = _Settings.slope_step
+    steps = step * np.eye(len(bases))
     flat = angles.reshape(-1, 1, len(bases))
     ahead, behind = (model.predict((flat + way * steps).reshape(-1, len(bases))) for way in (1.0, -1.0))
-    lengths = np.array(
-        [2.0 * (_Settings.slope_step if basis.is_prismatic else math.sin(_Settings.slope_step)) for basis in bases]
-    )
+    lengths = np.array([2.0 * (step if basis.is_prismatic else math.sin(step)) for basis in bases])
     columns = (ahead - behind).reshape(len(flat), len(bases), 3) / lengths[:, None]
     return columns.swapaxes(1, 2).reshape(*angles.shape[:-1], 3, len(bases))
 

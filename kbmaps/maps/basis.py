@@ -56,11 +56,8 @@ class Terms(NamedTuple):
 def _bernstein(alpha: float, centre: float) -> Terms:
     if not 0.0 < alpha < math.pi:
         raise BasisError(f"alpha must lie between 0 and 180 deg, got {math.degrees(alpha):.6g} deg")
-    if (
-        BasisSettings.singular_alpha_rad[0] - _ANGLE_ROUNDING
-        <= alpha
-        <= BasisSettings.singular_alpha_rad[1] + _ANGLE_ROUNDING
-    ):
+    least, most = BasisSettings.singular_alpha_rad
+    if least - _ANGLE_ROUNDING <= alpha <= most + _ANGLE_ROUNDING:
         raise SingularAlphaError(math.degrees(alpha))
     # u = sin((θ−α)/2)/sin α and v = sin((θ+α)/2)/sin α give w = (u², −2 cos α·u·v, v²), which equals the
     # normalised weights of Ulbrich et al. 2009, eqs. (9)-(10) with γ = cos α.

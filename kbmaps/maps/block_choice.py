@@ -37,9 +37,8 @@ def follow_a_path(prior: KBMap, q: ArrayLike) -> bool:
     left, right = BasisStack(prior.bases).halves(rows("q", q, len(prior.bases)))
     square = (left * left).sum(axis=1) * (right * right).sum(axis=1)
     inner = (left[:-1] * left[1:]).sum(axis=1) * (right[:-1] * right[1:]).sum(axis=1)
-    return bool(len(inner)) and bool(
-        np.median(inner / np.sqrt(square[:-1] * square[1:])) > BlockSettings.path_correlation
-    )
+    correlations = inner / np.sqrt(square[:-1] * square[1:])
+    return bool(len(inner)) and bool(np.median(correlations) > BlockSettings.path_correlation)
 
 
 def blockwise_precision(prior: KBMap, q: ArrayLike, x: ArrayLike) -> float:

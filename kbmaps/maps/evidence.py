@@ -63,12 +63,8 @@ class LinearEvidence:
         mean = (self.unreached + float(np.square(self.along).sum())) / self.count
         if not len(self.eigenvalues):
             return max(mean, RobustSettings.variance_floor)
-        middle, low, high = (
-            max(mean, RobustSettings.variance_floor),
-            _Settings.least_share * mean,
-            _Settings.greatest_share * mean,
-        )
-        low, high = max(low, RobustSettings.variance_floor), max(high, RobustSettings.variance_floor)
+        tried = mean, _Settings.least_share * mean, _Settings.greatest_share * mean
+        middle, low, high = (max(variance, RobustSettings.variance_floor) for variance in tried)
         for _ in range(_Settings.rounds):
             grid = np.geomspace(low, high, _Settings.points)
             best = int(self.at(grid).argmax())

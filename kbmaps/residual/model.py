@@ -128,10 +128,8 @@ class ResidualModel:
         angles = rows_or_vector("q", q, self.joints)
         if not self.weights:
             return self.chain.jacobian(angles)
-        around = (
-            np.atleast_2d(angles)[:, None, None]
-            + _Settings.slope_step * _STENCIL[:, None] * np.eye(self.joints)[:, None]
-        )
+        steps = _Settings.slope_step * _STENCIL[:, None] * np.eye(self.joints)[:, None]
+        around = np.atleast_2d(angles)[:, None, None] + steps
         x = self.features.positions(self.chain, self.weights, around.reshape(-1, self.joints))
         x = x.reshape(*around.shape[:3], 3)
         slopes = np.einsum("njsi,s->nij", x, _SLOPES / _Settings.slope_step)

@@ -451,10 +451,8 @@ class TensorLearner(Model):
         if before is None or (self._searches and self.kept < _Settings.searches_until * self.pairs_needed):
             return search(data, self._prior, self.bases, rng, self.settings.starts, robust=robust)
         fit = refine(data, self._prior, before.z, before.noise, robust=robust)
-        lost = (
-            fit.noise > _Settings.lost * max(before.noise, data.noise_floor)
-            or fit.noise > SearchSettings.plausible * data.size
-        )
+        most = min(_Settings.lost * max(before.noise, data.noise_floor), SearchSettings.plausible * data.size)
+        lost = fit.noise > most
         if self._searches and lost:
             again = search(data, self._prior, self.bases, rng, self.settings.starts, robust=robust)
             fit = min(fit, again, key=lambda candidate: candidate.noise)

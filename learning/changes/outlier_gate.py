@@ -71,9 +71,8 @@ def sound(distances_m: FloatArray, noise_m: float) -> NDArray[np.bool_]:
         noise_m: RMS distance between measurement and truth.
     """
     rms = math.sqrt(3.0) * MEDIAN_TO_SIGMA * float(np.median(distances_m))
-    return np.asarray(
-        distances_m <= OutlierSettings.times_farther * max(math.hypot(rms, noise_m), OutlierSettings.smallest_m)
-    )
+    expected_m = max(math.hypot(rms, noise_m), OutlierSettings.smallest_m)
+    return np.asarray(distances_m <= OutlierSettings.times_farther * expected_m)
 
 
 def explained(before_m: FloatArray, after_m: FloatArray, expected_m: float) -> bool:

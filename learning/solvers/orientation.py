@@ -75,11 +75,8 @@ class OrientationSolver:
         self._turns = np.vstack([self._turns, turns[told]])
         if self._exact is not None:
             self._feed(self._exact)
-        self._q, self._x, self._turns = (
-            self._q[-BatchSettings.kept :],
-            self._x[-BatchSettings.kept :],
-            self._turns[-BatchSettings.kept :],
-        )
+        kept = BatchSettings.kept
+        self._q, self._x, self._turns = self._q[-kept:], self._x[-kept:], self._turns[-kept:]
 
     def solve(self, belief: ChainBelief) -> OrientationSolution:
         """Return the solution around the posterior of the chain; at least one orientation is required."""

@@ -48,10 +48,8 @@ def workmanship(belief: ChainBelief, tolerances: ChainTolerances, q: FloatArray)
         The probable candidates, the narrowest last.
     """
     q = q[evenly_spread(len(q), ToleranceSettings.compared_pairs)]
-    candidates = [
-        tolerances,
-        *(each for made in reversed(ToleranceSettings.workmanship) for each in _narrower(tolerances, *made)),
-    ]
+    order = reversed(ToleranceSettings.workmanship)
+    candidates = [tolerances, *(each for made in order for each in _narrower(tolerances, *made))]
     narrowed = [belief.tightened(tolerances, each) for each in candidates]
     lost = _lost_in_the_curve(belief, [found for found, _ in narrowed], q)
     kept, shares = probable(np.array([evidence for _, evidence in narrowed]) - lost)

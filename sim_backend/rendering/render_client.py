@@ -16,7 +16,7 @@ from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.errors import SourceLost
 from bodyschema.interfaces.interpreter import module_command
 from bodyschema.interfaces.records import ImageArray
-from bodyschema.interfaces.waits import END_LIMIT_S
+from bodyschema.interfaces.waits import Waits
 from bodyschema.sim_backend.bullet import PhysicsUrdf
 from bodyschema.sim_backend.config import SimConfig
 from bodyschema.sim_backend.truth import TrueRobot
@@ -115,7 +115,7 @@ class RenderProcess:
 
     def _end(self) -> None:
         try:
-            self.process.wait(END_LIMIT_S)
+            self.process.wait(Waits.end_limit_s)
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()

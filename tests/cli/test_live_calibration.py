@@ -70,7 +70,7 @@ def views() -> list[View]:
 
 @pytest.fixture
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bodyschema.daemon.sampler.reconnect.FIRST_WAIT_S", 0.0)
+    monkeypatch.setattr("bodyschema.interfaces.waits.Waits.first_s", 0.0)
 
 
 def held(views: list[View], places: Iterable[int] | None = None) -> tuple[LiveViews, list[StereoFrame]]:

@@ -101,7 +101,7 @@ def test_extrapolated_position_is_published_only_with_sigma(has_sigma) -> None:
 
 
 def test_a_robot_that_comes_later_is_waited_for(monkeypatch) -> None:
-    monkeypatch.setattr("bodyschema.daemon.learner.answers.RETRY_S", 0.0)
+    monkeypatch.setattr("bodyschema.interfaces.waits.Waits.retry_s", 0.0)
     topic = Topic(absent=3)
     readings = [JointReading(t, frozen_array([0.1, 0.2])) for t in (1.0, 2.0)]
     expected = ExpectedMarker(Joints(readings, ("a", "b")), topic, Model, SystemClock())

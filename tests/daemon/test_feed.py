@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from guided_arm import STORE, Scene, make_pair, new_learning
 
-from bodyschema.daemon.learner.feed import RETRY_S, FeedSettings, PairFeed
+from bodyschema.daemon.learner.feed import FeedSettings, PairFeed
 from bodyschema.daemon.sampler.history import Page, read_page
 from bodyschema.daemon.transport.wire import PairMessage, PairsReply, encode, pair_to_wire
 from bodyschema.interfaces.errors import BusError, RequestError
 from bodyschema.interfaces.records import Pair
+from bodyschema.interfaces.waits import Waits
 from bodyschema.learning.online_learner import OnlineLearner
 
 PAGE = 7
@@ -78,7 +79,7 @@ class Fed:
     def settle(self) -> None:
         """Take all that has been offered, and what is behind."""
         for _ in range(self._offered + SPARE_STEPS):
-            self.clock.time += RETRY_S
+            self.clock.time += Waits.retry_s
             self.feed.step(0.0)
         self._offered = 0
 
@@ -149,7 +150,7 @@ def test_unanswered_feed_retries_and_catches_up() -> None:
     fed = Fed(stored=10)
     fed.history.answers = False
     fed.feed.step(0.0)
-    fed.clock.time += RETRY_S
+    fed.clock.time += Waits.retry_s
     fed.feed.step(0.0)
     assert (fed.history.asked, fed.learnt) == (2, (0, 0))
     fed.history.answers = True

@@ -177,7 +177,7 @@ def test_encoders_of_other_joints_are_refused(config) -> None:
 @pytest.fixture
 def impatient(monkeypatch) -> None:
     """Reopen lost sources at once."""
-    monkeypatch.setattr("bodyschema.daemon.sampler.reconnect.FIRST_WAIT_S", 0.0)
+    monkeypatch.setattr("bodyschema.interfaces.waits.Waits.first_s", 0.0)
 
 
 def test_reopened_camera_starts_new_segment(config, impatient) -> None:
@@ -426,7 +426,7 @@ def test_picture_is_served_after_first_frame(config) -> None:
 
 
 def test_silent_sources_are_reported(config, monkeypatch) -> None:
-    monkeypatch.setattr("bodyschema.daemon.sampler.sampler.SILENT_AFTER_S", 0.0)
+    monkeypatch.setattr("bodyschema.interfaces.waits.Waits.silent_after_s", 0.0)
     held = threading.Event()
     sources = Sources(Scripted([held], config.robot.joints), Scripted([held]), SystemClock())
     with running(config, sources) as bus:

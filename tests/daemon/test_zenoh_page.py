@@ -31,7 +31,7 @@ from bodyschema.daemon.transport.session import ZenohSession, client
 from bodyschema.daemon.transport.wire import MSGPACK, IkReply, IkRequest, JointsRequest, PredictReply, decode, encode
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import RequestError
-from bodyschema.interfaces.records import FARTHEST_M, Reason
+from bodyschema.interfaces.records import PairLimits, Reason
 from bodyschema.learning.state import MOST_POINTS
 from bodyschema.recordings.store.store import PairStore
 from bodyschema.robot.hand_eye import MarkerPose
@@ -82,7 +82,7 @@ def test_the_page_s_limits_are_the_code_s() -> None:
     assert f"| rows in a request | {wire.LARGEST_BATCH:,} |" in limits
     assert f"| pairs in a reply | {history.LARGEST_REPLY} |" in limits
     assert f"| points of the learning curve | {MOST_POINTS} |" in limits
-    assert f"| within {FARTHEST_M:.0f} m, else" in limits
+    assert f"| within {PairLimits.farthest_m:.0f} m, else" in limits
 
 
 # --- against a running learner

@@ -103,7 +103,7 @@ def test_taken_port_is_reported() -> None:
 
 
 def test_doctor_tells_rate_place_and_silence(monkeypatch) -> None:
-    monkeypatch.setattr("bodyschema.drivers.markers.stream.SILENT_AFTER_S", 0.3)
+    monkeypatch.setattr("bodyschema.interfaces.waits.Waits.silent_after_s", 0.3)
     port, seq = free_udp_port(), iter(range(10**6))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
 

@@ -160,7 +160,7 @@ def test_missing_size_is_named_with_those_there(device) -> None:
 
 @SDK
 def test_silent_device_is_lost(device, monkeypatch) -> None:
-    monkeypatch.setattr("bodyschema.vision.cameras.realsense.SILENT_AFTER_S", 0.1)
+    monkeypatch.setattr("bodyschema.interfaces.waits.Waits.silent_after_s", 0.1)
     with device.camera() as camera, pytest.raises(SourceLost, match="sends no images"):
         camera.read(0.3)
 

@@ -17,7 +17,7 @@ from bodyschema.interfaces.camera import StereoCalibration
 from bodyschema.interfaces.errors import ConfigError, SourceError, SourceLost
 from bodyschema.interfaces.protocols import Clock
 from bodyschema.interfaces.records import ImageArray, StereoFrame
-from bodyschema.interfaces.waits import SILENT_AFTER_S
+from bodyschema.interfaces.waits import Waits
 
 from .config import CamerasConfig, RealsenseConfig
 from .stamps import Stamps
@@ -167,7 +167,7 @@ class RealsenseCamera:
                 frame = self._whole(image, now)
                 if frame is not None:
                     return frame
-            elif now - self._heard > SILENT_AFTER_S:
+            elif now - self._heard > Waits.silent_after_s:
                 raise SourceLost(
                     f"the RealSense {self._serial} sends no images. Is it plugged in?",
                     brief=f"the RealSense {self._serial} sends no images",

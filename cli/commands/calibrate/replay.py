@@ -24,7 +24,7 @@ from bodyschema.cli.commands.options import (
     robot_file,
 )
 from bodyschema.interfaces.errors import RecordingError
-from bodyschema.interfaces.waits import LINE_EVERY_S
+from bodyschema.interfaces.waits import Waits
 
 if TYPE_CHECKING:
     from bodyschema.daemon.transport.status import LearnerStatus, SamplerStatus
@@ -130,11 +130,11 @@ def _progress(console: Console) -> Iterator[Callable[[SamplerStatus, LearnerStat
         with console.status("starting sampler and learner") as status:
             yield lambda sampler, learner: status.update(_line(sampler, learner))
         return
-    last = -LINE_EVERY_S
+    last = -Waits.line_every_s
 
     def show(sampler: SamplerStatus, learner: LearnerStatus) -> None:
         nonlocal last
-        if time.monotonic() - last >= LINE_EVERY_S:
+        if time.monotonic() - last >= Waits.line_every_s:
             last = time.monotonic()
             console.print(_line(sampler, learner), soft_wrap=True)
 

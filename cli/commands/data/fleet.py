@@ -15,7 +15,7 @@ from rich.live import Live
 
 from bodyschema.cli.commands.options import ANYTHING, HERE, VARIABLE, SearchOptions, flag, print_json, say, several
 from bodyschema.interfaces.errors import BusError, RequestError
-from bodyschema.interfaces.waits import STATUS_EVERY_S
+from bodyschema.interfaces.waits import Waits
 
 if TYPE_CHECKING:
     from bodyschema.cli.recordings.diagnosis import Asked
@@ -101,7 +101,7 @@ def _list(looked_at: list[Place], *, watch: bool, json: bool) -> None:
             with Live(console=console, auto_refresh=False, screen=console.is_terminal) as live:
                 while True:
                     live.update(screen(robots.look(), robots.unreached), refresh=True)
-                    time.sleep(STATUS_EVERY_S)
+                    time.sleep(Waits.status_every_s)
         while True:
             members = robots.look()
             if json:
@@ -111,7 +111,7 @@ def _list(looked_at: list[Place], *, watch: bool, json: bool) -> None:
                 console.print(screen(members, robots.unreached))
             if not watch:
                 break
-            time.sleep(STATUS_EVERY_S)
+            time.sleep(Waits.status_every_s)
     if not any(member.alive for member in members):
         _nobody(looked_at)
 

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from bodyschema.cli.commands.options import HERE, RobotFile, flag, say, several
 from bodyschema.daemon.service.signals import on_termination
-from bodyschema.interfaces.waits import POLL_S
+from bodyschema.interfaces.waits import Waits
 
 if TYPE_CHECKING:
     from bodyschema.cli.hardware.bench_run import BenchRun
@@ -73,4 +73,4 @@ def _look_on(run: BenchRun, console: Console) -> None:
                 console.print(said, markup=False)
             if run.count:
                 status.update(f"{run.count:,} {run.unit}")
-            time.sleep(POLL_S)
+            time.sleep(Waits.poll_s)

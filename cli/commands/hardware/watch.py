@@ -17,7 +17,7 @@ from bodyschema.cli.commands.options import HERE, RobotFile, flag, say
 from bodyschema.daemon.service.signals import SignalFlags, on_termination
 from bodyschema.interfaces.clock import SystemClock
 from bodyschema.interfaces.errors import SourceError
-from bodyschema.interfaces.waits import LINE_EVERY_S, POLL_S, STATUS_EVERY_S
+from bodyschema.interfaces.waits import Waits
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -116,7 +116,7 @@ def _joints(robot: Path, *, once: bool, json: bool, zero_force: bool) -> None:
             )
         else:
             with Live(screen(seen), console=console, auto_refresh=False, screen=True) as live:
-                _follow(watch, flags, POLL_S, lambda now: live.update(screen(now), refresh=True))
+                _follow(watch, flags, Waits.poll_s, lambda now: live.update(screen(now), refresh=True))
 
 
 def _cameras(robot: Path, out: Path | None, port: int, every: float, count: int | None) -> None:
@@ -136,10 +136,10 @@ def _cameras(robot: Path, out: Path | None, port: int, every: float, count: int 
             say("nothing says how the cameras see: the images as they come. `bodyschema calibrate cameras`")
         stack.enter_context(watched.camera)
         stack.enter_context(on_termination(watching.stop))
-        tell_at = time.monotonic() + LINE_EVERY_S
+        tell_at = time.monotonic() + Waits.line_every_s
         while watching.step(_Settings.read_s):
             if time.monotonic() >= tell_at:
-                tell_at = time.monotonic() + LINE_EVERY_S
+                tell_at = time.monotonic() + Waits.line_every_s
                 say(watched.camera.said, *watched.eyes.health)
     say(watched.camera.said, *watched.eyes.health)
 
@@ -160,7 +160,7 @@ def _marker(robot: Path, seconds: float | None) -> None:
         stack.enter_context(on_termination(flags.end))
         end = clock.now() + (float("inf") if seconds is None else seconds)
         while not flags.ending and clock.now() < end:
-            tell_at = min(clock.now() + STATUS_EVERY_S, end)
+            tell_at = min(clock.now() + Waits.status_every_s, end)
             while clock.now() < tell_at and not flags.ending:
                 for each in watches:
                     each.read(_Settings.read_s / 10)

@@ -17,7 +17,7 @@ from bodyschema.cli.commands.options import HERE, RobotFile, flag, say
 from bodyschema.daemon.service.signals import with_parent
 from bodyschema.interfaces.extras import require_extra
 from bodyschema.interfaces.interpreter import end, module_command
-from bodyschema.interfaces.waits import END_LIMIT_S
+from bodyschema.interfaces.waits import Waits
 
 log = logging.getLogger(__name__)
 
@@ -35,7 +35,7 @@ def shown(robot_file: Path, port: int = PORT) -> Iterator[subprocess.Popen[bytes
     try:
         yield process
     finally:
-        code = end(process, END_LIMIT_S)
+        code = end(process, Waits.end_limit_s)
         if code > 0:
             log.warning("the page had ended with exit code %d; its message is above", code)
 

@@ -12,7 +12,7 @@ from bodyschema.drivers.serial_lines.lines import SEQUENCES, STAMP_S, STAMPS, VE
 from bodyschema.interfaces.errors import BodyschemaError
 from bodyschema.interfaces.protocols import JointSource
 from bodyschema.interfaces.records import JointReading
-from bodyschema.interfaces.waits import POLL_S
+from bodyschema.interfaces.waits import Waits
 
 HEADER_EVERY_S = 1.0
 
@@ -131,7 +131,7 @@ class Listener:
     def _listen(self) -> None:
         try:
             while not self._stop.is_set():
-                reading = self._source.read(POLL_S)
+                reading = self._source.read(Waits.poll_s)
                 if reading is not None:
                     with self._told:
                         self._newest = reading
