@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from effect_arms import SLIDE, STEREO, arm, everywhere, sized, walk
+from effect_arms import SLIDE, arm, everywhere, sized, walk
 from hypothesis import given
 from hypothesis import strategies as st
 
