@@ -209,12 +209,14 @@ def test_a_letter_among_the_joint_angles_is_named(robot) -> None:
 @pytest.mark.parametrize("process", ["sampler", "learner"])
 def test_port_in_use_error_names_endpoint_and_fix(robot, process) -> None:
     endpoint = getattr(Config.load(robot, {}).tables.zenoh, process)
+    before = sorted(robot.parent.rglob("*"))
     with ZenohSession(listen=endpoint):
         said = refused("run", process, cwd=robot.parent)
     assert said == (
         f"the port of {endpoint} is in use. Stop the other bodyschema, "
         "or give another endpoint in the table [zenoh] of robot.toml"
     )
+    assert sorted(robot.parent.rglob("*")) == before
 
 
 @pytest.mark.parametrize(

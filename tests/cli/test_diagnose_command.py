@@ -313,8 +313,9 @@ def test_unknown_effect_error_suggests_nearest_known_effect(file, option) -> Non
     assert "Did you mean 'joint_offset'?" in line
 
 
-def test_outliers_cannot_be_excluded_from_the_search(file) -> None:
-    assert "always looked for" in refused(file, "--robot", DESK_ARM, "--exclude", "outliers")
+@pytest.mark.parametrize("option", ["--effects", "--exclude"])
+def test_outliers_cannot_be_named_as_an_effect(file, option) -> None:
+    assert "always looked for" in refused(file, "--robot", DESK_ARM, option, "outliers")
 
 
 def test_nan_in_recording_error_names_line_and_column(file, tmp_path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import re
 
 import pytest
@@ -53,8 +54,10 @@ def test_without_yes_it_asks(tmp_path, monkeypatch, answer, written) -> None:
 
 def test_existing_udev_rules_are_left_unchanged(tmp_path, capsys) -> None:
     install("--yes", "--root", tmp_path)
+    os.utime(tmp_path / FILE, (0, 0))
     install("--root", tmp_path)
     assert "there already" in capsys.readouterr().out
+    assert ((tmp_path / FILE).read_text(), (tmp_path / FILE).stat().st_mtime) == (rules(), 0)
 
 
 def test_uninstall_removes_the_file(tmp_path, capsys) -> None:

@@ -124,13 +124,18 @@ def test_uninstall_removes_the_learner_of_several(tmp_path, robots) -> None:
 # --- the router
 
 
-def test_router_unit_runs_and_mounts_its_file(tmp_path, router_file) -> None:
-    install("router", router_file, "--user", "daemon", "--yes", "--root", tmp_path)
+def test_router_unit_mounts_its_file_and_certificates(tmp_path, router_file, hidden_folder) -> None:
+    file = hidden_folder / "elsewhere" / "router.toml"
+    file.parent.mkdir()
+    text, certificates = re.subn(r'"(\S+\.(?:pem|key))"', rf'"{router_file.parent}/\1"', router_file.read_text("utf-8"))
+    file.write_text(text, encoding="utf-8")
+    install("router", file, "--user", "daemon", "--yes", "--root", tmp_path)
     unit = (tmp_path / FOLDER / "bodyschema-router.service").read_text("utf-8")
-    assert values(unit, "ExecStart")[0].endswith(f"router {router_file}")
+    assert values(unit, "ExecStart")[0].endswith(f"router {file}")
     assert values(unit, "User") == ["daemon"]
-    seen = (Path(value.removeprefix("-")) for value in values(unit, "BindReadOnlyPaths"))
-    assert any(router_file.is_relative_to(folder) for folder in seen)
+    seen = [Path(value.removeprefix("-")) for value in values(unit, "BindReadOnlyPaths")]
+    assert certificates == 3
+    assert {file.parent, router_file.parent} <= set(seen)
 
 
 @analyze

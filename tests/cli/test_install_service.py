@@ -220,9 +220,14 @@ def test_installing_makes_the_state_dir(tmp_path, robot) -> None:
 
 
 def test_existing_units_are_left_unchanged(tmp_path, robot, capsys) -> None:
-    for _ in range(2):
-        install("--robot", robot, "--user", "daemon", "--yes", "--root", tmp_path)
+    install("--robot", robot, "--user", "daemon", "--yes", "--root", tmp_path)
+    units = [file for file in (tmp_path / FOLDER).rglob("*") if file.is_file()]
+    assert len(units) >= len(PROCESSES)
+    for file in units:
+        os.utime(file, (0, 0))
+    install("--robot", robot, "--user", "daemon", "--yes", "--root", tmp_path)
     assert "All of it is there already" in capsys.readouterr().out
+    assert {file.stat().st_mtime for file in units} == {0}
 
 
 def test_uninstall_leaves_what_other_robots_need(tmp_path, robot, config) -> None:

@@ -241,7 +241,8 @@ def test_real_eye_in_hand_recording_learns_unknown_frame() -> None:
     assert report["any_step"]
     assert report["accepted"] == 80
     assert report["fitted"] == ["pose_known = false", "marker_known = false"]
-    assert report["after"]["mean_mm"] < 1.5 * report["before"]["mean_mm"]
+    # 0.33 is reached: 0.9 of 2.8 mm, with about 1 mm of noise. Without learning it is 1.
+    assert report["after"]["mean_mm"] < 0.5 * report["before"]["mean_mm"]
 
 
 @pytest.mark.soak

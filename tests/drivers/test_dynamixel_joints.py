@@ -174,13 +174,6 @@ def test_two_servos_of_one_id_are_refused() -> None:
         pass
 
 
-def test_duplicate_id_and_model_is_refused_by_positions() -> None:
-    arm = Arm()
-    arm.chain.servos.append(Servo(BY_NAME["XM430-W350"], 2, swing(9), return_delay_s=0))
-    with pytest.raises(SourceError, match=r"joint2 .* garbled answers: two servos"), arm.joints:
-        pass
-
-
 def test_servo_answering_only_ping_names_status_level() -> None:
     arm = Arm()
     arm.chain.servo(1)["status_return"] = 0

@@ -9,12 +9,13 @@ import shutil
 import subprocess
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from random import Random
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from servo_arm import swing
 from virtual_port import VirtualClock, VirtualPort, at_once
@@ -29,6 +30,7 @@ from bodyschema.drivers.serial_lines.joints import SerialLineJoints
 from bodyschema.drivers.serial_lines.lines import (
     INITIAL,
     LONGEST,
+    SEQUENCES,
     VERSION,
     GarbledLine,
     Header,
@@ -148,7 +150,8 @@ def test_any_bytes_are_a_line_or_refused(data) -> None:
 
 
 @given(PIECES)
-def test_only_readings_that_were_sent_are_accepted(pieces) -> None:
+@example([b"\n", with_checksum(HEADER), *(with_checksum(f"{seq},{10 * seq},1,-5") for seq in (7, 6, 7, 9))])
+def test_accepted_readings_were_sent_and_are_in_order(pieces) -> None:
     board, said = Board(0.0, 0.0), b"".join(pieces)
     for k, piece in enumerate(pieces):
         board.hear(piece, 100.0 + k * 1e-3)
@@ -159,6 +162,7 @@ def test_only_readings_that_were_sent_are_accepted(pieces) -> None:
         seen.append(timed.reading.seq)
     assert board.header is not None or not seen
     assert len(seen) == board.counts.lines
+    assert all(0 < (later - earlier) % SEQUENCES < SEQUENCES // 2 for earlier, later in pairwise(seen))
 
 
 def test_a_flood_without_line_feeds_is_forgotten() -> None:

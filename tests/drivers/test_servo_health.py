@@ -46,6 +46,16 @@ def test_only_the_overloaded_servo_reports_trouble(make) -> None:
 
 
 @pytest.mark.parametrize("make", MAKES, ids=["dynamixel", "feetech"])
+def test_torque_that_stays_on_is_an_error(make, monkeypatch) -> None:
+    arm = make()
+    servo = arm.chain.servo(2)
+    servo["torque"] = 1
+    monkeypatch.setattr(type(servo), "write", lambda *_: 0)
+    with pytest.raises(SourceError, match=r"torque of joint 'joint2' \(ID 2\) stays on"), arm.joints:
+        pytest.fail("it was opened")
+
+
+@pytest.mark.parametrize("make", MAKES, ids=["dynamixel", "feetech"])
 def test_silent_servo_is_marked_until_it_returns(make) -> None:
     arm = make()
     with arm.joints:
@@ -116,6 +126,21 @@ def test_lost_turn_count_needs_explicit_acceptance() -> None:
         (reading,) = read(arm, 1)
     assert reading.q[1] == pytest.approx(0.2 + math.radians(100), abs=0.01)
     assert not arm.joints.asks_for_turns
+
+
+def test_turn_acceptance_holds_for_one_loss() -> None:
+    turned = [0.0]
+    arm = Arm(paths=[lambda t: 0.1, lambda t: 0.2 + turned[0], lambda t: 0.3])
+    with arm.joints:
+        read(arm, 3)
+    for angle in (100.0, 200.0):
+        turned[0] = math.radians(angle)
+        arm.chain.power_cycle(arm.clock.now())
+        with pytest.raises(SourceLost, match="turn count is lost"), arm.joints:
+            pytest.fail("it was opened")
+        arm.joints.accept_turns()
+        with arm.joints:
+            read(arm, 1)
 
 
 def test_turn_acceptance_without_a_question_has_no_effect() -> None:

@@ -13,6 +13,8 @@ from bodyschema.sim_backend import ErrorConfig, SimConfig
 from bodyschema.sim_backend.posed import PosedWorld, _Settings
 
 CLOSE_M = 1e-6
+COMPLIANT = ("joint_compliance", "shoulder_lift", None)  # without it no payload shows
+VERTICAL = ("joint_compliance", "neck_yaw", None)  # no weight turns it
 NO_ERRORS = ErrorConfig(
     joint_offset_rad=0, link_length_m=0, link_axis_rad=0, camera_position_m=0, camera_rotation_rad=0, tool_m=0
 )
@@ -56,11 +58,15 @@ def test_a_simulation_that_has_run_can_be_pickled(robot) -> None:
 @pytest.mark.parametrize("name", [name for name in EFFECT_TYPES if name != "camera_latency"])
 def test_simulated_world_shows_each_effect_at_every_joint(robot, name, monkeypatch) -> None:
     postures = walk(2).q[:20]
-    for place in everywhere(robot):
-        if place[0] == name:
-            simulation = Simulation(robot, (sized(robot, place, 1.0, 3),))
-            apart = shown(simulation, postures, monkeypatch) - simulation.positions(rows(postures))
-            assert np.abs(apart).max() < CLOSE_M, place
+    others = (sized(robot, COMPLIANT, 1.0),) if name == "payload" else ()
+    without = Simulation(robot, others).positions(rows(postures))
+    places = [place for place in everywhere(robot) if place[0] == name and place != VERTICAL]
+    assert places
+    for place in places:
+        simulation = Simulation(robot, (*others, sized(robot, place, 1.0, 3)))
+        expected = simulation.positions(rows(postures))
+        assert np.abs(expected - without).max() > CLOSE_M, place
+        assert np.abs(shown(simulation, postures, monkeypatch) - expected).max() < CLOSE_M, place
 
 
 def test_all_effects_at_once_show_in_the_world(robot, monkeypatch) -> None:

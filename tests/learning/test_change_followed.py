@@ -130,7 +130,18 @@ def test_rollback_keeps_counters_and_drops_later_pairs(followed: Followed) -> No
     assert restored.change is None
     change = followed.learning.change
     assert change is not None
-    assert abs(len(restored.state().arrays["q"]) - TAUGHT) <= abs(change.first_seq - 1 - TAUGHT)
+    np.testing.assert_array_equal(restored.state().arrays["q"], followed.q[: change.first_seq - 1])
+
+
+def test_pairs_dropped_by_rollback_are_not_learnt_again(followed: Followed) -> None:
+    restored = new_learning()
+    restored.restore(followed.learning.state())
+    restored.rollback()
+    again, fresh = measured(followed.before, followed.q[-2:], np.random.default_rng(1), first=TAUGHT + SINCE)
+    with pytest.raises(RequestError, match="learnt already"):
+        restored.learn(again, 0.0)
+    restored.learn(fresh, 0.0)
+    assert restored.counters.pairs == TAUGHT + SINCE + 1
 
 
 def test_rollback_without_a_change_is_refused() -> None:

@@ -8,6 +8,7 @@ from functools import cache
 import numpy as np
 import pytest
 from guided_arm import NOW_AND_THEN, Scene, make_pair, near, new_learning, teach
+from scipy.spatial.transform import Rotation
 from test_calibration import DESK_ARM, figures_of
 
 import bodyschema.daemon.learner.findings
@@ -173,13 +174,33 @@ def test_only_unidentifiable_joint_offsets_are_null() -> None:
     assert [name for name, zero in zeros.items() if zero is None] == ["base_yaw", "wrist_roll"]
 
 
-def test_hand_eye_matrix_and_covariance_match_camera_position() -> None:
+def test_hand_eye_pose_matches_camera_figures() -> None:
     findings = findings_of(shared(2, 60))
     findings.renew()
     found = findings.calibration
-    assert np.array(found.hand_eye.matrix)[:3, 3] == pytest.approx([figure.learnt for figure in found.camera_xyz])
-    variances = np.diag(np.reshape(found.hand_eye.covariance, (6, 6)))[:3]
-    assert 1.96 * np.sqrt(variances) == pytest.approx([figure.half_width for figure in found.camera_xyz], rel=1e-3)
+    matrix = np.array(found.hand_eye.matrix)
+    turned = Rotation.from_euler("xyz", [figure.learnt for figure in found.camera_rpy]).as_matrix()
+    assert matrix[:3, 3] == pytest.approx([figure.learnt for figure in found.camera_xyz])
+    assert matrix[:3, :3] == pytest.approx(turned, abs=1e-9)
+    assert Rotation.from_quat(found.hand_eye.quaternion_xyzw).as_matrix() == pytest.approx(turned, abs=1e-9)
+    assert matrix[3] == pytest.approx([0.0, 0.0, 0.0, 1.0])
+
+
+def test_hand_eye_covariance_matches_camera_intervals() -> None:
+    findings = findings_of(shared(2, 60))
+    findings.renew()
+    found = findings.calibration
+    _, pitch, yaw = (figure.learnt for figure in found.camera_rpy)
+    about_z = Rotation.from_euler("z", yaw)
+    # Columns: the turns about the parent's axes by a step in roll, pitch and yaw.
+    turns = np.column_stack(
+        [(about_z * Rotation.from_euler("y", pitch)).apply([1.0, 0.0, 0.0]), about_z.apply([0.0, 1.0, 0.0]), [0, 0, 1]]
+    )
+    to_figures = np.zeros((6, 6))
+    to_figures[:3, :3], to_figures[3:, 3:] = np.eye(3), np.linalg.inv(turns)
+    variances = np.diag(to_figures @ np.reshape(found.hand_eye.covariance, (6, 6)) @ to_figures.T)
+    expected = [figure.half_width for figure in (*found.camera_xyz, *found.camera_rpy)]
+    assert 1.96 * np.sqrt(variances) == pytest.approx(expected, rel=1e-3)
 
 
 def test_estimated_arm_tolerances_are_below_learner_defaults() -> None:

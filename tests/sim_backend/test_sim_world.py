@@ -211,8 +211,8 @@ def test_dead_renderer_is_lost_until_camera_reopens(running):
 
 def test_lost_renderer_is_reported_with_its_exit_code(monkeypatch):
     start = "bodyschema.sim_backend.rendering.render_client._start"
-    monkeypatch.setattr(start, lambda *_: subprocess.Popen(["sleep", "0.2"]))
-    with pytest.raises(SourceLost, match="exit code 0"), SimWorld(shipped(), SimConfig(seed=3)):
+    monkeypatch.setattr(start, lambda *_: subprocess.Popen(["sh", "-c", "sleep 0.2; exit 3"]))
+    with pytest.raises(SourceLost, match="exit code 3"), SimWorld(shipped(), SimConfig(seed=3)):
         pass
 
 
