@@ -27,6 +27,8 @@ def explained(file: Path) -> Iterator[None]:
     except sqlite3.Error as error:
         kind = StoreUnwritable if _name(error).startswith(_PASSING) else StoreError
         raise kind(explanation(file, error)) from error
+    except UnicodeDecodeError as error:  # SQLite's message quotes a damaged definition of a table
+        raise StoreError(damaged(file, f"a table's definition is not UTF-8: {error}")) from error
 
 
 def explanation(file: Path, error: sqlite3.Error) -> str:

@@ -63,7 +63,11 @@ INSERT = {
 }
 # Unreadable pairs get no checksum when an older store is migrated to schema 5.
 _SEAL = "UPDATE {table} SET checksum = sealed_{table}({columns})"
-TABLES = ";".join([_TABLES, *_MIGRATIONS.values()]).split(";")
+
+
+def statements_of(schema: int) -> list[str]:
+    """Return the statements that create the tables of a schema."""
+    return ";".join([_TABLES, *(_MIGRATIONS[each] for each in _MIGRATIONS if each <= schema)]).split(";")
 
 
 def connect(file: Path, *, readonly: bool = False) -> sqlite3.Connection:
@@ -211,7 +215,7 @@ def write_meta(connection: sqlite3.Connection, contents: dict[str, str]) -> None
 
 def create(connection: sqlite3.Connection, contents: dict[str, str]) -> None:
     with transaction(connection):
-        for statement in TABLES:
+        for statement in statements_of(SCHEMA_VERSION):
             connection.execute(statement)
         connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
         connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
@@ -226,23 +230,26 @@ def _pair_columns(schema: int) -> list[str]:
 
 def _unlike(connection: sqlite3.Connection, schema: int) -> str | None:
     """Return a difference between the file and a pair store of this schema; None if there is none."""
-    sealed = [CHECKSUM] if schema >= WITH_CHECKSUMS else []
-    expected = {"meta": ["key", "value"], "pairs": _pair_columns(schema)}
-    others = ("sessions", "devices") if schema >= WITH_DEVICES else ("sessions",)
-    expected |= {name: [*COLUMNS[name].split(", "), *sealed] for name in others}
     if connection.execute("PRAGMA encoding").fetchone()[0] != b"UTF-8":
         return "its texts are not UTF-8"
     trigger = connection.execute("SELECT name FROM sqlite_schema WHERE type = 'trigger'").fetchone()
     if trigger is not None:
         return "it has a trigger, which a pair store has not"
-    plain = {row[1] for row in connection.execute("PRAGMA table_list") if row[2] == b"table"}
-    for table, names in expected.items():
-        there = connection.execute(f"PRAGMA table_xinfo({table})").fetchall()
-        if table.encode() not in plain or {row[1] for row in there if not row[-1]} != {name.encode() for name in names}:
-            return f"its table {table} is not that of schema {schema}"
-        if len(there) != len(names):
-            return f"its table {table} has computed columns"
-    return None
+    with contextlib.closing(sqlite3.connect(":memory:")) as sound:
+        sound.text_factory = bytes
+        for statement in statements_of(schema):
+            sound.execute(statement)
+        expected, there = _tables(sound), _tables(connection)
+    odd = next((table for table, columns in expected.items() if there.get(table) != columns), None)
+    return None if odd is None else f"its table {odd.decode()} is not that of schema {schema}"
+
+
+def _tables(connection: sqlite3.Connection) -> dict[bytes, list[tuple[object, ...]]]:
+    """Return the columns of each table: name, type, constraints, and whether it is computed."""
+    found = [row[1] for row in connection.execute("PRAGMA table_list") if row[2] == b"table"]
+    return {
+        name: connection.execute("SELECT * FROM pragma_table_xinfo(?)", (name.decode(),)).fetchall() for name in found
+    }
 
 
 def _seal(connection: sqlite3.Connection) -> None:
