@@ -62,7 +62,9 @@ def test_observer_columns_match_the_simulated_effect(
     still = replace(
         made(arm, np.random.default_rng(1)), frames=built.frames, harmonics=(np.zeros((1, 3)),) * len(arm.read)
     )
-    for cause in [c for c in causes if c.effect == effect]:
+    chosen = [cause for cause in causes if cause.effect == effect]
+    assert chosen
+    for cause in chosen:
         amounts = SMALL * cause.amounts
         shape = cause.shape | ({"width": float(amounts[0])} if effect == "backlash" else {})
         small = replace(cause, amounts=amounts, shape=shape)

@@ -449,11 +449,11 @@ def test_offset_within_the_stated_tolerance_is_written(pairs_file, tmp_path) -> 
 def test_links_worse_than_any_are_not_written(pairs_file, tmp_path) -> None:
     arm = planted(1)
     change, rng = arm.change.copy(), np.random.default_rng(0)
-    change[arm.parameters.shifts] += 0.15 * rng.normal(size=8)
-    change[arm.parameters.tilts] += 0.3 * rng.normal(size=8)
+    change[arm.parameters.shifts] += 0.045 * rng.normal(size=8)
+    change[arm.parameters.tilts] += 0.09 * rng.normal(size=8)
     q = arm.recording.q
     Recording(arm.robot.joints, q, arm.parameters.positions(change, q)).write_csv(pairs_file)
-    with pytest.raises((CalibrationError, RecordingError), match=r"of another arm|hardly of this robot"):
+    with pytest.raises(CalibrationError, match=r"nothing was written. .* the worst that is considered. .* another arm"):
         called(pairs_file, "--out", tmp_path / "calibrated")
     assert not (tmp_path / "calibrated").exists()
 

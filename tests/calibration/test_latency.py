@@ -170,14 +170,6 @@ def test_latency_estimate_beats_speed_correlation_over_many_seeds() -> None:
     assert within > 0.65
 
 
-def test_an_arm_that_hardly_moves_is_refused() -> None:
-    still = wiggle(0, 0.05)
-    rng = np.random.default_rng(0)
-    x = still.x[:1] + rng.normal(0, 5e-4, still.x.shape)
-    with pytest.raises(LatencyError):
-        latency_of(Wiggle(still.t_joints, POSE + 1e-4 * (still.q - POSE), still.t_marker, x), ARM.chain)
-
-
 def test_periodic_motion_is_rejected_as_repeating_itself() -> None:
     t_joints, t_marker = np.arange(500) / 100, np.arange(150) / 30
     q = np.tile(POSE, (500, 1))
@@ -189,8 +181,8 @@ def test_periodic_motion_is_rejected_as_repeating_itself() -> None:
         latency_of(Wiggle(t_joints, q, t_marker, x), ARM.chain)
 
 
-def test_a_latency_beyond_the_range_is_refused() -> None:
-    with pytest.raises(LatencyError):
+def test_latency_far_beyond_the_search_fits_nowhere() -> None:
+    with pytest.raises(LatencyError, match="do not go with them at any latency from -50 to 250 ms"):
         latency_of(wiggle(0, 0.6), ARM.chain)
 
 

@@ -1,6 +1,9 @@
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from threading import Event
 
 import numpy as np
 import pytest
@@ -70,10 +73,25 @@ def test_frame_without_later_reading_has_no_joints(buffer) -> None:
     assert buffer.at(1.05, 0.01) is Reason.NO_JOINTS
 
 
+@contextmanager
+def waited_on(buffer: JointBuffer) -> Iterator[Event]:
+    """Yield an event that is set when a thread is about to wait and holds the buffer's lock until it does."""
+    begun, wait_for = Event(), buffer._changed.wait_for
+
+    def telling(predicate: Callable[[], bool], timeout_s: float | None = None) -> bool:
+        begun.set()
+        return wait_for(predicate, timeout_s)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(buffer._changed, "wait_for", telling)
+        yield begun
+
+
 def test_a_frame_waits_for_the_reading_after_it(buffer) -> None:
     buffer.put(reading(1.0, 1.0, 1.0))
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor() as pool, waited_on(buffer) as begun:
         waiting = pool.submit(buffer.at, 1.05, LIMIT_S)
+        assert begun.wait(LIMIT_S)
         buffer.put(reading(1.1, 3.0, 1.0))
         assert waiting.result(LIMIT_S).tolist() == pytest.approx([2.0, 1.0])
 
@@ -87,8 +105,9 @@ def test_lost_encoders_keep_no_frame_waiting(buffer) -> None:
 def test_the_first_reading_ends_the_silence(buffer) -> None:
     buffer.silence()
     buffer.put(reading(1.0, 1.0, 1.0))
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor() as pool, waited_on(buffer) as begun:
         waiting = pool.submit(buffer.at, 1.05, LIMIT_S)
+        assert begun.wait(LIMIT_S)
         buffer.put(reading(1.06, 1.0, 1.0))
         assert not isinstance(waiting.result(LIMIT_S), Reason)
 
@@ -122,8 +141,9 @@ def test_encoders_without_cameras_keep_the_newest_readings() -> None:
 def test_closing_lets_waiting_encoders_go() -> None:
     buffer = JointBuffer(REVOLUTE, max_gap_s=1.0, capacity=1)
     buffer.put(reading(0.0, 0.0, 0.0))
-    with ThreadPoolExecutor() as pool:
+    with ThreadPoolExecutor() as pool, waited_on(buffer) as begun:
         waiting = pool.submit(buffer.put, reading(1.0, 0.0, 0.0))
+        assert begun.wait(LIMIT_S)
         buffer.close()
         waiting.result(LIMIT_S)
     assert buffer.at(1.0, 0.0) is Reason.NO_JOINTS

@@ -444,16 +444,20 @@ def test_a_forged_checkpoint_is_restored_or_refused(tmp_path: Path, stored, plac
 
 @quick
 @given(st.lists(st.binary(max_size=60) | st.just(b"{}"), max_size=5))
-def test_malformed_published_bytes_leave_feed_queue_empty(payloads: list[bytes]) -> None:
+def test_malformed_published_bytes_are_counted_and_learning_continues(payloads: list[bytes]) -> None:
     from bodyschema.daemon.learner.feed import PairFeed
+    from bodyschema.daemon.sampler.history import Page, read_page
     from bodyschema.interfaces.clock import SystemClock
 
-    def no_history(_begin: int) -> wire.PairsReply:
-        raise RequestError("nobody")
+    pairs = [wire.pair_to_wire(pair) for pair in Scene.draw(0, 3).pairs]
 
-    feed = PairFeed(new_learning(), no_history, SystemClock())
-    for payload in payloads:
+    def history(begin: int) -> Page:
+        return read_page(wire.encode(wire.PairsReply(pairs[0].store, 2, pairs[begin - 1 : 2])))
+
+    learning = new_learning()
+    feed = PairFeed(learning, history, SystemClock())
+    feed.step(0.0)
+    for payload in (*payloads, wire.encode(pairs[2])):
         feed.offer(payload)
-    for _ in payloads:
         feed.step(0.0)
-    assert feed._waiting.empty()
+    assert (learning.counters.refused, learning.counters.pairs) == (len(payloads), 3)

@@ -63,6 +63,7 @@ class Site:
 
     pki: Path
     endpoint: str
+    router: ZenohSession
     sampler: ZenohSession
     learner: ZenohSession
     heard: Queue[bytes]
@@ -82,7 +83,7 @@ def site(pki: Path, tmp_path_factory, free_endpoint) -> Iterator[Site]:
     heard: Queue[bytes] = Queue()
     with ExitStack() as stack:
         router = RouterConfig.load(router_file)
-        stack.enter_context(ZenohSession(listen=endpoint, settings=router.settings()))
+        meeting = stack.enter_context(ZenohSession(listen=endpoint, settings=router.settings()))
         buses = {}
         for process, machine in (("sampler", "robot"), ("learner", "learner")):
             folder = tmp_path_factory.mktemp(machine)
@@ -110,7 +111,7 @@ def site(pki: Path, tmp_path_factory, free_endpoint) -> Iterator[Site]:
         sampler.token(KEYS.alive("sampler"))
         learner.token(KEYS.alive("learner"))
         assert alive.wait(LIMIT_S)
-        found = Site(pki, endpoint, sampler, learner, heard, publish)
+        found = Site(pki, endpoint, meeting, sampler, learner, heard, publish)
         operator, until = found.as_somebody("bert"), time.monotonic() + LIMIT_S
         while len(answered(operator, QUESTIONS | STATES | COMMANDS)) < len(QUESTIONS | STATES | COMMANDS):
             assert time.monotonic() < until
@@ -209,14 +210,32 @@ def test_operator_cannot_forge_liveliness(site: Site) -> None:
             seen.get(timeout=SILENCE_S)
 
 
-def test_viewer_of_all_robots_sees_liveliness(site: Site) -> None:
+@pytest.fixture(scope="module")
+def second_robot(site: Site) -> Keys:
+    """Return the keys of another robot, for which the router's own session answers; no certificate restricts it."""
+    second = Keys("second")
+    for key in (second.predict, second.status("sampler"), second.command("learner")):
+        site.router.answer(key, lambda _request, key=key: key.encode())
+    site.router.token(second.alive("sampler"))
+    return second
+
+
+def test_viewer_of_all_robots_sees_liveliness(site: Site, second_robot: Keys) -> None:
     with client(site.as_somebody("anna")) as viewer:
-        assert viewer.alive("bodyschema/*/alive/sampler")
+        assert {KEYS.alive("sampler"), second_robot.alive("sampler")} <= set(viewer.alive("bodyschema/*/alive/sampler"))
 
 
-def test_operator_of_one_robot_cannot_list_all_robots(site: Site) -> None:
+def test_operator_of_one_robot_reaches_no_other(site: Site, second_robot: Keys) -> None:
+    keys = {key: key for key in (second_robot.predict, second_robot.status("sampler"), second_robot.command("learner"))}
+    assert answered(site.as_somebody("anna"), keys) == {second_robot.predict, second_robot.status("sampler")}
+    assert answered(site.as_somebody("bert"), keys | COMMANDS) == set(COMMANDS)
+
+
+def test_operator_of_one_robot_cannot_list_all_robots(site: Site, second_robot: Keys) -> None:
     with client(site.as_somebody("bert")) as operator:
-        assert not operator.alive("bodyschema/*/alive/sampler")
+        assert operator.alive(KEYS.alive("sampler")) == [KEYS.alive("sampler")]
+        assert operator.alive("bodyschema/*/alive/sampler") == []
+        assert operator.alive(second_robot.alive("sampler")) == []
 
 
 def test_denied_command_error_suggests_missing_role(site: Site) -> None:

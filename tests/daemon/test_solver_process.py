@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -140,10 +139,8 @@ def test_polling_does_not_wait_for_blocked_solver(monkeypatch) -> None:
     with solver_process.SolverProcess() as process:
         process.start(TASK)
         process.learn(np.zeros((10_000, 3)), np.zeros((10_000, 3)))
-        monkeypatch.setattr(solver_process, "READS_WITHIN_S", 20.0)
-        begin = time.monotonic()
+        monkeypatch.setattr(solver_process, "READS_WITHIN_S", 3600.0)  # a poll that waited would reach the time limit
         assert process.poll() is None
-        assert time.monotonic() - begin < 10.0
 
 
 def test_solver_with_unreadable_cpu_clock_is_kept(monkeypatch) -> None:

@@ -20,6 +20,13 @@ from bodyschema.interfaces.errors import BodyschemaError
 LIMIT_S = 500.0
 # Writes its process id, then waits for SIGTERM to end it.
 WAITING = "import os, signal, sys; print(os.getpid(), file=open(sys.argv[1], 'a'), flush=True); signal.pause()"
+# Fails once the other has written its process id.
+FAILING_AFTER = """
+import os, sys, time
+while not (os.path.exists(sys.argv[1]) and os.path.getsize(sys.argv[1])):
+    time.sleep(0.01)
+raise SystemExit(3)
+"""
 STUBBORN = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); " + WAITING
 
 
@@ -92,10 +99,11 @@ def test_a_child_that_does_not_end_is_killed(tmp_path, monkeypatch) -> None:
 
 
 def test_child_failing_at_start_ends_the_others(tmp_path) -> None:
-    supervisor = Supervisor([child(WAITING, tmp_path / "pids"), child("raise SystemExit(3)")])
+    supervisor = Supervisor([child(WAITING, tmp_path / "pids"), child(FAILING_AFTER, tmp_path / "pids")])
     with pytest.raises(BodyschemaError, match=r"could not start \(exit code 3\); its message is above"):
         supervisor.run()
-    assert all(map(gone, started(tmp_path / "pids")))
+    (other,) = started(tmp_path / "pids")
+    assert gone(other)
 
 
 SERVING_THEN_FAILING = (

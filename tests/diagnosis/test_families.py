@@ -38,7 +38,9 @@ def test_family_columns_match_moves_times_amounts(start, found) -> None:
 
 def test_subfamily_moves_as_the_whole_family_does(start, found) -> None:
     rng = np.random.default_rng(0)
-    for family in (family for family in found if family.kind == "body" and family.ties is None):
+    bodies = [family for family in found if family.kind == "body" and family.ties is None]
+    assert bodies
+    for family in bodies:
         way = Way.of(family, start)
         part = way.along(np.linalg.qr(rng.normal(size=(way.amounts, 2)))[0])
         numbers = rng.normal(size=len(part.scales)) / part.scales
@@ -50,7 +52,9 @@ def test_link_compliant_at_near_end_rotates_about_carrier() -> None:
     robot = RobotDescription.load(model_file("upper_body"))
     run = start_of(robot, walk(robot, 1, rows=50), (), 1).run
     found, gravity = families(run), run.simulation.gravity
-    for k in np.flatnonzero(~np.array(run.simulation.upward)):
+    joints = np.flatnonzero(~np.array(run.simulation.upward))
+    assert len(joints)
+    for k in joints:
         what = f"what carries {run.simulation.robot.joints[k]} gives under the arm's weight"
         *_, family = (one for one in found if one.what == what and one.ties is not None and not one.is_specific)
         T_camera_carrier = run.frames[:, k] @ np.linalg.inv(gravity.in_supports(k)[-1])

@@ -151,6 +151,8 @@ def test_prismatic_ripple_is_tolerated_despite_exact_links(robot: RobotDescripti
     fit = aligned(Observations.of(recording, Simulation(robot)), Simulation(robot)).tolerating(Scales(lengths=0.1))
     ripple = Effect.at(robot, "joint_ripple", ELBOW, values=[5e-5, 0.0, 16.0])
     assert fit.background.tolerates(replace(ripple, prismatic=True))
+    exact = fit.tolerating(Scales(slides=0.1))
+    assert not exact.background.tolerates(replace(ripple, prismatic=True))
 
 
 def test_background_survives_extended_toml_round_trip(robot: RobotDescription, tmp_path: Path) -> None:

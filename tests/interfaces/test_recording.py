@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import numpy as np
@@ -168,16 +167,6 @@ def test_a_recording_made_from_a_nan_is_refused() -> None:
 def test_recording_rejects_arrays_of_unequal_length() -> None:
     with pytest.raises(ValueError, match="x has the shape"):
         Recording(JOINTS, np.zeros((2, 2)), np.zeros((3, 3)))
-
-
-def test_reading_12000_rows_takes_under_half_a_second(tmp_path: Path) -> None:
-    rng = np.random.default_rng(1)
-    joints = tuple(f"q{i}" for i in range(6))
-    file = tmp_path / "large.csv"
-    Recording(joints, rng.normal(size=(12_000, 6)), rng.normal(size=(12_000, 3))).write_csv(file)
-    start = time.process_time()
-    assert len(Recording.read(file, joints)) == 12_000
-    assert time.process_time() - start < 0.5
 
 
 def test_chosen_rows_keep_all_their_columns(write) -> None:

@@ -198,7 +198,7 @@ def test_runs_that_see_no_pair_leave_nothing_behind(file) -> None:
         assert connection.execute("SELECT count(*) FROM sessions").fetchone()[0] == 1
 
 
-def test_store_uses_wal_with_full_synchronous_commits(store, monkeypatch) -> None:
+def test_store_uses_wal_with_full_synchronous_commits(store) -> None:
     assert store._connection.execute("PRAGMA synchronous").fetchone()[0] == 2  # FULL
     assert store._connection.execute("PRAGMA journal_mode").fetchone()[0] == b"wal"
 
@@ -308,6 +308,19 @@ def test_a_closed_store_takes_nothing(file) -> None:
 def test_empty_store_file_is_initialized_on_opening(file) -> None:
     file.parent.mkdir()
     file.touch()
+    with PairStore(file, SESSION) as store:
+        assert fill(store, 1)[0].seq == 1
+
+
+def test_store_killed_during_creation_is_initialized_on_opening(file) -> None:
+    code = (
+        "import os, sys; from pathlib import Path; from bodyschema.recordings.store import schema, store\n"
+        "statements = schema.statements_of\n"
+        "def until_killed(number): yield from statements(number)[:2]; os._exit(9)\n"
+        "schema.statements_of = until_killed\n"
+        "with store.PairStore(Path(sys.argv[1]), store.Session(('waist', 'shoulder'), '', '', '', '', '', '')): pass"
+    )
+    assert subprocess.run([sys.executable, "-c", code, file], check=False).returncode == 9
     with PairStore(file, SESSION) as store:
         assert fill(store, 1)[0].seq == 1
 

@@ -99,14 +99,15 @@ def test_motion_resolves_the_tilt_ambiguity() -> None:
 
 
 def test_oppositely_tilted_pose_never_becomes_a_fix() -> None:
-    rng = np.random.default_rng(20261124)
+    rng, fixes = np.random.default_rng(20261124), 0
     for k in range(12):
         truth = tilted(float(rng.uniform(0.0, 25.0)), rng.standard_normal(3) * [1.0, 1.0, 0.0])
         found = tracker_of(ONE, TAG).track(seen(at(truth, [0.0, 0.0, 0.6]), noise=2.0, seed=k))
         if isinstance(found, MarkerFix):
             assert found.cov_R is not None
-            off = turned_off(found, truth)
+            off, fixes = turned_off(found, truth), fixes + 1
             assert off @ np.linalg.solve(found.cov_R, off) < 36.0
+    assert fixes
 
 
 def test_flat_cluster_pose_is_recovered_from_one_image() -> None:
